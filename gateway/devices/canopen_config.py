@@ -1,4 +1,4 @@
-"""What the gateway is told about CANopen besides addresses: what a bus's master produces, and how a node is booted."""
+"""CANopen configuration besides addresses: what a bus's master produces, and how a node is booted."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ from fieldtwin.gateway.protocols.canopen.lss import LssAddress
 
 @dataclass(frozen=True)
 class CanopenBusConfig:
-    """SYNC every `sync_ms` with a counter up to `sync_counter` (0: without), TIME every `time_ms`; 0: never.
+    """The master of a bus: SYNC every `sync_ms` with a counter up to `sync_counter` (0: no counter), TIME every
+    `time_ms`; 0: never.
 
-    `short_sdo`: replies of fewer than 8 bytes are taken, as old controllers send them.
+    `short_sdo`: accept replies of fewer than 8 bytes, as old controllers send them.
     """
 
     sync_ms: int = 0
@@ -26,8 +27,8 @@ class CanopenBusConfig:
 
 @dataclass(frozen=True)
 class RpdoConfig:
-    """The tags that RPDO1 of a node shall carry. `synchronous`: they count from the next SYNC on. `event_ms`: how often it
-    is sent although nothing changed, 0 for never."""
+    """The tags that RPDO1 of a node is to carry. `synchronous`: the values take effect at the next SYNC. `event_ms`:
+    how often it is sent without a change; 0: never."""
 
     tags: tuple[str, ...]
     synchronous: bool = False
@@ -36,11 +37,13 @@ class RpdoConfig:
 
 @dataclass(frozen=True)
 class CanopenNodeConfig:
-    """`identity`: who has to answer. `configuration`: what it shall hold, from the DCF `dcf`.
+    """How a node is booted. `identity` is the expected identity; `configuration` is what the node is to hold, from the
+    DCF `dcf`.
 
-    `lss`: the address under which it gets its node id where nobody has that. `tpdos`: the process data that it sends, as
-    its DCF has them; None where `adopt_tpdos` says to read them from the node, or where nothing is said. `rpdos` and
-    `adopt_rpdos`: the same of the process data that it takes; `rpdo1`: what its RPDO1 shall be.
+    `lss`: the LSS address by which the node gets its node ID if no node has that ID. `tpdos`: the process data that the
+    node sends, from its DCF; None if `adopt_tpdos` asks to read them from the node, or if nothing is configured.
+    `rpdos` and `adopt_rpdos`: the same for the process data that the node receives; `rpdo1`: how its RPDO1 is to be
+    configured.
     """
 
     identity: ExpectedIdentity = field(default_factory=ExpectedIdentity)
@@ -55,8 +58,8 @@ class CanopenNodeConfig:
 
 
 def cycle_period_ns(bus: CanopenBusConfig, nodes: Iterable[CanopenNodeConfig]) -> int:
-    """Return the communication cycle period of a bus in ns: how often its master produces SYNC, else the shortest period that a
-    node's DCF sets (1006h); 0 where neither says it."""
+    """Return the communication cycle period of a bus in ns: the SYNC period of its master, else the shortest period
+    that a node's DCF sets (1006h), else 0."""
     if bus.sync_ms:
         return bus.sync_ms * NS_PER_MS
     settings = (setting for node in nodes if node.configuration for setting in node.configuration.settings)

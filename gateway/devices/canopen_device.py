@@ -1,9 +1,9 @@
 """The driver of a CANopen node: identity, configuration over SDO, values from TPDOs, state from the heartbeat.
 
-The node's values are good while its TPDOs come and it is OPERATIONAL; a lost heartbeat makes them bad at once. Without
-leave to write, nothing is configured and nothing is started: the mapping is read from the node and listened to. Nothing
-at all is written to a node that is another than the one expected. What it is commanded goes by RPDO where one of its RPDOs
-has it and may be sent, else by SDO.
+The node's values are good while its TPDOs arrive and it is OPERATIONAL; a lost heartbeat makes them bad at once. If
+writing is not allowed, the driver configures and starts nothing: it reads the PDO mapping from the node and listens.
+The driver writes nothing at all to a node whose identity is not the expected one. An output goes by RPDO if one of the
+node's RPDOs carries it and may be sent, otherwise by SDO.
 """
 
 from __future__ import annotations
@@ -39,7 +39,8 @@ from fieldtwin.gateway.protocols.canopen.pdo import PdoEntry, PdoLengthMismatch,
 _OPERATIONAL = NmtState.OPERATIONAL
 
 CONSTANT = frozenset({0x1000, 0x1008, 0x1009, 0x100A, 0x1018})
-"""Objects that do not change while a node runs (7.5.2.1, 7.5.2.9 to 7.5.2.11, 7.5.2.19): device type, names, identity."""
+"""Objects that do not change while a node runs (7.5.2.1, 7.5.2.9 to 7.5.2.11, 7.5.2.19): device type, names,
+identity."""
 
 NMT_COMMANDS = {
     "nmt_start": NmtCommand.START,
@@ -52,10 +53,11 @@ NMT_COMMANDS = {
 
 @dataclass(slots=True)
 class TpdoSeen:
-    """A TPDO of the node that is listened to: `frames` since it was mapped. With 0 the node never sent it.
+    """A TPDO of the node that the driver listens to. `frames` counts its frames since it was mapped; 0 means that the
+    node never sent it.
 
-    `puts` are the tags of its entries with their full names, None for an entry that is no tag of ours. Made with the first frame,
-    and anew once the profile changed.
+    `puts` holds the tags of its entries with their full names, and None for an entry that is not a tag of the profile.
+    It is built with the first frame, and again after the profile changed.
     """
 
     number: int
@@ -79,7 +81,7 @@ class CanopenDriver(DeviceDriver):
         self._master: CanopenMaster | None = None
         self._by_object = {t.object: t for t in self.profile.tags.values()}
         self.tpdos: tuple[TpdoSeen, ...] = ()
-        """Those that are listened to, by number."""
+        """The TPDOs that the driver listens to, by number."""
         self._listening: dict[int, PdoCallback] = {}
         self._by_change: frozenset[str] = frozenset()
         self._rpdos: dict[str, Rpdo] = {}
@@ -87,12 +89,12 @@ class CanopenDriver(DeviceDriver):
 
     @property
     def message_tag(self) -> str | None:
-        """A node emits no message that a program could be bound to."""
+        """None: a node emits no message that a program could be bound to."""
         return None
 
     @property
     def master(self) -> CanopenMaster:
-        """The master of the bus that this node stands on."""
+        """The master of the bus that this node is connected to."""
         if self._master is None:
             raise Bug("a driver without a master was used", where=self.config.where)
         return self._master
@@ -104,7 +106,7 @@ class CanopenDriver(DeviceDriver):
             seen.puts = None
 
     def understood(self, tag_name: str, held: TagValue, of: TagValue | None) -> TagValue:
-        """What a tag's bytes mean now."""
+        """Decode a tag's stored bytes under the present configuration."""
         return decode_little(self.profile.tags[tag_name], held.raw, held.t_ns)
 
     @property
@@ -117,7 +119,10 @@ class CanopenDriver(DeviceDriver):
 
     @property
     def operational(self) -> bool:
-        """Whether it takes process data: its heartbeat says so, or, where it has none, it was started and told nothing since."""
+        """Whether the node takes process data.
+
+        Its heartbeat shows that. For a node without a heartbeat it is True if the last NMT command was "start".
+        """
         state = self.master.node_state(self.node)
         if state in (None, NmtState.INITIALISING):
             return self._started
@@ -125,20 +130,26 @@ class CanopenDriver(DeviceDriver):
 
     @property
     def is_watched(self) -> bool:
-        """Whether a lost node would be noticed: its heartbeat has a limit, and was heard. A node that produces none, because the
-        gateway only listens, is not watched (CiA 301, 7.2.8.3.2.2: monitoring starts with the first heartbeat)."""
+        """Whether the loss of the node would be noticed: its heartbeat has a limit and was received.
+
+        A node that produces no heartbeat, because the gateway only listens, is not watched (CiA 301, 7.2.8.3.2.2:
+        monitoring starts with the first heartbeat).
+        """
         return self.config.heartbeat is not None and self.master.heartbeat_watched(self.node)
 
     def stale_after_ms(self, tag: Tag) -> int | None:
-        """How long a value of `tag` is good without being refreshed; None for what cannot change while the node runs, and
-        for what a TPDO tells only when it changes, while a heartbeat tells that the node would."""
+        """Return for how many milliseconds a value of `tag` is good without being refreshed.
+
+        Return None for a value that cannot change while the node runs, and for a value that a TPDO sends only when it
+        changes, while the heartbeat shows that the node is alive.
+        """
         constant = tag.name in self.config.expect or (tag.object is not None and tag.object[0] in CONSTANT)
         if constant or (tag.name in self._by_change and self.is_watched):
             return None
         return max(self.config.stale_after_ms, 3 * self.config.poll.get(tag.poll, 0))
 
     def attach_master(self, connection: CanConnection, master: CanopenMaster) -> None:
-        """Use `master`, which talks over `connection`, from now on."""
+        """Use `master`, which communicates over `connection`, from now on."""
         self.attach(connection)
         self._master = master
         self.tpdos, self._listening = (), {}
@@ -154,7 +165,7 @@ class CanopenDriver(DeviceDriver):
     # -- bringing the node up (CiA 302-2, boot slave) ---------------------------------------------------------------
 
     async def identify(self) -> None:
-        """Read what the system file says of the node's identity over SDO; raises `WrongDevice` on a difference."""
+        """Read over SDO the identity that the system file states, and compare. Raises `WrongDevice` on a difference."""
         differences = await identity_differences(self.master, self.node, self.config.canopen.identity)
         if differences:
             self.identity_error = ", ".join(f"{name}: {difference}" for name, difference in differences.items())
@@ -173,7 +184,8 @@ class CanopenDriver(DeviceDriver):
             )
 
     async def read_once(self) -> None:
-        """Read over SDO what no TPDO brings and `identify` did not read. What the node refuses has no value."""
+        """Read over SDO the tags that no TPDO brings and that `identify` did not read. A tag that the node refuses has
+        no value."""
         others = {*(self.config.tpdo1.tags if self.config.tpdo1 else ()), *self.config.expect}
         for tag in self.profile.tags.values():
             if tag.readable and tag.name not in others:
@@ -184,7 +196,7 @@ class CanopenDriver(DeviceDriver):
 
     @property
     def to_configure(self) -> str:
-        """What `configure` may write, in words; empty where the system file says nothing that is written."""
+        """What `configure` may write, in words; empty if the system file configures nothing that is written."""
         canopen, parts = self.config.canopen, []
         if canopen.configuration is not None:
             parts.append(f"{canopen.dcf} unless it holds that")
@@ -197,9 +209,10 @@ class CanopenDriver(DeviceDriver):
         return f"{', '.join(parts)} as in the system file" if parts else ""
 
     async def configure(self) -> None:
-        """Write the DCF, unless the node holds it, then heartbeat and TPDO1 as the system file says, and listen.
+        """Write the DCF, unless the node already holds it, then heartbeat and TPDO1 as the system file states, and
+        listen.
 
-        These are writes: the caller has leave to write.
+        These are writes: call this only where writing is allowed.
         """
         if self.config.canopen.configuration is not None:
             await download_configuration(self.master, self.node, self.config.canopen.configuration)
@@ -216,7 +229,7 @@ class CanopenDriver(DeviceDriver):
         await self._take_rpdos()
 
     async def adopt(self) -> None:
-        """Take the TPDOs as the node or its DCF has them, and listen. Reads only."""
+        """Use the TPDOs as the node or its DCF has them, and listen. This only reads."""
         tpdos = await self._other_tpdos()
         if self.config.tpdo1 is not None:
             held = await read_tpdo(self.master, self.node, 1)
@@ -224,14 +237,15 @@ class CanopenDriver(DeviceDriver):
         self._listen(tpdos)
 
     async def to_be_halted(self) -> bool:
-        """Whether the node has to be brought to PRE-OPERATIONAL first: its configuration will change, and it may run."""
+        """Return whether the node has to be put into PRE-OPERATIONAL first, because its configuration will change and
+        it may be running."""
         configuration, state = self.config.canopen.configuration, self.master.node_state(self.node)
         if configuration is None or state in (NmtState.PRE_OPERATIONAL, NmtState.INITIALISING):
             return False
         return not await holds_configuration(self.master, self.node, configuration.date)
 
     async def _other_tpdos(self) -> list[PdoConfig]:
-        """Those besides what `tpdo1` says of TPDO1: from the DCF, or read from the node."""
+        """Return the TPDOs other than the configured TPDO1: from the DCF, or read from the node."""
         boot, first = self.config.canopen, 2 if self.config.tpdo1 else 1
         held = boot.tpdos or ()
         if boot.adopt_tpdos:
@@ -254,7 +268,8 @@ class CanopenDriver(DeviceDriver):
             self.master.subscribe_pdo(cob_id, callback)
 
     async def _take_rpdos(self) -> None:
-        """Map RPDO1 as the system file says, take others as the node or its DCF has them, and see what they hold."""
+        """Map RPDO1 as the system file states, use the other RPDOs as the node or its DCF has them, and read their
+        current values."""
         boot, chosen = self.config.canopen, []
         if boot.rpdo1 is not None:
             objects = [self._entry(self.profile.tags[t]) for t in boot.rpdo1.tags]
@@ -271,7 +286,10 @@ class CanopenDriver(DeviceDriver):
         self._rpdos = taken
 
     async def _filled(self, config: PdoConfig) -> Rpdo | None:
-        """The RPDO with what the node holds now. None where it does not say: what is not commanded would be overwritten."""
+        """Return the RPDO filled with the values that the node holds now.
+
+        Return None if the node does not return one of them: values that are not commanded would be overwritten.
+        """
         held = []
         for entry in config.mapping.entries:
             data = b""
@@ -301,9 +319,9 @@ class CanopenDriver(DeviceDriver):
         master = self.master
         state = master.node_state(self.node)
         if state is not _OPERATIONAL and state is not None and not self.operational:
-            return  # a TPDO that overtook its node's last heartbeat: the state decides
+            return  # the TPDO arrived after its node's last heartbeat: the state decides
         if master.heartbeat_lost(self.node):
-            return  # whoever sends this, the node's state is not known: only its heartbeat brings it back (CO-038)
+            return  # whichever node sends this, the node's state is unknown until its heartbeat returns (CO-038)
         try:
             values = seen.mapping.unpack(data)
         except PdoLengthMismatch:
@@ -320,16 +338,18 @@ class CanopenDriver(DeviceDriver):
             self.emitter.emit(MEASUREMENT(data))
 
     def _put_of(self, entry: PdoEntry) -> tuple[str, Tag] | None:
-        """The tag that an entry brings, with its full name; None where there is none, or it is of another size."""
+        """Return the tag that an entry brings, with its full name; None if there is no such tag, or if its size
+        differs."""
         tag = self._by_object.get((entry.index, entry.subindex))
         if tag is None or BITS.get(tag.type) != entry.bits:
             return None
         return f"{self.config.name}.{tag.name}", tag
 
     def on_event(self, event: NodeEvent) -> None:
-        """The node's state changed, or its heartbeat was lost: its values follow at once.
+        """Follow a change of the node's state or the loss of its heartbeat: the quality of its values changes at once.
 
-        One that restarted, or may have, can have lost its mappings: until it is brought up again its process data mean nothing.
+        A node that restarted, or may have restarted, can have lost its mappings: until it is brought up again, its
+        process data means nothing.
         """
         if event.kind == "boot-up":
             self._rpdos, self._started = {}, False
@@ -343,16 +363,16 @@ class CanopenDriver(DeviceDriver):
     # -- what the node is sent -----------------------------------------------------------------------------------------
 
     def rpdo_of(self, tag_name: str) -> Rpdo | None:
-        """The RPDO by which this tag is commanded; None where it goes by SDO."""
+        """Return the RPDO by which this tag is commanded; None if it goes by SDO."""
         return self._rpdos.get(tag_name)
 
     @property
     def rpdos(self) -> list[Rpdo]:
-        """Those that this driver sends."""
+        """The RPDOs that this driver sends."""
         return list(dict.fromkeys(self._rpdos.values()))
 
     async def send_rpdo(self, rpdo: Rpdo, values: Mapping[str, bytes]) -> None:
-        """Send one frame with `values` by tag. Process data waits in no queue: the newest value is the one that counts."""
+        """Send one frame with `values` by tag. Process data is not queued: only the newest value counts."""
         if self.identity_error:
             raise NotAllowed("another node answers: nothing is written to it", got=self.identity_error).at(
                 self.config.where
@@ -371,7 +391,7 @@ class CanopenDriver(DeviceDriver):
         return value
 
     async def _read(self, what: str) -> list[DATA]:
-        """Read a poll group over SDO, without what TPDOs bring. What the node refuses has no value."""
+        """Read a poll group over SDO, except the tags that TPDOs bring. A tag that the node refuses has no value."""
         brought = self.pdo_tags
         for tag in self.profile.group(what):
             if f"{self.config.name}.{tag.name}" not in brought:
@@ -398,7 +418,7 @@ class CanopenDriver(DeviceDriver):
         await self.master.sdo_download(self.node, *tag.object, item.data)
 
     def command(self, tag_name: str, value: float) -> COMMAND:
-        """The command that writes `value` to a tag's object. Raises `NotAllowed` outside its limits."""
+        """Return the command that writes `value` to a tag's object. Raises `NotAllowed` outside its limits."""
         tag = self.profile.tags.get(tag_name)
         if tag is None or not tag.writable:
             raise NotAllowed(f"the tag {tag_name!r} cannot be written", where=self.config.where)

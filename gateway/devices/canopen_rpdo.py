@@ -1,7 +1,7 @@
-"""The process data that a node is sent: what stands in each RPDO, and which of its RPDOs we may fill at all.
+"""The process data that a node receives: the contents of each RPDO, and which of its RPDOs the gateway may send.
 
-An RPDO carries all of its objects each time, so that it may be used only where each of them may be written, and is filled
-from what the node held when it was brought up. Pure: it must never know a bus, a master or when something is sent.
+An RPDO carries all of its objects each time. So it may be used only if each of them may be written, and it is filled
+with what the node held when it was brought up. This module must not know a bus, a master or the time of sending.
 """
 
 from __future__ import annotations
@@ -18,17 +18,18 @@ BITS = {
     "bool": 8, "int8": 8, "uint8": 8, "int16": 16, "uint16": 16, "int32": 32, "uint32": 32, "int64": 64, "uint64": 64,
     "float32": 32, "float64": 64,
 }  # fmt: skip
-"""Bits of a tag's object; a BOOLEAN object may be mapped with 1."""
+"""The size in bits of a tag's object; a BOOLEAN object may also be mapped with 1 bit."""
 
 DUMMY_MAX = 0x1F
-"""Objects up to here are data types: in a mapping, a gap (7.4.8)."""
+"""Objects up to this index are data types: in a mapping they are gaps (7.4.8)."""
 
 ObjectTags = Mapping[tuple[int, int] | None, Tag]
 
 
 @dataclass(eq=False)
 class Rpdo:
-    """One RPDO. `held` is what the node last was told, object by object; `repeat_ms` 0: sent only when something changes."""
+    """One RPDO. `held` is what was last sent to the node, object by object; `repeat_ms` 0: sent only when a value
+    changes."""
 
     number: int
     cob_id: int
@@ -39,11 +40,11 @@ class Rpdo:
     repeat_ms: int = 0
 
     def frame(self, values: Mapping[str, bytes]) -> CanFrame:
-        """The frame with `values` (tag: bytes, little endian) in place of what is held."""
+        """Return the frame with `values` (tag: bytes, little endian) in place of what is held."""
         return CanFrame(self.cob_id, self.mapping.pack(self._with(values)))
 
     def sent(self, values: Mapping[str, bytes]) -> None:
-        """`frame(values)` is on the bus: that is what the node holds."""
+        """Note that `frame(values)` was sent: these are the values that the node holds."""
         self.held = self._with(values)
 
     def _with(self, values: Mapping[str, bytes]) -> list[bytes]:
@@ -51,12 +52,12 @@ class Rpdo:
 
 
 def is_gap(entry: PdoEntry) -> bool:
-    """Whether a mapped object is none, but room."""
+    """Return whether a mapped entry is a gap and not an object."""
     return entry.index <= DUMMY_MAX
 
 
 def tags_in(mapping: PdoMapping, by_object: ObjectTags) -> tuple[str, ...]:
-    """The tag of each mapped object, "" for a gap and for an object that is no tag of this size."""
+    """Return the tag of each mapped object; "" for a gap and for an object without a tag of this size."""
     return tuple(_tag_of(entry, by_object) for entry in mapping.entries)
 
 
@@ -70,10 +71,10 @@ def _tag_of(entry: PdoEntry, by_object: ObjectTags) -> str:
 def usable(
     held: Collection[PdoConfig], by_object: ObjectTags, writable: Collection[str], taken: Collection[str] = ()
 ) -> list[PdoConfig]:
-    """Those of a node's RPDOs that we may send: enabled, each object in `writable`, and no tag in two of them.
+    """Return those of a node's RPDOs that we may send: enabled, each object in `writable`, and no tag in two of them.
 
-    `taken` are tags that another RPDO has already: a second one would put back what the first changed. The RPDO with the
-    most tags comes first, so that what belongs together goes in one frame.
+    `taken` are tags that another RPDO carries already: a second RPDO would restore the value that the first changed.
+    The RPDO with the most tags comes first, so that related values go in one frame.
     """
     candidates = []
     for config in held:

@@ -1,8 +1,8 @@
 """The driver's value codec: registers or object bytes to engineering values and back.
 
-The emulator has one of its own and shares nothing with this (a bug in a shared codec would cancel itself out).
-Registers are 16 bit, big endian on the wire (Modbus AP 4.2). `order` says how the bytes of a value longer than one register
-stand: ABCD big endian, CDAB words swapped, BADC bytes swapped within words, DCBA little endian.
+The emulator has its own codec and shares no code with this one, because a bug in a shared codec would cancel itself
+out. Registers have 16 bits and are sent in big-endian order (Modbus AP 4.2). `order` is the byte order of a value
+longer than one register: ABCD big endian, CDAB words swapped, BADC bytes swapped within words, DCBA little endian.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ _FORMATS = {
     "uint64": ">Q", "float32": ">f", "float64": ">d",
 }  # fmt: skip
 _UNPACK = {kind: struct.Struct(form).unpack for kind, form in _FORMATS.items()}
-_GOOD, _NO_REASON = Quality.GOOD, Reason.NONE  # an Enum's members are slow to look up
+_GOOD, _NO_REASON = Quality.GOOD, Reason.NONE  # local names, because looking up an Enum's members is slow
 
 
 def reorder(data: bytes, order: str) -> bytes:
-    """Bring the bytes of one value into big-endian order, or back: every order is its own inverse."""
+    """Convert the bytes of one value to big-endian order, or back: every order is its own inverse."""
     if order == "ABCD" or len(data) < 2:
         return data
     words = [data[i : i + 2] for i in range(0, len(data), 2)]
@@ -37,16 +37,16 @@ def reorder(data: bytes, order: str) -> bytes:
 
 
 def decode(tag: Tag, data: bytes, t_ns: int) -> TagValue:
-    """The value of `tag` from its register bytes as on the wire. Text ends at the first NUL; its registers keep their
-    order whatever `order` says, its bytes are swapped where that swaps bytes.
+    """Return the value of `tag` from its register bytes as received.
 
-    Not a number, a digit that is none and a sentinel are bad values and never good ones; a value outside the profile's range
-    is uncertain.
+    Text ends at the first NUL. The registers of a text keep their sequence whatever `order` is; its bytes are swapped
+    if `order` swaps bytes within words. NaN, an invalid digit and a sentinel are bad values, never good ones; a value
+    outside the profile's range is uncertain.
     """
-    if tag.type in _UNPACK:  # most are numbers
+    if tag.type in _UNPACK:  # the most frequent case: a number
         return _decode_number(tag, data if tag.order == "ABCD" else reorder(data, tag.order), data, t_ns)
     if tag.type == "string":
-        swapped = tag.order in ("BADC", "DCBA")  # characters change places within a register, registers never do
+        swapped = tag.order in ("BADC", "DCBA")  # characters are swapped within a register; registers are never swapped
         text = (
             (reorder(data, "BADC") if swapped else data).split(b"\0", 1)[0].decode("ascii", errors="replace").rstrip()
         )
@@ -59,7 +59,7 @@ def decode(tag: Tag, data: bytes, t_ns: int) -> TagValue:
 
 
 def _decode_number(tag: Tag, ordered: bytes, data: bytes, t_ns: int) -> TagValue:
-    """The value of the big-endian bytes `ordered`, which were `data` on the wire."""
+    """Return the value of the big-endian bytes `ordered`, which were received as `data`."""
     if tag.sentinels and int.from_bytes(ordered) in tag.sentinels:
         return TagValue(None, Quality.BAD, Reason.SENTINEL, t_ns, data)
     unpack = _UNPACK.get(tag.type) if tag.bits is None else None
@@ -68,14 +68,15 @@ def _decode_number(tag: Tag, ordered: bytes, data: bytes, t_ns: int) -> TagValue
         return TagValue(None, Quality.BAD, Reason.NOT_A_NUMBER, t_ns, data)
     value = (
         number if tag.scale == 1.0 and tag.offset == 0.0 else number * tag.scale + tag.offset
-    )  # whole ones stay whole
+    )  # an integer stays an integer
     if tag.range is not None and not tag.range[0] <= value <= tag.range[1]:
         return TagValue(value, Quality.UNCERTAIN, Reason.OUT_OF_RANGE, t_ns, data)
     return TagValue(value, _GOOD, _NO_REASON, t_ns, data)
 
 
 def _odd_number(tag: Tag, ordered: bytes) -> int | None:
-    """Decimal digits, or some bits, of big-endian bytes; None for digits that are none (a BCD digit above 9)."""
+    """Return the number in decimal digits, or in some bits, of big-endian bytes; None for an invalid digit (a BCD digit
+    above 9)."""
     if tag.type.startswith("bcd"):
         digits = ordered.hex()
         return int(digits) if digits.isdigit() else None
@@ -85,7 +86,8 @@ def _odd_number(tag: Tag, ordered: bytes) -> int | None:
 
 
 def apply_scale(tag: Tag, value: TagValue, exponent: TagValue | None) -> TagValue:
-    """`value` times ten to the power that its scale-factor register holds (SunSpec). Without one it is bad, not unscaled."""
+    """Return `value` times ten to the power in its scale-factor register (SunSpec). Without a valid factor the value is
+    bad, not unscaled."""
     if not isinstance(value.value, int | float):
         return value
     if exponent is None or not isinstance(exponent.value, int) or not -10 <= exponent.value <= 10:
@@ -94,14 +96,14 @@ def apply_scale(tag: Tag, value: TagValue, exponent: TagValue | None) -> TagValu
 
 
 def decode_little(tag: Tag, data: bytes, t_ns: int) -> TagValue:
-    """The value of `tag` from a CANopen object's bytes, which are little endian (CiA 301, 7.1.4)."""
+    """Return the value of `tag` from a CANopen object's bytes, which are little endian (CiA 301, 7.1.4)."""
     if tag.type in _FORMATS:
         return _decode_number(tag, data[::-1], data, t_ns)
     return decode(tag, data, t_ns)
 
 
 def encode(tag: Tag, value: Scalar) -> bytes:
-    """Register bytes of an engineering value. Raises `NotAllowed` for what the tag cannot hold."""
+    """Return the register bytes of an engineering value. Raises `NotAllowed` for a value that the tag cannot hold."""
     if isinstance(value, str | bytes) or tag.type in ("string", "bytes"):
         raise NotAllowed(f"{tag.name}: text cannot be written", expected=f"a number for {tag.type}", got=repr(value))
     low_high = tag.limits
@@ -115,19 +117,21 @@ def encode(tag: Tag, value: Scalar) -> bytes:
     number = value if tag.scale == 1.0 and tag.offset == 0.0 else (value - tag.offset) / tag.scale
     try:
         return reorder(_packed(tag.type, number), tag.order)
-    except (struct.error, OverflowError, ValueError) as e:  # a `range` wider than the type, a float too large
+    # a `range` wider than the type, or a float that is too large
+    except (struct.error, OverflowError, ValueError) as e:
         raise NotAllowed(
             f"{tag.name}: the value is outside its limits", expected=f"what a {tag.type} can hold", got=f"{value:g}"
         ) from e
 
 
 def _packed(kind: str, number: float) -> bytes:
-    """Big-endian bytes of a raw number. Raises `struct.error`, `OverflowError` or `ValueError` where it does not fit."""
+    """Return the big-endian bytes of a raw number. Raises `struct.error`, `OverflowError` or `ValueError` if it does
+    not fit."""
     if kind.startswith("bcd"):
         digits = f"{round(number):0{4 * REGISTERS_OF[kind]}d}"
         if len(digits) > 4 * REGISTERS_OF[kind]:
             raise OverflowError(number)
-        return bytes.fromhex(digits)  # a sign is no digit: ValueError
+        return bytes.fromhex(digits)  # a negative number raises ValueError, because its sign is not a digit
     if kind.startswith("float"):
         packed = struct.pack(_FORMATS[kind], number)
         if not math.isfinite(struct.unpack(_FORMATS[kind], packed)[0]):

@@ -1,4 +1,4 @@
-"""What the gateway is told about its buses and devices: frozen, resolved, without a word on what is emulated."""
+"""The configuration of buses and devices: frozen and resolved, without any information about emulation."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ from fieldtwin.gateway.devices.canopen_config import CanopenBusConfig, CanopenNo
 
 @dataclass(frozen=True)
 class BusConfig:
-    """A bus and the plant's endpoint of it. `bitrate` (bit/s) is for CAN only; what follows it is for Modbus.
+    """A bus and the plant's endpoint for it. `bitrate` (bit/s) is for CAN only; the fields after it are for Modbus.
 
-    `spacing_s` is a pause behind every exchange, `turnaround_s` that behind a broadcast, `connect_pause_s` the one after
-    the connection was opened. `echo`: what is sent comes back first. `strict`: RTU silences as SL 2.5.1.1 has them.
-    `probe_share` of the bus's time, at most, goes to devices that do not answer while others do.
+    `spacing_s` is a pause after every exchange, `turnaround_s` a pause after a broadcast, `connect_pause_s` a pause
+    after the connection was opened. `echo`: sent bytes are received back first. `strict`: RTU silences as in SL
+    2.5.1.1. `probe_share` is the largest share of the bus's time that goes to devices that do not answer while other
+    devices do.
     """
 
     name: str
@@ -36,7 +37,7 @@ class BusConfig:
 class Heartbeat:
     """CANopen heartbeat times in milliseconds: the node's producer time and our consumer time.
 
-    `producer_ms` None: the node's producer time (1017h) is left as it is, and the gateway only listens.
+    `producer_ms` None: the node's producer time (1017h) is not changed, and the gateway only listens.
     """
 
     producer_ms: int | None
@@ -45,7 +46,7 @@ class Heartbeat:
 
 @dataclass(frozen=True)
 class Tpdo:
-    """The tags that TPDO1 of a node shall carry, and its event timer in milliseconds."""
+    """The tags that TPDO1 of a node is to carry, and its event timer in milliseconds."""
 
     tags: tuple[str, ...]
     event_ms: int
@@ -53,13 +54,14 @@ class Tpdo:
 
 @dataclass(frozen=True)
 class DeviceConfig:
-    """A device of the system. `address` is the Modbus unit id (1 to 255) or the CANopen node id (1 to 127).
+    """A device of the system. `address` is the Modbus unit ID (1 to 255) or the CANopen node ID (1 to 127).
 
-    `poll` gives each group's period in milliseconds; a group without one is read once after connecting. `phase` is where
-    in its period a group is read, in milliseconds; the others are spread. `timeout_s` and `retries` None: as the bus.
-    `spacing_s` is the device's pause behind each exchange with it. While it does not answer it is left alone for
-    `backoff_first_s`, then twice as long, up to `backoff_limit_s`.
-    `writable` and `safe` are what the system file allows to be written, and what is written when the controller is lost.
+    `poll` gives each group's period in milliseconds; a group without one is read once after connecting. `phase` is the
+    offset within its period at which a group is read, in milliseconds; the other groups are spread evenly. `timeout_s`
+    and `retries` None: as configured for the bus. `spacing_s` is the device's pause after each exchange with it. A
+    device that does not answer is left alone for `backoff_first_s`, then twice as long, up to `backoff_limit_s`.
+    `writable` holds the tags that the system file allows to be written, and `safe` the values that are written when the
+    controller is lost.
     """
 
     name: str
@@ -72,7 +74,7 @@ class DeviceConfig:
     writable: frozenset[str] = frozenset()
     safe: dict[str, float] = field(default_factory=dict)
     write_groups: dict[str, tuple[str, ...]] = field(default_factory=dict)
-    """By name: tags that are written whole or not at all, in the order in which they are written."""
+    """By group name: tags that are written together or not at all, in the order in which they are written."""
     heartbeat: Heartbeat | None = None
     tpdo1: Tpdo | None = None
     start: bool = False
@@ -86,6 +88,6 @@ class DeviceConfig:
 
     @property
     def where(self) -> str:
-        """For messages: device, bus and address."""
+        """Device, bus and address, for messages."""
         kind = "unit" if self.profile.protocol == "modbus" else "node"
         return f"{self.name} ({self.bus} {kind} {self.address})"

@@ -1,7 +1,7 @@
 """SPEC row DeviceDriver: one concrete connection, an emitter and a consumer.
 
-Send is consume ; write. Receive is read ; emit. A driver opens nothing (it is attached to a connection that the runtime
-opened through a Connector), knows no clock but the one it is given, and cannot tell an emulator from the device.
+Send is consume ; write. Receive is read ; emit. A driver opens no connection (it is attached to one that the runtime
+opened through a Connector), uses only the clock it is given, and cannot distinguish an emulator from the device.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from fieldtwin.gateway.devices.config import DeviceConfig
 
 
 class TagSink(Protocol):
-    """Where a driver's values go: the runtime's tag table."""
+    """The destination of a driver's values: the runtime's tag table."""
 
     def put(self, name: str, value: TagValue) -> None:
-        """Take the newest value of the tag `name` (``device.tag``)."""
+        """Store the newest value of the tag `name` (``device.tag``)."""
         ...
 
     def put_bad(self, names: list[str], reason: Reason) -> None:
-        """Every tag of `names` is bad from now on; its last value and time stay readable."""
+        """Mark every tag of `names` as bad from now on; its last value and time stay readable."""
         ...
 
 
 class DeviceDriver(ABC):
-    """A driver of one device. Concrete ones name the kinds of connection they accept in `wire_types`."""
+    """A driver of one device. Concrete classes list the kinds of connection they accept in `wire_types`."""
 
     wire_types: ClassVar[frozenset[PROTOCOL]]
 
@@ -44,7 +44,7 @@ class DeviceDriver(ABC):
 
     @property
     def command_list(self) -> frozenset[str]:
-        """What this driver can ask of its device; a quirk may add to what the profile says."""
+        """The commands that this driver can send to its device; a quirk may add to those of the profile."""
         return self.profile.command_list
 
     @property
@@ -60,7 +60,7 @@ class DeviceDriver(ABC):
         return [f"{self.config.name}.{t.name}" for t in self.profile.tags.values() if t.readable]
 
     def attach(self, connection: ByteConnection | CanConnection) -> None:
-        """Init: from now on this connection; what waited to be sent over an earlier one stays queued."""
+        """Init: use this connection from now on; items that waited to be sent over an earlier one stay queued."""
         if connection.inbound.type not in self.wire_types:
             raise FileInvalid(
                 f"device {self.config.name!r} cannot stand on this bus",
@@ -71,8 +71,8 @@ class DeviceDriver(ABC):
         self._connection = connection
 
     def reconfigure(self, config: DeviceConfig) -> None:
-        """From now on `config`: the same device at the same place, with other limits, scaling or pace. Never while
-        something is being read or written."""
+        """Use `config` from now on: the same device at the same address, with different limits, scaling or timing. Must
+        not be called while something is being read or written."""
         self.config, self.profile = config, config.profile
 
     def check(self, command: COMMAND) -> None:
@@ -83,14 +83,14 @@ class DeviceDriver(ABC):
             )
 
     def command(self, tag_name: str, value: float) -> COMMAND:
-        """The command that writes `value` (engineering units) to a tag. Raises `NotAllowed` for what cannot be written, or is
-        outside of its limits."""
+        """Return the command that writes `value` (engineering units) to a tag. Raises `NotAllowed` for a tag that
+        cannot be written, or a value outside its limits."""
         raise NotAllowed(f"the tag {tag_name!r} cannot be written", where=self.config.where)
 
     def behaviour(self, name: str) -> tuple[COMMAND, ...]:
-        """The commands that the profile maps to a named behaviour, in its order (SPEC ruling 14).
+        """Return the commands that the profile maps to a named behaviour, in its order (SPEC ruling 14).
 
-        Raises `NotAllowed` for a name that the profile does not have, and as `command`.
+        Raises `NotAllowed` for a name that the profile does not have, and otherwise as `command`.
         """
         form = self.profile.form
         if name not in form.behaviours:
@@ -99,7 +99,8 @@ class DeviceDriver(ABC):
         return tuple(self.command(form.commands[command], value) for command, value in form.behaviours[name].items())
 
     def change_behaviour(self, name: str) -> int:
-        """ChangeBehavior: the behaviour's commands wait to be sent, all of them or none; how many. Raises as `behaviour`."""
+        """ChangeBehavior: queue the behaviour's commands, all of them or none, and return how many. Raises as
+        `behaviour`."""
         commands = self.behaviour(name)
         for command in commands:
             self.consumer.observe(command)
@@ -108,25 +109,26 @@ class DeviceDriver(ABC):
     async def send(self) -> None:
         """Send: consume ; write. The consumer's queue must not be empty.
 
-        What the device or the configuration refused is gone; what the wire lost stays first in the queue.
+        An item that the device or the configuration refused is dropped; an item that a communication error lost stays
+        first in the queue.
         """
         item = self.consumer.consume()
         try:
             await self._write(item)
         except (DeviceRefused, NotAllowed):
             raise
-        except BaseException:  # a cancelled write may or may not have arrived: it is sent again under its own name
+        except BaseException:  # a cancelled write may or may not have arrived, so it is sent again under the same name
             self.consumer.put_back(item)
             raise
 
     async def receive(self, what: str) -> None:
-        """Receive: read ; emit. `what` is a poll group, or whatever else the driver reads by name."""
+        """Receive: read ; emit. `what` is a poll group, or anything else that the driver reads by name."""
         for item in await self._read(what):
             self.emitter.emit(item)
 
     @abstractmethod
     async def _write(self, item: DATA) -> None:
-        """Carry out what was consumed. Raises the errors of the wire or of the device."""
+        """Carry out what was consumed. Raises communication errors or errors of the device."""
 
     @abstractmethod
     async def _read(self, what: str) -> list[DATA]:

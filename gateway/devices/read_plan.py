@@ -1,9 +1,10 @@
-"""How a poll group is read: the fewest transactions, and what a device taught about its gaps.
+"""How a poll group is read: in the fewest transactions, and without the gaps that the device was found to have.
 
-Neighbouring registers are read together, over gaps up to a profile's `max_gap`. A device that refuses such a read with exception
-02 (address) or 03 (too many) has a gap in it or a limit of its own: the read is halved until all parts are taken or single, and
-what was proved on the way is kept and offered for the profile (catalogue case 25). Proved means: both sides of a gap are taken
-and the two together are not. A value or a message is never split over two transactions.
+Neighbouring registers are read together, over gaps up to a profile's `max_gap`. A device that refuses such a read with
+exception 02 (address) or 03 (too many) has a gap in it or a limit of its own. The read is then halved until each part
+is accepted or is a single value. What was proved on the way is kept and offered for the profile (case 25 of the
+test-case list). A gap is proved when both sides of it are accepted and the two together are not. A value or a message
+is never split over two transactions.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from functools import cached_property
 from fieldtwin.gateway.core.profile import DeviceProfile, Message, RegisterRange, Tag
 
 ILLEGAL_ADDRESS, TOO_LONG = 0x02, 0x03
-"""Exceptions (AP 7) that say that a read went over a gap, and that it was too long."""
+"""Exceptions (AP 7) which show that a read covered a gap, and that it was too long."""
 
 Member = tuple[RegisterRange, Tag | Message]
 
@@ -30,19 +31,19 @@ class Read:
 
     @cached_property
     def places(self) -> tuple[tuple[Tag, slice], ...]:
-        """Each tag with where its bytes stand among those that the read brings."""
+        """Each tag with the position of its bytes in the data of the read."""
         return tuple((tag, place_of(tag.registers, self.range)) for tag in self.tags)
 
     @property
     def members(self) -> list[Member]:
-        """What is read, by address; the longer first where two start at one address."""
+        """The tags and messages that are read, by address; the longer first if two begin at one address."""
         both: list[Member] = [(t.registers, t) for t in self.tags]
         both += [(m.at, m) for m in self.messages]
         return sorted(both, key=lambda m: (m[0].address, -m[0].count))
 
 
 def place_of(at: RegisterRange, read: RegisterRange) -> slice:
-    """Where the bytes of `at` stand among those that reading `read` brings: two a register, one a bit."""
+    """Return the position of the bytes of `at` in the data of the read `read`: two bytes per register, one per bit."""
     width = 1 if read.table in ("coil", "discrete") else 2
     start = (at.address - read.address) * width
     return slice(start, start + at.count * width)
@@ -50,11 +51,11 @@ def place_of(at: RegisterRange, read: RegisterRange) -> slice:
 
 @dataclass
 class Learnt:
-    """What a device taught, over all its poll groups.
+    """What was learnt about a device from its refusals, over all its poll groups.
 
-    `gaps` are ranges between two values that no read may go over; one of 0 registers is a border, behind which
-    another read begins (a device that takes fewer registers at once than the profile says). `missing` are tags that it refuses by
-    themselves. `changes` counts what was learnt or unlearnt.
+    `gaps` are ranges between two values that no read may cover. A gap of 0 registers is a border: a new read begins
+    after it (the device accepts fewer registers per read than the profile states). `missing` are tags that the device
+    refuses even when they are read alone. `changes` counts what was learnt or unlearnt.
     """
 
     gaps: list[RegisterRange] = field(default_factory=list)
@@ -72,7 +73,7 @@ class Learnt:
         self.changes += bool(new)
 
     def found(self, tags: Sequence[str]) -> bool:
-        """Tags that were read; True when one of them was missing."""
+        """Note tags that were read; return True if one of them was missing before."""
         back = [t for t in tags if t in self.missing]
         self.missing = [t for t in self.missing if t not in back]
         self.changes += bool(back)
@@ -80,15 +81,17 @@ class Learnt:
 
     @property
     def profile_gaps(self) -> tuple[RegisterRange, ...]:
-        """The gaps as a profile states them, by address: borders are none of it."""
+        """The gaps as a profile states them, by address; borders are not included."""
         return tuple(sorted((g for g in self.gaps if g.count), key=lambda g: (g.table, g.address)))
 
 
 def plan_reads(profile: DeviceProfile, group: str, learnt: Learnt | None = None) -> tuple[Read, ...]:
-    """The fewest transactions that read `group`, in address order: gaps up to `max_gap` are read over, none is longer
-    than `read_registers`, none goes over a gap that the profile states or that was learnt; a missing tag is read by
-    itself. Messages come along with the tag that announces them. Devices that know pairs of registers only
-    (`even_only`) are asked for whole pairs."""
+    """Return the fewest transactions that read `group`, in address order.
+
+    Gaps up to `max_gap` are read over. No transaction is longer than `read_registers`, and none covers a gap that the
+    profile states or that was learnt; a missing tag is read alone. Messages are read with the tag that announces them.
+    Devices that only support pairs of registers (`even_only`) are asked for whole pairs.
+    """
     members: list[Member] = [(t.registers, t) for t in profile.group(group)]
     members += [(m.at, m) for m in profile.messages.values() if profile.tags[m.when].poll == group]
     members.sort(key=lambda m: (m[0].table, m[0].address, -m[0].count))
@@ -112,7 +115,7 @@ def plan_reads(profile: DeviceProfile, group: str, learnt: Learnt | None = None)
 
 
 def _crosses(span: RegisterRange, gap: RegisterRange) -> bool:
-    """Whether `span` goes over `gap`; over a border, when registers of it stand on both sides."""
+    """Return whether `span` covers `gap`; it covers a border if it has registers on both sides."""
     if span.table != gap.table:
         return False
     if not gap.count:
@@ -121,7 +124,7 @@ def _crosses(span: RegisterRange, gap: RegisterRange) -> bool:
 
 
 def _paired(profile: DeviceProfile, at: RegisterRange) -> RegisterRange:
-    """`at`, widened to whole pairs of registers where the device knows nothing else."""
+    """Return `at`, widened to whole pairs of registers if the device only supports pairs."""
     if not profile.form.limits.even_only or at.table in ("coil", "discrete"):
         return at
     first = at.address - at.address % 2
@@ -136,8 +139,8 @@ def _read(profile: DeviceProfile, members: Sequence[Member]) -> Read:
 
 
 def split(profile: DeviceProfile, read: Read) -> tuple[Read, Read] | None:
-    """`read` in two, at the border nearest to its middle that cuts no value (nor pair, where the device knows pairs);
-    None where there is no such border."""
+    """Split `read` in two, at the border nearest to its middle that cuts no value (nor pair, if the device only
+    supports pairs); return None if there is no such border."""
     members = read.members
     borders: list[tuple[int, int]] = []
     end = _paired(profile, members[0][0]).end
@@ -154,7 +157,8 @@ def split(profile: DeviceProfile, read: Read) -> tuple[Read, Read] | None:
 
 @dataclass
 class _Split:
-    """A refused read and its two parts. `taken` are the parts that the device took; with both, the gap is proved."""
+    """A refused read and its two parts. `taken` are the parts that the device accepted; with both, the gap is
+    proved."""
 
     first: Read
     second: Read
@@ -175,14 +179,16 @@ class GroupPlan:
         self.plan_again()
 
     def plan_again(self) -> None:
-        """Make the plan from the profile and what is learnt by now. What is missing is asked for again."""
+        """Make the plan from the profile and what is learnt by now. Missing tags are asked for again."""
         self.reads = list(plan_reads(self._profile, self._group, self.learnt))
         self._splits.clear()
         self._refused_any = self._found_any = False
 
     def refused(self, read: Read, code: int = ILLEGAL_ADDRESS) -> tuple[Read, ...]:
-        """The device refused `read` with exception `code`: what to read instead. Empty when a single value is
-        refused: it is left out."""
+        """Return what to read instead, after the device refused `read` with exception `code`.
+
+        The result is empty when a single value is refused: it is left out of the plan.
+        """
         self._refused_any = True
         parts = split(self._profile, read) or ()
         self.reads = [r for known in self.reads for r in (parts if known == read else (known,))]
@@ -193,21 +199,24 @@ class GroupPlan:
         return parts
 
     def taken(self, read: Read) -> None:
-        """The device answered `read`."""
+        """Note that the device answered `read`."""
         if self.learnt.missing:
             self._found_any |= self.learnt.found([t.name for t in read.tags])
         if not self._splits or (whole := self._splits.get(read)) is None:
             return
         whole.taken.add(read)
         first, second = whole.first, whole.second
-        if len(whole.taken) == 2:  # a side that was refused explains the refusal of the whole by itself
+        if len(whole.taken) == 2:  # if a part was also refused, that alone explains the refusal of the whole
             gap = second.range.address - first.range.end if whole.code == ILLEGAL_ADDRESS else 0
             self.learnt.learn_gap(RegisterRange(first.range.table, first.range.end, gap))
             del self._splits[first], self._splits[second]
 
     def pass_ended(self) -> None:
-        """Every read was answered or refused. After a refusal what was halved for nothing is joined again, and what is
-        missing stays out. Where nothing is left, one value is still asked for: when it is there, so may be the others."""
+        """End a pass, in which every read was answered or refused.
+
+        After a refusal, reads that were halved without need are joined again, and missing tags stay out. If no read is
+        left, one value is still asked for: when the device has it, it may also have the others.
+        """
         if self._found_any:
             self.plan_again()
         elif self._refused_any or not self.reads:

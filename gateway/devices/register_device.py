@@ -1,8 +1,9 @@
-"""Drivers of devices that are registers: poll groups in, single values out.
+"""Drivers of Modbus devices: they read poll groups and write single values.
 
-A group is read in as few transactions as the profile's limits and the device's own holes allow (`read_plan`); a value or a
-message is never split over two (one transaction, one time stamp). Where a profile says that values are *samples*, they
-are as old as the sample and not as the poll: a sensor that answers and does not sample has no good values.
+A group is read in as few transactions as the profile's limits and the gaps in the device's registers allow
+(`read_plan`). A value or a message is never split over two transactions, so it has one time stamp. Where a profile
+declares that values are *samples*, they are as old as the sample, not as the poll: a sensor that answers but does not
+sample has no good values.
 """
 
 from __future__ import annotations
@@ -25,17 +26,18 @@ from fieldtwin.gateway.protocols.modbus.client import ModbusClient, UnitPace
 from fieldtwin.gateway.protocols.modbus.replies import BitsReply, RegistersReply
 
 MOST_REGISTERS, MOST_COILS = 123, 1968
-"""What one request may write (AP 6.11 and 6.12)."""
+"""The most that one request may write (AP 6.11 and 6.12)."""
 SAMPLED_STEPS = 0x80000000
-"""A sample counter that moved by more than this went backwards: the device restarted."""
+"""A step of the sample counter that is larger than this is a step backwards: the device restarted."""
 
 
 NOTHING_READ = 1 << 16
-"""More registers or bits than a device has."""
+"""More registers or bits than a device can have."""
 
 
 class Reading:
-    """A group that is being read, transaction by transaction. `items` are what occurred, once it is complete."""
+    """A poll group that is being read, transaction by transaction. `items` holds what occurred, once the reading is
+    complete."""
 
     __slots__ = ("blocks", "items", "todo", "values", "what")
 
@@ -49,7 +51,7 @@ class Reading:
 
 @dataclass
 class Progress:
-    """How far the writing of several tags got: those that were sent, and those that the device confirmed."""
+    """How far the writing of several tags got: the tags that were sent, and the tags that the device confirmed."""
 
     sent: set[str] = field(default_factory=set)
     confirmed: set[str] = field(default_factory=set)
@@ -58,8 +60,8 @@ class Progress:
 class RegisterDriver(DeviceDriver):
     """A driver of a Modbus device, made from its profile.
 
-    `receive` reads a group at one go. Where others wait for the line, `begin` and then `read_next` until that returns True do
-    the same with one transaction each, and `finish` emits what occurred.
+    `receive` reads a whole group. Where other devices share the bus, call `begin`, then `read_next` until it returns
+    True, which carries out one transaction each time, then `finish`, which emits what occurred.
     """
 
     wire_types = frozenset({PROTOCOL.RS232, PROTOCOL.TCP})
@@ -70,30 +72,30 @@ class RegisterDriver(DeviceDriver):
         self.plans = {group: GroupPlan(self.profile, group, self.learnt) for group in self.profile.groups}
         self.samples_missed = 0
         self.may_trigger = False
-        """Whether this driver may write what makes its device measure: the gateway says so."""
+        """Whether this driver may write the register that makes its device measure; the gateway sets it."""
         self._client: ModbusClient | None = None
         self._sample_count: int | None = None
         self._sample_t_ns = 0
         self._held: dict[str, TagValue] = {}
         self._decoded: dict[str, TagValue] = {}
-        """What each tag's bytes said when they were decoded last: as a rule they are the same again."""
+        """The last decoded value of each tag, because the bytes of a tag usually do not change between polls."""
         self._names = {name: f"{config.name}.{name}" for name in self.profile.tags}
         self._scales = any(tag.scale_by is not None for tag in self.profile.tags.values())
 
     @property
     def message_tag(self) -> str | None:
-        """The full name of the message that this driver emits, if any."""
+        """The full name of the message that this driver emits, or None."""
         return next((f"{self.config.name}.{name}" for name in self.profile.messages), None)
 
     @property
     def client(self) -> ModbusClient:
-        """The Modbus client of the bus that this device stands on."""
+        """The Modbus client of the bus that this device is connected to."""
         if self._client is None:
             raise Bug("a driver without a client was used", where=self.config.where)
         return self._client
 
     def attach_client(self, connection: ByteConnection, client: ModbusClient) -> None:
-        """Use `client`, which talks over `connection`, from now on."""
+        """Use `client`, which communicates over `connection`, from now on."""
         self.attach(connection)
         self._client = client
         client.set_pace(self.config.address, UnitPace(self.config.timeout_s, self.config.spacing_s))
@@ -109,24 +111,26 @@ class RegisterDriver(DeviceDriver):
             self._client.set_pace(config.address, UnitPace(config.timeout_s, config.spacing_s))
 
     def understood(self, tag_name: str, held: TagValue, of: TagValue | None) -> TagValue:
-        """What a tag's bytes mean now; `of` is what the tag that scales it holds."""
+        """Decode a tag's stored bytes under the present configuration; `of` is the value of the tag that scales it."""
         tag = self.profile.tags[tag_name]
         value = decode(tag, held.raw, held.t_ns)
         return apply_scale(tag, value, of) if tag.scale_by is not None else value
 
     def know(self, learnt: Learnt) -> None:
-        """Take over what was learnt in an earlier run, before anything is read. What is missing is asked for once."""
+        """Take over the gaps and missing ranges that were learnt in an earlier run, before anything is read. Missing
+        ranges are asked for once more."""
         self.learnt.gaps = list(learnt.gaps)
         self.learnt.missing = list(learnt.missing)
         self.ask_again()
 
     def ask_again(self) -> None:
-        """The device was away: what it did not have it may have now."""
+        """Plan to ask again for ranges that the device did not have: after an absence it may have them."""
         for plan in self.plans.values():
             plan.plan_again()
 
     def command(self, tag_name: str, value: float) -> COMMAND:
-        """The command that writes `value` (engineering units) to a tag. Raises `NotAllowed` outside its limits."""
+        """Return the command that writes `value` (engineering units) to a tag. Raises `NotAllowed` outside its
+        limits."""
         tag = self.profile.tags.get(tag_name)
         if tag is None or not tag.writable:
             raise NotAllowed(f"the tag {tag_name!r} cannot be written", where=self.config.where)
@@ -135,7 +139,7 @@ class RegisterDriver(DeviceDriver):
     async def identify(self) -> None:
         """Read the identity group and compare it with what the system file expects.
 
-        Raises `WrongDevice` on a difference; the runtime blocks writes then and says so.
+        Raises `WrongDevice` on a difference; the runtime then blocks writes and reports why.
         """
         if not self.config.expect:
             return
@@ -154,19 +158,19 @@ class RegisterDriver(DeviceDriver):
     def cost(self, what: str) -> int:
         """Return how many registers or bits the first transaction of the group `what` reads: the cost of a failed try.
 
-        A group that reads nothing tells nothing about the device, so it costs more than any other.
+        A group that reads nothing shows nothing about the device, so its cost is higher than any other.
         """
         plan = self.plans.get(what)
         return plan.reads[0].range.count if plan is not None and plan.reads else NOTHING_READ
 
     def begin(self, what: str) -> Reading:
-        """Start to read `what`, a poll group. Nothing is sent yet."""
+        """Start to read the poll group `what`. Nothing is sent yet."""
         return Reading(what, self.plans[what].reads)
 
     async def read_next(self, reading: Reading) -> bool:
-        """One transaction of `reading`; True when it was the last one, and all values are published.
+        """Carry out one transaction of `reading`. Return True when it was the last one and all values are published.
 
-        When it raises, the same transaction is next: it may be tried again.
+        When it raises an error, the same transaction is next, so it may be tried again.
         """
         if reading.todo:
             await self._read_block(reading)
@@ -208,7 +212,7 @@ class RegisterDriver(DeviceDriver):
             values[tag.name] = self._decode(tag, raw[place], t_ns)
 
     def _decode(self, tag: Tag, raw: bytes, t_ns: int) -> TagValue:
-        """As `codec.decode`, which is asked when the bytes are others than the last ones."""
+        """Decode as `codec.decode` does, but call it only when the bytes differ from the last ones."""
         last = self._decoded.get(tag.name)
         if last is not None and last.raw == raw:
             return TagValue(last.value, last.quality, last.reason, t_ns, raw)
@@ -216,7 +220,7 @@ class RegisterDriver(DeviceDriver):
         return value
 
     def _complete(self, reading: Reading) -> list[DATA]:
-        """Publish the values of a group that was read; what occurred."""
+        """Publish the values of a group that was read, and return what occurred."""
         values, what = reading.values, reading.what
         for name, value in values.items() if self._scales else ():
             tag = self.profile.tags[name]
@@ -231,7 +235,7 @@ class RegisterDriver(DeviceDriver):
         return [MEASUREMENT(raw[place_of(m.at, read.range)]) for read, raw in reading.blocks for m in read.messages]
 
     def _transaction(self, at: RegisterRange) -> Coroutine[Any, Any, BitsReply | RegistersReply]:
-        """Read a range."""
+        """Read the range `at`."""
         unit = self.config.address
         if at.table == "coil" or at.table == "discrete":
             return self.client.read_bits(unit, at.table, at.address, at.count)
@@ -248,12 +252,12 @@ class RegisterDriver(DeviceDriver):
         self.sink.put(self._names[name], value)
 
     def trigger_wait_ms(self, group: str) -> int:
-        """How long after `trigger` the values of `group` are there; 0 where they need no trigger."""
+        """Return how many milliseconds after `trigger` the values of `group` are ready; 0 if they need no trigger."""
         form = self.profile.form.trigger
         return form.wait_ms if form is not None and form.poll == group else 0
 
     async def trigger(self) -> None:
-        """Ask the device to measure. A write: only with leave (`may_trigger`)."""
+        """Make the device measure. This is a write, so it is allowed only with `may_trigger`."""
         form = self.profile.form.trigger
         if form is None or not self.may_trigger:
             raise NotAllowed("this device may not be triggered", where=self.config.where)
@@ -262,9 +266,10 @@ class RegisterDriver(DeviceDriver):
     # -- samples ----------------------------------------------------------------------------------------------------
 
     def _note_sample(self, values: dict[str, TagValue]) -> bool:
-        """Tell a new sample from an old one, and give every value of the group its age. True for a new sample.
+        """Distinguish a new sample from an old one, and set the age of every value of the group. Return True for a new
+        sample.
 
-        The first count seen is only a base line: how old that sample is, nobody knows.
+        The first count is only a baseline: the age of that sample is unknown.
         """
         sampled = self.profile.sampled
         assert sampled is not None
@@ -289,7 +294,7 @@ class RegisterDriver(DeviceDriver):
         return fresh
 
     def _sample_reason(self, count: int, now_ns: int) -> Reason:
-        """Why the group's values are not good, or NONE."""
+        """Return why the group's values are not good, or NONE."""
         sampled = self.profile.sampled
         assert sampled is not None
         if count == 0:
@@ -304,7 +309,8 @@ class RegisterDriver(DeviceDriver):
     # -- writing ------------------------------------------------------------------------------------------------------
 
     async def _write(self, item: DATA) -> None:
-        """Write a command's tag with one request and read it back: what is published is what the device holds."""
+        """Write a command's tag with one request and read it back, so that the published value is what the device
+        holds."""
         if not isinstance(item, COMMAND):
             raise Bug("a register device takes commands only", got=type(item).__name__, where=self.config.where)
         self.check(item)
@@ -313,10 +319,10 @@ class RegisterDriver(DeviceDriver):
         await self._verify(tag, item)
 
     async def _verify(self, tag: Tag, item: COMMAND) -> None:
-        """Raise `VerifyFailed` where the device holds another value than the one that was written."""
+        """Raise `VerifyFailed` if the device holds a different value than the one that was written."""
         if tag.readable:
             held = await self._read_tag(tag)
-            if int.from_bytes(held.raw) != int.from_bytes(item.data):  # a coil comes back as one byte
+            if int.from_bytes(held.raw) != int.from_bytes(item.data):  # a coil is read back as one byte
                 raise VerifyFailed(
                     f"{item.name}: acknowledged, and not held",
                     expected=item.data.hex(),
@@ -325,8 +331,11 @@ class RegisterDriver(DeviceDriver):
                 )
 
     async def write_together(self, commands: Sequence[COMMAND], progress: Progress) -> None:
-        """Write the tags of `commands` and read each back: with one request where their registers, or coils, are adjacent, else
-        one after another in their order. When this raises, it may be called again with the same `progress` for the rest."""
+        """Write the tags of `commands` and read each of them back: with one request if their registers, or coils, are
+        adjacent, otherwise one after another in their order.
+
+        When this raises an error, it may be called again with the same `progress` for the remaining tags.
+        """
         tags = [self._tag_of(command) for command in commands]
         data = {tag.name: command.data for tag, command in zip(tags, commands, strict=True)}
         together = self._adjacent(tags)
@@ -344,7 +353,7 @@ class RegisterDriver(DeviceDriver):
             progress.confirmed.add(tag.name)
 
     def _adjacent(self, tags: Sequence[Tag]) -> list[Tag]:
-        """`tags` by address, where one request can write them all; else none."""
+        """Return `tags` sorted by address if one request can write them all, otherwise an empty list."""
         ordered = sorted(tags, key=lambda tag: tag.registers.address)
         table, function = ordered[0].registers.table, 15 if ordered[0].registers.table == "coil" else 16
         end = ordered[0].registers.address
@@ -366,8 +375,8 @@ class RegisterDriver(DeviceDriver):
             await self.client.write_registers(self.config.address, first.address, words)
 
     async def _write_tag(self, tag: Tag, data: bytes) -> None:
-        """Write a tag's registers with one request: function 10h, or 06 where the device has no other; a coil with 05, or
-        0Fh where it has no other."""
+        """Write a tag's registers with one request: function 10h, or 06 if the device does not support 10h; a coil with
+        05, or with 0Fh if the device does not support 05."""
         at = tag.registers
         functions = self.profile.form.limits.functions
         if at.table == "coil" and functions is not None and 5 not in functions:
@@ -392,5 +401,5 @@ class SensorDriver(RegisterDriver):
 
 
 def _cells(reply: BitsReply | RegistersReply) -> bytes:
-    """The bytes of registers as on the wire; bits one a byte."""
+    """Return the bytes of registers as they were received; bits as one byte each."""
     return bytes(reply.bits) if isinstance(reply, BitsReply) else reply.raw

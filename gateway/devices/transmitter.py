@@ -1,11 +1,12 @@
 """SPEC row TransmitterDriver: a pure relay between two mailboxes and two queues (SPEC ruling 17).
 
-A mailbox holds one message: sequence, length, payload, in holding registers written in one request; the sequence that
-the taker acknowledges stands elsewhere. 0 is empty; sequences run 1 to 65535 and round to 1. A message whose sequence equals
-the acknowledged one was taken already: duplicates are discarded, and the same command sent twice is two commands.
+A mailbox holds one message: sequence, length and payload, in holding registers that are written with one request. The
+sequence that the receiver acknowledges is in a separate register. 0 means empty; sequences run from 1 to 65535 and then
+start again at 1. A message whose sequence equals the acknowledged one was already taken: duplicates are discarded, and
+the same command sent twice is two commands.
 
-The plant's end and the far end are this same class: there, what comes in are COMMANDs and what goes out are RESPONSEs;
-here, the other way round. Payloads are never looked into.
+The plant's end and the topside end use this same class. At the topside end, COMMANDs come in and RESPONSEs go out; at
+the plant's end it is the reverse. Payloads are never interpreted.
 """
 
 from __future__ import annotations
@@ -25,15 +26,15 @@ _SEQUENCE_AND_LENGTH = struct.Struct(">HH").unpack_from
 
 
 def next_sequence(sequence: int) -> int:
-    """The sequence after `sequence`: 0 is never used, it means an empty mailbox."""
+    """Return the sequence after `sequence`. 0 is never used, because it means an empty mailbox."""
     return 1 if sequence >= LAST_SEQUENCE else sequence + 1
 
 
 class TransmitterDriver(RegisterDriver):
     """A driver of a transmitter on TCP.
 
-    `receive("inbox")` reads the inbox and emits a message that was not taken before; `acknowledge()` frees it.
-    `send()` writes the next queued message; it may be called when `outbox_free`, which `check_outbox()` brings up to date.
+    `receive("inbox")` reads the inbox and emits a message that was not taken before; `acknowledge()` frees it. `send()`
+    writes the next queued message; it may be called when `outbox_free`, which `check_outbox()` updates.
     """
 
     wire_types = frozenset({PROTOCOL.TCP})
@@ -49,12 +50,12 @@ class TransmitterDriver(RegisterDriver):
         self.emitted = b""
         """The whole inbox as it was when its message was emitted."""
         self.taken_before = b""
-        """The same of a message that was taken from here before this driver was there, and perhaps not acknowledged."""
+        """The whole inbox of a message that was taken before this driver existed, and perhaps not acknowledged."""
         self._unconfirmed: tuple[int, DATA] | None = None
-        """What was written under which sequence, until the device confirms it."""
+        """The message that was written, and its sequence, until the device confirms it."""
         self._sent = 0
         self.to_acknowledge = 0
-        """Sequence of the message that was emitted and not acknowledged yet; 0 when there is none."""
+        """The sequence of the message that was emitted and is not acknowledged yet; 0 if there is none."""
         self.outbox_free = False
         self.received = self.sent = self.taken = self.mailbox_waits = 0
 
@@ -68,10 +69,11 @@ class TransmitterDriver(RegisterDriver):
         return f"{self.config.name}.outbox"
 
     async def synchronise(self) -> None:
-        """After (re)connecting: learn from the device what was taken on either side, so that nothing is done twice.
+        """After (re)connecting, read from the device what was taken on either side, so that no message is handled
+        twice.
 
-        What was emitted here and is not acknowledged stays so, and so does what was taken before; what was written and whose
-        reply was lost was sent.
+        A message that was emitted here and is not acknowledged keeps that state, and so does one that was taken before.
+        A message that was written but whose reply was lost counts as sent.
         """
         unit, inbox = self.config.address, self._inbox.at
         held = await self.client.read_registers(unit, "holding", inbox.address, inbox.count)
@@ -123,13 +125,13 @@ class TransmitterDriver(RegisterDriver):
         return [self._incoming(reply.raw[4 : 4 + length])]
 
     async def acknowledge(self) -> None:
-        """Tell the transmitter that the emitted message was taken; its mailbox is free for the next one."""
+        """Acknowledge the emitted message to the transmitter; its mailbox is then free for the next one."""
         if self.to_acknowledge:
             await self.client.write_registers(self.config.address, self._inbox.ack.address, [self.to_acknowledge])
             self.to_acknowledge = 0
 
     async def check_outbox(self) -> bool:
-        """Ask whether the transmitter took the last message. A mailbox still full is a wait, and counted."""
+        """Ask whether the transmitter took the last message. If the mailbox is still full, this counts as a wait."""
         reply = await self.client.read_registers(self.config.address, "holding", self._outbox.ack.address, 1)
         free = reply.registers[0] == self._sent
         self.taken += free and not self.outbox_free

@@ -1,9 +1,10 @@
-"""The gateway between lines: a client's request to the unit behind it, and that unit's answer back.
+"""The bridge: it forwards a client's request to the unit that the request is for, and returns that unit's answer.
 
-Modbus TCP clients reach units on serial lines, a master on a serial line reaches units on TCP. What has no route gets
-exception 0A, what nobody answers 0B, each once (TG 4.4.2.5). The request goes through the target bus's own queue, behind the
-PLC's writes and by turns with its polls; a unit that does not answer is left alone with growing pauses, during which its
-clients get 0B at once and the line is not touched (case MB-062). Every write is on record before it is on the wire.
+Modbus TCP clients reach units on serial lines; a client on a serial line reaches units on TCP. A unit ID without a
+route gets exception 0A, a unit that does not answer gets 0B, each once (TG 4.4.2.5). The request goes through the
+target bus's own queue, after the PLC's writes and alternating with its polls. A unit that does not answer is left alone
+with growing pauses, during which its clients get 0B at once and the bus is not used (case MB-062). Every write is
+recorded in the audit log before it is sent.
 """
 
 from __future__ import annotations
@@ -54,12 +55,12 @@ from fieldtwin.gateway.runtime.bridge_tcp import Answer, Caller, TcpFront
 from fieldtwin.gateway.runtime.modbus_bus import ModbusBus
 
 LAST_LINE_UNIT = 247
-"""Unit ids 248 to 255 are reserved on a serial line (SL 2.2)."""
+"""Unit IDs 248 to 255 are reserved on a serial line (SL 2.2)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Route:
-    """Where a unit id of a client leads: a bus, and the unit id there."""
+    """The target of a client's unit ID: a bus, and the unit ID on it."""
 
     bus: str
     unit: int
@@ -67,12 +68,14 @@ class Route:
 
 @dataclass(frozen=True)
 class BridgeConfig:
-    """`listen` is ``tcp://HOST:PORT`` or ``tls://HOST:PORT`` for clients, or a serial line whose master asks us.
+    """One bridge. `listen` is ``tcp://HOST:PORT`` or ``tls://HOST:PORT`` for clients, or a serial line whose client
+    sends requests to us.
 
-    `routes` go first; a unit that is not in them keeps its id on `to`, where that is given. `broadcast`: unit 0 is passed on
-    to every serial line that the bridge reaches, and nobody answers; with `answer_broadcast` we do, once it went out. `queue`
-    bounds what waits for one bus, `in_flight` what one client may have under way. `cache_ms` 0: no cache. `idle_s`: a client
-    that is silent for so long is closed; 0: never.
+    `routes` are searched first; a unit ID that is not in them keeps its ID on the bus `to`, if that is given.
+    `broadcast`: unit ID 0 is forwarded to every serial line that the bridge reaches, and no unit answers; with
+    `answer_broadcast` the bridge answers once the broadcast was sent. `queue` limits the requests that wait for one
+    bus, `in_flight` those that one client may have under way. `cache_ms` 0: no cache. `idle_s`: a client that is silent
+    for this long is closed; 0: never.
     """
 
     name: str
@@ -88,18 +91,18 @@ class BridgeConfig:
     in_flight: int = 16
     idle_s: float = 0.0
     insist: bool = True
-    """Whether a port that cannot be listened on is tried again and again; else that is an error."""
+    """Whether a port that cannot be opened is tried again and again; otherwise that is an error."""
 
     @property
     def buses(self) -> set[str]:
-        """The buses that it leads to."""
+        """The buses that the bridge forwards to."""
         return {r.bus for r in self.routes.values()} | ({self.to} if self.to else set())
 
 
 @dataclass
 class BridgeCounters:
-    """What became of requests: `no_path` and `refused` never left here; `spared` and `full` were answered without the
-    wire; `silent` had no answer; `unread` were answered and nobody was there any more."""
+    """The outcomes of requests: `no_path` and `refused` were not forwarded; `spared` and `full` were answered without
+    using the bus; `silent` had no answer; `unread` were answered after the client had gone."""
 
     requests: int = 0
     no_path: int = 0
@@ -120,7 +123,8 @@ class _Away:
 
 
 class Bridge:
-    """One bridge, until cancelled. `buses` are the gateway's own; `blocked` says why a unit may not be written to, or ""."""
+    """One bridge, which runs until cancelled. `buses` are the gateway's own; `blocked` returns why a unit must not be
+    written to, or ""."""
 
     def __init__(
         self,
@@ -170,7 +174,7 @@ class Bridge:
         await self.front.run()
 
     def describe(self) -> dict[str, Any]:
-        """For the status."""
+        """Return the bridge's part of the status."""
         return {
             **self.front.describe(),
             **asdict(self.counters),
@@ -181,7 +185,8 @@ class Bridge:
     # -- one request ------------------------------------------------------------------------------------------------
 
     def ask(self, caller: Caller, unit: int, pdu: bytes) -> Answer:
-        """A request for `unit` as the client says it. Never waits; every refusal is an exception response."""
+        """Handle a request for `unit`, the unit ID as the client sent it. Never waits; every refusal is an exception
+        response."""
         self.counters.requests += 1
         try:
             asked, route = self._judged(caller, unit, pdu)
@@ -193,7 +198,8 @@ class Bridge:
             return exception_pdu(e)
 
     def _judged(self, caller: Caller, unit: int, pdu: bytes) -> tuple[Asked, Route | None]:
-        """What is asked, and where it leads; no route is a broadcast. Raises the exception to answer with."""
+        """Return the parsed request and its route; a route of None is a broadcast. Raises the exception to answer
+        with."""
         function = pdu[0] if pdu else 0
         route = self._route(unit)
         broadcast = route is None and unit == 0 and self.config.broadcast
@@ -226,7 +232,8 @@ class Bridge:
         return framing_of(self._buses[bus].config.endpoint) in ("rtu", "ascii")
 
     def _is_ours(self, unit: int) -> bool:
-        """On a shared line we are only the units that lead somewhere; the others are somebody else's (case MB-029)."""
+        """Return whether we answer for a unit ID on a shared line: only for those with a route; the others belong to
+        other devices (case MB-029)."""
         return self._route(unit) is not None or (unit == 0 and self.config.broadcast)
 
     def _place(self, unit: int, route: Route | None) -> str:
@@ -290,7 +297,7 @@ class Bridge:
     def _response(
         self, route: Route, pdu: bytes, asked: Asked, result: ForwardedReply | FieldtwinError
     ) -> bytes | None:
-        """The response PDU; on the way, what the answer says about the unit is noted."""
+        """Return the response PDU, and note what the result shows about the unit."""
         if isinstance(result, ForwardedReply):
             self._away.pop(route, None)
             self.cache.put(route.bus, route.unit, pdu, result.raw, result.t_ns)
@@ -305,8 +312,9 @@ class Bridge:
         return exception_pdu(refusal(asked.function, code))
 
     def _code_of(self, error: FieldtwinError, route: Route) -> int:
-        """What a client is told: the unit's own exception as it is, 0B where nobody answered (properly), 06 where there was
-        no room, 0A where our own wire is gone. Behind TCP that wire is the unit's. Anything else is our own failure, 04."""
+        """Return the exception code for the client: the unit's own exception unchanged, 0B if there was no (valid)
+        answer, 06 if a queue was full, 0A if our own connection is down. If the connection is TCP, it belongs to the
+        unit, so the code is 0B. Any other error is our own failure, 04."""
         match error:
             case ModbusExceptionReply():
                 return error.code
@@ -320,7 +328,8 @@ class Bridge:
                 return SERVER_FAILURE
 
     def _broadcast(self, caller: Caller, pdu: bytes, asked: Asked) -> list[asyncio.Future[bytes | None]]:
-        """To every serial line, once, without retry; nobody answers (case MB-028). What becomes of it on each line."""
+        """Send a broadcast to every serial line, once, without a retry; units do not answer it (case MB-028). Return a
+        future for each line."""
         sent = []
         for name, bus in self._buses.items():
             if not self._is_line(name) or bus.down is not None:

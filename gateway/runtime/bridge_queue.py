@@ -1,7 +1,8 @@
-"""Requests of bridge clients that wait for a bus: bounded, fair between clients, and gone when nobody waits any more.
+"""Requests of bridge clients that wait for a bus: limited in number, fair between clients, dropped when the client has
+gone.
 
-The bus takes one at a time, behind the PLC's writes and never two between two polls that are due. It must never know
-where a request came from or what answers it.
+The bus takes one request at a time, after the PLC's writes, and never two between two polls that are due. This module
+must not know where a request came from or what answers it.
 """
 
 from __future__ import annotations
@@ -16,14 +17,14 @@ from fieldtwin.gateway.protocols.modbus.server import Asked
 from fieldtwin.gateway.protocols.modbus.server_forward import Forwarded, ForwardedReply
 
 MAX_WAIT_NS = 10_000_000_000
-"""Whoever waited for longer has given up: what asked for it then is not worth the wire."""
+"""A client that has waited longer than this has given up, so its request is not sent any more."""
 
 
 @dataclass(eq=False)
 class Guest:
-    """A request for `unit`. `attempts` are left, each a turn of its own.
+    """A request for `unit`. `attempts` is the number of attempts left; each attempt waits for its own turn.
 
-    `done` is called once, with the reply or the error, unless `wanted` has turned False: then nobody waits any more.
+    `done` is called once, with the reply or the error, unless `wanted` returns False: then the client has gone.
     """
 
     client: str
@@ -35,13 +36,14 @@ class Guest:
     done: Callable[[ForwardedReply | FieldtwinError], None]
     wanted: Callable[[], bool]
     before: Callable[[], None] = lambda: None
-    """Called before each attempt, just before it goes on the wire. What it raises is the request's end."""
+    """Called before each attempt, just before it is sent. An error that it raises ends the request."""
     deferred: bool = False
 
 
 @dataclass
 class GuestCounters:
-    """What became of the requests on one bus. `full`: no room; `gone`: nobody waited any more; `stale`: waited too long."""
+    """The outcomes of the requests on one bus. `full`: no room; `gone`: the client had gone; `stale`: waited too
+    long."""
 
     carried: int = 0
     full: int = 0
@@ -58,10 +60,10 @@ class GuestQueue:
     counters: GuestCounters = field(default_factory=GuestCounters)
     _waiting: dict[str, deque[Guest]] = field(default_factory=dict)
     size: int = 0
-    """How many wait."""
+    """How many requests wait."""
 
     def put(self, guest: Guest) -> None:
-        """Put it in line. On a full queue it fails at once, with `EndpointBusy`."""
+        """Queue a request. If the queue is full, the request fails at once with `EndpointBusy`."""
         if self.size >= self.limit:
             self._drop_gone()
         if self.size >= self.limit:
@@ -73,14 +75,14 @@ class GuestQueue:
         self.on_put()
 
     def take(self, now_ns: int) -> Guest | None:
-        """The next one to carry out, of the client whose turn it is."""
+        """Return the next request to carry out, from the client whose turn it is."""
         while self._waiting:
             client, line = next(iter(self._waiting.items()))
             guest = line.popleft()
             self.size -= 1
             del self._waiting[client]
             if line:
-                self._waiting[client] = line  # to the end: the others first
+                self._waiting[client] = line  # move the client to the end, so that the other clients come first
             if not guest.wanted():
                 self.counters.gone += 1
             elif now_ns - guest.queued_ns > MAX_WAIT_NS:
@@ -91,7 +93,8 @@ class GuestQueue:
         return None
 
     async def carry_out(self, guest: Guest, client: ModbusClient, on_line: bool) -> None:
-        """One attempt. What the wire lost goes back in line while attempts are left. Raises `ConnectionLost` only."""
+        """Carry out one attempt. A request that was lost on the bus is queued again while attempts are left. Raises
+        only `ConnectionLost`."""
         guest.attempts -= 1
         request = Forwarded(guest.unit, guest.pdu, guest.asked, on_line=on_line)
         sent_before = client.counters.requests
@@ -100,7 +103,7 @@ class GuestQueue:
             reply = await client.execute(guest.unit, request)
         except (WireError, ConnectionLost) as e:
             if client.counters.requests == sent_before and not guest.deferred:
-                guest.deferred = True  # the connection had ended while it was idle: nothing was sent
+                guest.deferred = True  # the connection had ended while it was idle, so the request was not sent
                 guest.attempts += 1
             if guest.attempts > 0 and guest.wanted():
                 self._waiting.setdefault(guest.client, deque()).appendleft(guest)
@@ -117,7 +120,7 @@ class GuestQueue:
             guest.done(reply)
 
     def fail_all(self, error: FieldtwinError) -> None:
-        """The wire is gone and does not come back soon."""
+        """End all requests with `error`, because the bus is down for a longer time."""
         while self._waiting:
             _, line = self._waiting.popitem()
             for guest in line:
@@ -125,7 +128,7 @@ class GuestQueue:
         self.size = 0
 
     def _drop_gone(self) -> None:
-        """Make room of those whose client went."""
+        """Make room by dropping the requests of clients that have gone."""
         for client, line in list(self._waiting.items()):
             kept = deque(guest for guest in line if guest.wanted())
             self.counters.gone += len(line) - len(kept)

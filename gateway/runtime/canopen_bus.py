@@ -1,9 +1,10 @@
-"""One CAN bus: its connection, the CANopen master on it, and the bringing up of its nodes.
+"""One CAN bus: its connection, the CANopen master on it, and the boot-up procedure of its nodes.
 
-Every node is brought up on its own and again whenever it restarts or was lost: identity, configuration, start, in the order of
-CiA 302-2; a node id that nobody has is given over LSS where the system file says to whom. A node that is up is polled over
-SDO for what no TPDO brings, and takes its outputs (`node_writes`). Configuring, starting, SYNC, TIME, LSS and outputs are
-writes: on a plant that was not allowed, the nodes are listened to and nothing more.
+Every node is brought up separately, and again whenever it restarts or was lost: identity, configuration, start, in the
+order of CiA 302-2. If no node has an expected node ID, the master assigns it over LSS where the system file gives the
+node's LSS address. A node that is up is polled over SDO for the values that no TPDO brings, and receives its outputs
+(`node_writes`). Configuring, starting, SYNC, TIME, LSS and outputs are writes: on a plant where writing is not allowed,
+the gateway only listens to the nodes and reads.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ from fieldtwin.gateway.runtime.poll_schedule import PollSchedule
 from fieldtwin.gateway.runtime.tags import TagTable
 
 SETTLE_NS = 100 * NS_PER_MS
-"""A TPDO or reply that is this much younger than an RPDO shows what the RPDO did, or that it did not."""
+"""A TPDO or reply that is received at least this long after an RPDO shows whether the RPDO took effect."""
 
 
 def _nobody(driver: CanopenDriver) -> None:
@@ -58,12 +59,13 @@ def _nobody(driver: CanopenDriver) -> None:
 
 
 START_AGAIN_S = 2.0
-"""Between a node's leaving OPERATIONAL by itself and its being started again."""
+"""Delay in seconds between a node's leaving OPERATIONAL by itself and the next start."""
 
 
 @dataclass
 class NodeStatus:
-    """What the bus knows about one node. `wanted` is set while it has to be brought up (again), `up` while it is."""
+    """What the bus knows about one node. `wanted` is set while the node has to be brought up (again), `up` while it is
+    up."""
 
     driver: CanopenDriver
     writes: NodeWrites
@@ -73,7 +75,8 @@ class NodeStatus:
     boots: int = 0
     conflicts: int = 0
     conflict: str = ""
-    """The last sign of a second node with this id. It stays, because nothing proves that the second node has gone."""
+    """The last sign of a second node with this node ID. It stays, because nothing proves that the second node has
+    gone."""
     emcy_log: EmcyLog = field(default_factory=EmcyLog)
     bring_ups: int = 0
     polls: int = 0
@@ -97,8 +100,11 @@ class NodeStatus:
 
 
 class CanopenBus:
-    """Runs a bus until cancelled. `on_offline` is called with the driver of a node that was lost, or may have lost what it
-    was told: it restarted, or left OPERATIONAL."""
+    """A CAN bus that runs until cancelled.
+
+    `on_offline` is called with the driver of a node that was lost, or that may have lost its commanded values because
+    it restarted or left OPERATIONAL.
+    """
 
     def __init__(
         self,
@@ -116,7 +122,7 @@ class CanopenBus:
         self.connected = False
         self.opens = 0
         self.locals: deque[str] = deque(maxlen=MOST_LOCALS)
-        """The addresses that we connected from, latest last; empty texts for media without addresses."""
+        """The local addresses of the connections so far, latest last; an empty text for a medium without addresses."""
         self.error = ""
         self._coming: Coming | None = None
         self._nursery: Nursery | None = None
@@ -139,7 +145,7 @@ class CanopenBus:
         return NodeStatus(driver, NodeWrites(driver, clock, self.config.timeout_s), schedule)
 
     def reconfigure(self, coming: Coming) -> None:
-        """Another configuration, taken over between two polls: each node's when nothing of it is being read."""
+        """Take over a new configuration between two polls: each node's part when no group of it is being read."""
         self._coming = coming
         for status in self.nodes.values():
             if not status.reading:
@@ -172,31 +178,33 @@ class CanopenBus:
 
     @property
     def not_produced(self) -> int:
-        """SYNC, TIME and repeated RPDO messages that found no room on the bus within their time, or were overslept."""
+        """SYNC, TIME and repeated RPDO messages that were not sent because the bus did not take them in time, or
+        because their time passed while the gateway did not run."""
         return self._not_produced + sum(status.writes.not_sent for status in self.nodes.values())
 
     def takes(self, driver: CanopenDriver, tag: str) -> bool:
-        """Whether a write of this tag can go out now: the node is up, and OPERATIONAL where it goes by RPDO."""
+        """Return whether a write of this tag can be sent now: the node is up, and also OPERATIONAL if the tag goes by
+        RPDO."""
         status = self.nodes[driver.node]
         if not status.online or self._master is None:
             return False
         if driver.rpdo_of(tag) is not None:
             return driver.operational
-        return self._master.node_state(driver.node) is not NmtState.STOPPED  # no SDO then (7.3.2.2)
+        return self._master.node_state(driver.node) is not NmtState.STOPPED  # a stopped node answers no SDO (7.3.2.2)
 
     def frame_of(self, driver: CanopenDriver, tag: str) -> Rpdo | None:
-        """What the tag shares one frame with; None for one that is written by itself."""
+        """Return the RPDO that carries this tag together with others, or None for a tag that is written by itself."""
         return driver.rpdo_of(tag)
 
     def settle_ns(self, driver: CanopenDriver, tag: str) -> int:
-        """How long after a write the node may still tell the value before it."""
+        """Return for how many nanoseconds after a write the node may still report the value before it."""
         rpdo = driver.rpdo_of(tag)
         if rpdo is None:
             return SETTLE_NS
         return SETTLE_NS + (2 * self.config.canopen.sync_ms * NS_PER_MS if rpdo.synchronous else 0)
 
     def write(self, driver: CanopenDriver, tag: str, command: COMMAND, done: Done) -> None:
-        """Put a write on its way; `done` is told how it ended, at once where it cannot go out."""
+        """Start a write; `done` is called with its result, at once if the write cannot be sent."""
         if not self._allow_writes:
             done(NotAllowed("this plant is read-only", where=driver.config.where))
         elif not self.takes(driver, tag):
@@ -205,20 +213,20 @@ class CanopenBus:
             self.nodes[driver.node].writes.write(tag, command, done)
 
     def totals(self) -> Counter[str]:
-        """Counters over all connections so far."""
+        """Return counters over all connections so far."""
         return self._past + Counter(asdict(self._master.counters)) if self._master else Counter(self._past)
 
     # -- running --------------------------------------------------------------------------------------------------------
 
     async def run(self) -> None:
-        """Open, serve, and open again, until cancelled."""
+        """Open the connection, serve, and open it again, until cancelled."""
         backoff = Backoff(0.25, 5.0)
         for status in self.nodes.values():
             status.schedule.anchor(self._clock.monotonic_ns())
         while True:
             try:
                 connection = await self._connector.open_can(self.config.endpoint, self.config.bitrate)
-            except (Unreachable, UsageError) as e:  # a wrong bit rate can be mended while we run: keep trying
+            except (Unreachable, UsageError) as e:  # a wrong bit rate can be corrected while we run, so keep trying
                 self._lost(e)
                 await self._pause(backoff.next_s())
                 continue
@@ -273,7 +281,7 @@ class CanopenBus:
                 await connection.aclose()
 
     def _producers(self) -> list[Producer]:
-        """SYNC and TIME, where the system file wants them and writing is allowed."""
+        """Return the SYNC and TIME producers that the system file asks for, if writing is allowed."""
         wanted, now_ns = self.config.canopen, self._clock.monotonic_ns()
         made: list[Producer] = []
         if wanted.sync_ms and self._allow_writes:
@@ -283,7 +291,8 @@ class CanopenBus:
         return made
 
     async def _produce(self, producer: Producer, master: CanopenMaster) -> None:
-        """Send what is due when it is due. What the bus does not take within a period is given up, and counted."""
+        """Send each message when it is due. A message that the bus does not take within one period is dropped and
+        counted."""
         while True:
             await self._clock.sleep_until_ns(producer.next_ns)
             missed = producer.missed
@@ -306,7 +315,8 @@ class CanopenBus:
             self._tags.put_bad(status.driver.tag_names, Reason.UNREACHABLE)
 
     def _offline(self, status: NodeStatus, error: FieldtwinError) -> None:
-        """The node is away, or no longer as it was brought up: what was on its way to it ends."""
+        """Mark a node as away, or as no longer configured as it was brought up. Writes on their way to it fail with
+        `error`."""
         status.online, status.error = False, str(error)
         status.up.clear()
         status.schedule.stop()
@@ -316,7 +326,7 @@ class CanopenBus:
     def _online(self, status: NodeStatus) -> None:
         driver = status.driver
         for tag in driver.profile.tags.values():
-            if tag.readable:  # which tags a TPDO brings, and when, may be known only now
+            if tag.readable:  # only now is it known which tags a TPDO brings, and when
                 self._tags.declare([f"{driver.config.name}.{tag.name}"], driver.stale_after_ms(tag))
         status.online, status.error = True, ""
         status.bring_ups += 1
@@ -325,7 +335,7 @@ class CanopenBus:
         status.up.set()
 
     async def _keep_up(self, status: NodeStatus) -> None:
-        """Bring the node up now, and again each time that it is wanted."""
+        """Bring the node up now, and again each time that this is requested."""
         while True:
             await status.wanted.wait()
             status.wanted.clear()
@@ -341,17 +351,17 @@ class CanopenBus:
                 self._failed(status, e)
                 await self._rest(status)
             else:
-                if not status.wanted.is_set():  # else it restarted meanwhile
+                if not status.wanted.is_set():  # otherwise it restarted meanwhile
                     self._online(status)
 
     async def _rest(self, status: NodeStatus) -> None:
-        """Leave a node alone that did not answer, until it says that it booted."""
+        """Leave a node that did not answer alone for the back-off time, or until its boot-up message arrives."""
         with suppress(TimeoutError):
             async with asyncio.timeout(status.backoff.next_s()):
                 await status.booted.wait()
 
     async def _poll(self, status: NodeStatus) -> None:
-        """Read the node's groups in their turn while it is up. Periods that were missed are counted and skipped."""
+        """Read the node's groups when they are due, while it is up. Missed periods are counted and skipped."""
         schedule = status.schedule
         while True:
             await status.up.wait()
@@ -371,7 +381,7 @@ class CanopenBus:
     async def _read_group(self, status: NodeStatus, group: str) -> None:
         driver, master = status.driver, status.driver.master
         if master.node_state(driver.node) is NmtState.STOPPED:
-            return  # it answers no SDO (7.3.2.2): the values grow stale
+            return  # a stopped node answers no SDO (7.3.2.2): the values become stale
         status.polls += 1
         try:
             await driver.receive(group)
@@ -383,7 +393,7 @@ class CanopenBus:
             names = [f"{driver.config.name}.{t.name}" for t in driver.profile.group(group)]
             self._tags.put_bad([name for name in names if name not in brought], reason_of(e))
             if status.online and not driver.is_watched:
-                self._failed(status, e)  # no heartbeat will tell
+                self._failed(status, e)  # without a heartbeat, only this error shows that the node is lost
 
     def _failed(self, status: NodeStatus, error: FieldtwinError) -> None:
         self._offline(status, error)
@@ -391,7 +401,10 @@ class CanopenBus:
         status.wanted.set()
 
     async def _assign(self, driver: CanopenDriver, error: FieldtwinError) -> FieldtwinError:
-        """Nobody has the node's id: give it to the one that shall have it. What went wrong, or `error` where nothing did."""
+        """Assign the node ID, which no node answered to, over LSS to the node that is to have it.
+
+        Return the error of the assignment, or `error` itself if the assignment did not fail.
+        """
         address = driver.config.canopen.lss
         if address is None or self._lss is None or not self._allow_writes:
             return error
@@ -399,9 +412,9 @@ class CanopenBus:
             self._note_lss(driver, address)
             had = await self._lss.assign(address, driver.node)
             if had not in (UNCONFIGURED, driver.node):
-                await driver.master.nmt(NmtCommand.RESET_COMMUNICATION, had)  # it takes the new id when it boots
+                await driver.master.nmt(NmtCommand.RESET_COMMUNICATION, had)  # it takes the new ID when it boots
         except ReplyTimeout:
-            return error  # it is not there at all
+            return error  # no node with this LSS address is on the bus
         except ConnectionLost:
             raise
         except FieldtwinError as e:
@@ -432,7 +445,7 @@ class CanopenBus:
             await driver.send()
 
     def _restate_limits(self, driver: CanopenDriver) -> None:
-        """How old values may be depends on whether the node's heartbeat is heard."""
+        """State again how old values may become: that depends on whether the node's heartbeat is received."""
         for tag in driver.profile.tags.values():
             if tag.readable:
                 self._tags.restate(f"{driver.config.name}.{tag.name}", driver.stale_after_ms(tag))
@@ -443,7 +456,7 @@ class CanopenBus:
             return
         status.driver.on_event(event)
         if event.kind == "state" and status.online and status.driver.config.heartbeat is not None:
-            self._restate_limits(status.driver)  # a first heartbeat begins the watch
+            self._restate_limits(status.driver)  # monitoring starts with the first heartbeat
         if event.kind == "boot-up":
             status.boots += 1
             status.emcy_log.restarted()
@@ -464,8 +477,12 @@ class CanopenBus:
             status.emcy_log.add(parse_emcy(event.data), event.t_ns)
 
     def _start_again(self, status: NodeStatus) -> None:
-        """A node that we started fell back by itself, as 1029h has it after an error (CiA 301, 7.5.2.32): it is brought up
-        anew, by and by, so that one with a lasting error is not asked without end. Unless somebody started it meanwhile."""
+        """Start a node again that left OPERATIONAL by itself, as object 1029h prescribes after an error (CiA 301,
+        7.5.2.32).
+
+        The node is brought up anew after `START_AGAIN_S`, so that a node with a lasting error is not started without
+        pause, and only if it is still PRE-OPERATIONAL then.
+        """
         master, node = self._master, status.driver.node
 
         def again() -> None:
@@ -477,18 +494,19 @@ class CanopenBus:
 
         if self._allow_writes and not self._stopping:
             if status.start_again is not None:
-                status.start_again.cancel()  # it was started meanwhile, and fell back again
+                status.start_again.cancel()  # it was started meanwhile, and left OPERATIONAL again
             status.start_again = asyncio.get_running_loop().call_later(START_AGAIN_S, again)
 
     async def stop_nodes(self, timeout_s: float) -> None:
-        """On the way out: nodes that we started go back to PRE-OPERATIONAL, where they send no process data."""
+        """Put the nodes that the gateway started back to PRE-OPERATIONAL when it stops, so that they send no process
+        data."""
         self._stopping = True
         if self._master is None or not self._allow_writes:
             return
         for status in self.nodes.values():
             if status.online and status.driver.config.start:
                 name = status.driver.config.name
-                with suppress(Unreachable):  # a log that cannot be written keeps nothing from being stopped
+                with suppress(Unreachable):  # an audit log that cannot be written must not prevent the stop
                     self._audit.note("nmt", name, by="stop", result="asked", what="pre-operational")
                 try:
                     async with asyncio.timeout(timeout_s):

@@ -1,10 +1,12 @@
-"""One Modbus bus: its connection, its queue, its devices' polls. One transaction at a time, writes first in line; then
-polls that are due and the requests of bridge clients, turn by turn. While one unit has its pause, others have the line.
+"""One Modbus bus: its connection, its queue and the polls of its devices.
 
-A device that does not answer costs the others its own timeouts once. Then it is asked once after growing pauses, and all
-such tries together get no more than a stated share of the bus's time while others answer (catalogue case 62). Nothing
-here opens anything but through the Connector, and a connection that ends is opened again for ever, with back-off; until
-then the devices' tags are bad and say why.
+The bus carries one transaction at a time. Writes go first; polls that are due and the requests of bridge clients
+alternate after them. While one unit ID has its pause after a transaction, the bus serves other units.
+
+A device that does not answer costs the other devices its own timeouts once. After that it is asked once per try, after
+growing pauses, and all such tries together get no more than a configured share of the bus's time while other devices
+answer (case 62 of the test-case list). This module opens connections only through the `Connector`. A connection that
+ends is opened again without limit, with back-off; until then the devices' tags are bad and carry the reason.
 """
 
 from __future__ import annotations
@@ -50,7 +52,7 @@ MAX_JOBS = 256
 
 
 def reason_of(error: FieldtwinError) -> Reason:
-    """What a tag's quality says after `error`."""
+    """Return the reason that a tag's quality carries after `error`."""
     if isinstance(error, WrongDevice):
         return Reason.WRONG_DEVICE
     if isinstance(error, GatewayRefusal):
@@ -63,13 +65,13 @@ def reason_of(error: FieldtwinError) -> Reason:
 
 
 ALARM_NS = 10 * NS_PER_S
-"""For how long the devices of a bus are polled with shortened timeouts after one of them fell silent."""
+"""How long the devices of a bus are polled with shortened timeouts after one of them stopped answering."""
 STREAMS = frozenset({"tcp", "tls", "rtu+tcp"})
 
 
 @dataclass
 class Job:
-    """Something to do on the bus before the next poll. `done` is called with None or the error, once."""
+    """A request to carry out on the bus before the next poll. `done` is called once, with None or the error."""
 
     driver: RegisterDriver
     run: Callable[[], Awaitable[None]]
@@ -77,14 +79,14 @@ class Job:
 
 
 MOST_LOCALS = 64
-"""Addresses of ours that are remembered: one for each time that the bus was opened."""
+"""How many local addresses are remembered; each time the bus is opened adds one."""
 
 
 class ModbusBus:
-    """Runs a bus until cancelled. `on_offline` is called with a driver whose device was lost.
+    """A Modbus bus that runs until cancelled. `on_offline` is called with the driver of a device that was lost.
 
-    `offset`, 0 to less than 1, moves its polls within the places that their periods give them, so that a gateway's buses
-    do not all poll at once.
+    `offset`, 0 to less than 1, moves the polls of this bus within the slots that their periods allow, so that the buses
+    of one gateway do not all poll at the same time.
     """
 
     def __init__(
@@ -102,10 +104,10 @@ class ModbusBus:
         self.connected = False
         self.opens = 0
         self.locals: deque[str] = deque(maxlen=MOST_LOCALS)
-        """The addresses that we connected from, latest last; empty texts for media without addresses."""
+        """The local addresses of the connections so far, latest last; an empty text for a medium without addresses."""
         self.error = ""
         self.down: FieldtwinError | None = None
-        """Why the wire could not be opened when that was tried last; None while it is open, or was until just now."""
+        """Why the last attempt to open the bus failed; None while the bus is open, or was open until just now."""
         self.guests = GuestQueue()
         self.guests.on_put = self._wake
         self._guest_was_last = False
@@ -120,12 +122,13 @@ class ModbusBus:
         self._coming: Coming | None = None
         self._jobs: deque[Job] = deque()
         self._awake = False
-        """Somebody wants to be looked at, whether `_serve` sleeps or not."""
+        """Set when the bus has new work to look at, whether `_serve` sleeps or not."""
         self._sleeper: asyncio.Future[None] | None = None
         self._idle = asyncio.Event()
         self._halted = False
         self._alarm_until_ns = 0
-        """Until then, devices that answer are polled with shortened timeouts, because one of them fell silent."""
+        """Until this time, devices that answer are polled with shortened timeouts, because one of them stopped
+        answering."""
         self.latency = Latencies()
         self._past: Counter[str] = Counter()
         self._client: ModbusClient | None = None
@@ -133,11 +136,11 @@ class ModbusBus:
     # -- what others see ----------------------------------------------------------------------------------------------
 
     def online(self, driver: RegisterDriver) -> bool:
-        """True while the device answers and is the right one."""
+        """Return whether the device answers and is the expected one."""
         return any(d.driver is driver and d.online for d in self.devices)
 
     def submit(self, job: Job) -> None:
-        """Put a job in line, ahead of every poll. On a full queue, or without a connection, it fails at once."""
+        """Queue a job, ahead of every poll. If the queue is full or there is no connection, the job fails at once."""
         if not self.connected:
             job.done(Unreachable(f"not connected: {self.error}", where=f"{self.config.name} {self.config.endpoint}"))
         elif len(self._jobs) >= MAX_JOBS:
@@ -147,7 +150,7 @@ class ModbusBus:
             self._wake()
 
     def reconfigure(self, coming: Coming) -> None:
-        """Another configuration, taken over between two polls: each device's when nothing of it is being read."""
+        """Take over a new configuration between two polls: each device's part when no group of it is being read."""
         self._coming = coming
         if self._client is None:
             self._take_over()
@@ -179,14 +182,14 @@ class ModbusBus:
             ring(self._sleeper)
 
     def totals(self) -> Counter[str]:
-        """Counters over all connections so far: requests, replies, timeouts... and `missed_polls`, periods in which a
-        group of a device that was there was not read."""
+        """Return counters over all connections so far: requests, replies, timeouts and so on. `missed_polls` counts the
+        periods in which a group of an online device was not read."""
         totals = self._past + Counter(asdict(self._client.counters)) if self._client else Counter(self._past)
         totals["missed_polls"] = sum(sum(d.schedule.missed.values()) for d in self.devices)
         return totals
 
     async def halt(self, timeout_s: float) -> None:
-        """Send nothing more: return when the request under way has ended, or after `timeout_s` seconds."""
+        """Stop sending: return when the request under way has ended, or after `timeout_s` seconds."""
         self._halted = True
         self._wake()
         if self._client is not None:
@@ -194,12 +197,12 @@ class ModbusBus:
                 async with asyncio.timeout(timeout_s):
                     await self._idle.wait()
             except TimeoutError:
-                pass  # a device that takes its time; the process ends all the same
+                pass  # a slow device; the process ends all the same
 
     # -- running --------------------------------------------------------------------------------------------------------
 
     async def run(self) -> None:
-        """Open, serve, and open again, until cancelled."""
+        """Open the connection, serve, and open it again, until cancelled."""
         backoff = Backoff(0.25, 5.0)
         endpoint = self.config.endpoint
         epoch_ns = self._clock.monotonic_ns()
@@ -296,7 +299,7 @@ class ModbusBus:
                 await self._sleep(min(at_ns, wake_ns))
 
     def _next_job(self, client: ModbusClient, now_ns: int) -> tuple[Job | None, int]:
-        """The first job in line whose unit has had its pause; else None, and when there may be one."""
+        """Return the first queued job whose unit has had its pause, or None, and the time at which to look again."""
         wake_ns = now_ns + NS_PER_S
         for place, job in enumerate(self._jobs):
             ready_ns = client.spaced_ns(job.driver.config.address)
@@ -307,7 +310,7 @@ class ModbusBus:
         return None, wake_ns
 
     async def _carry_guest(self) -> bool:
-        """One request of a bridge client, if any waits."""
+        """Carry out one request of a bridge client, if one waits. Return whether one did."""
         client = self._client
         guest = self.guests.take(self._clock.monotonic_ns()) if client is not None else None
         if guest is None or client is None:
@@ -317,7 +320,7 @@ class ModbusBus:
         return True
 
     async def _sleep(self, until_ns: int | None) -> None:
-        """Until then, or until somebody wakes the bus; None: until that."""
+        """Sleep until `until_ns`, or until `_wake` is called; with None, only until `_wake` is called."""
         if self._awake:
             return
         loop, end = asyncio.get_running_loop(), None
@@ -334,7 +337,7 @@ class ModbusBus:
                 end()
 
     async def _poll(self, client: ModbusClient, device: DeviceState, group: str) -> None:
-        """One turn of a device: a transaction of a group, or first contact."""
+        """Give a device one turn: one transaction of a group, or first contact."""
         begun_ns = self._clock.monotonic_ns()
         device.polls += not device.online or device.reading is None
         unit, probed = device.driver.config.address, not device.online
@@ -365,7 +368,7 @@ class ModbusBus:
                 client.relax(unit)
 
     def _patience_s(self, device: DeviceState, now_ns: int) -> float:
-        """How long a poll of a device that answers waits for it, if others want the line."""
+        """Return how long, in seconds, to wait for a device that answers, when other devices also need the bus."""
         if now_ns < self._alarm_until_ns:
             return self._turns.short_s(device, self.latency.recent_longest_ns, self.config.timeout_s)
         return self._own_s(device)
@@ -377,17 +380,20 @@ class ModbusBus:
     def _silent(
         self, client: ModbusClient, device: DeviceState, error: ReplyTimeout, begun_ns: int, probed: bool
     ) -> None:
-        """A device did not answer. One that did before keeps its place while it has repetitions left; others go on meanwhile.
+        """Handle a device that did not answer. A device that answered before keeps its turn while it has repetitions
+        left; the other devices are polled meanwhile.
 
-        Several devices often fall silent together, by a cut cable. So for a while the others are polled with shortened
-        timeouts too: each of them would cost its whole timeout otherwise, while those that still answer wait.
+        Several devices often stop answering together, because of a cut cable. So for a while the other devices are
+        polled with shortened timeouts too. Otherwise each of them would cost its whole timeout, while the devices that
+        still answer wait.
         """
         if not probed and not device.alone:
             shortened = self._patience_s(device, begun_ns) < self._own_s(device)
             if begun_ns >= self._alarm_until_ns:
                 self._turns.doubt_ns = begun_ns
             self._alarm_until_ns = self._clock.monotonic_ns() + ALARM_NS
-            # A shortened timeout is no proof: a slow device has another try, with more time once its late reply was heard.
+            # A shortened timeout proves nothing: a slow device gets another try, with more time once its late reply was
+            # received.
             tries = max(self._retries_of(device), 1 if shortened else 0)
             if device.reading is not None and device.silences < tries:
                 device.silences += 1
@@ -398,7 +404,7 @@ class ModbusBus:
     def _failed(
         self, client: ModbusClient, device: DeviceState, error: FieldtwinError, begun_ns: int, probed: bool
     ) -> None:
-        """A device is away, or still away; the time that this took counts."""
+        """Record that a device is away, or still away, and charge the time that this try took."""
         device.poll_errors += 1
         self._offline(device, error)
         now_ns = self._clock.monotonic_ns()
@@ -409,7 +415,8 @@ class ModbusBus:
         self._turns.failed(device, begun_ns, now_ns, clear_ns)
 
     def _heard_late(self, client: ModbusClient) -> None:
-        """Devices answered after their shortened timeouts, within their own: they are there, and get more time, now."""
+        """Handle devices that answered after their shortened timeout but within their own: they are present, so they
+        are asked again at once, with more time."""
         for device in self.devices:
             late_ns = client.late_ns.get(device.driver.config.address)
             if late_ns is not None and late_ns <= self._own_s(device) * NS_PER_S:
@@ -417,8 +424,11 @@ class ModbusBus:
         client.late_ns.clear()
 
     async def _bring_online(self, device: DeviceState) -> str:
-        """First contact, or contact again: is it the right device, and where do its mailboxes stand. Which group to read
-        first: where nothing says who it is, that it answers at all is what makes it online."""
+        """Make first contact, or contact again: check the device's identity and where its mailboxes stand. Return the
+        group to read first.
+
+        Where the configuration states no identity to check, the device is online once it answers.
+        """
         driver = device.driver
         if driver.learnt.missing:
             driver.ask_again()
@@ -427,7 +437,7 @@ class ModbusBus:
             await self._attempts(device, driver.synchronise)
         device.schedule.start(self._clock.monotonic_ns())
         group = next(iter(device.schedule.due_ns), "")
-        # Where nothing of it is ever read, nothing can tell.
+        # A device of which nothing is ever read counts as online, because no poll could tell.
         device.online = bool(driver.config.expect) or isinstance(driver, TransmitterDriver) or not group
         if device.online:
             device.error = ""
@@ -435,7 +445,7 @@ class ModbusBus:
         return group if device.alone else min(device.schedule.due_ns, key=driver.cost)
 
     async def _turn(self, device: DeviceState, group: str) -> None:
-        """The next transaction of `group`: its trigger, its first or a further one."""
+        """Carry out the next transaction of `group`: its trigger, its first read or a further read."""
         if not group:
             return
         driver, reading = device.driver, device.reading
@@ -452,7 +462,8 @@ class ModbusBus:
             driver.finish(reading)
 
     async def _trigger(self, device: DeviceState, group: str, now_ns: int) -> bool:
-        """Where a device measures when asked: ask, and come back for the values; others have the bus meanwhile."""
+        """Trigger a device that measures on request, and return True if its values have to be read later. The bus
+        serves other devices meanwhile."""
         driver = device.driver
         wait_ms = driver.trigger_wait_ms(group)
         if not wait_ms or group in device.triggered:
@@ -468,15 +479,16 @@ class ModbusBus:
         return True
 
     def _refused(self, device: DeviceState, group: str, error: DeviceRefused) -> None:
-        """It answers, and says no to this group; the other groups go on.
+        """Handle a device that answers but refuses this group; its other groups go on.
 
-        Busy (06) and acknowledge (05, it takes long) mean later: the last value lives on until it is stale, never a 0
-        in its place, and the device is given time (MB-023, MB-024). The time is the device's: what else of it says so
-        before that is over waits for the same moment, and only who says so behind it makes the next one longer.
+        Busy (06) and acknowledge (05: the request takes long) mean "later": the last value stays valid until it is
+        stale and is never replaced by 0, and the device is given time (MB-023, MB-024). That time belongs to the
+        device: other groups that are refused with "later" before it is over wait until the same moment. Only a refusal
+        after that moment makes the next pause longer.
         """
         device.poll_errors += 1
         device.reading = None
-        if not group:  # it said no when it was asked who it is
+        if not group:  # it refused the request for its identity
             self._offline(device, error)
             return
         device.online, device.error = True, str(error)
@@ -522,8 +534,11 @@ class ModbusBus:
     async def _attempts(
         self, device: DeviceState | None, what: Callable[[], Awaitable[T]], *, later: bool = False
     ) -> T:
-        """Try `1 + retries` times as long as the wire is at fault; what the device refuses is not asked again, nor is
-        one that was away asked more than once. `later`: where other devices wait, silence is not answered here."""
+        """Try up to `1 + retries` times while the error is on the bus. A request that the device refuses is not
+        repeated, and a device that was away is asked only once.
+
+        With `later`, a timeout is raised without a repetition if other devices wait for the bus.
+        """
         retries = self.config.retries
         if device is not None:
             retries = self._retries_of(device) if device.retries_left else 0

@@ -1,7 +1,8 @@
-"""What is on its way to one CANopen node: RPDOs with their newest values, and SDO downloads one behind the other.
+"""Pending writes to one CANopen node: RPDOs with their newest values, and a queue of SDO downloads.
 
-What is offered together goes in one frame. Process data is never queued: a newer value takes an older one's place, whose
-sender is told of the same end. It must never know what is wanted or safe, nor whether writing is allowed at all.
+Values that are offered together go in one frame. Process data is never queued: a newer value replaces an older one, and
+both callers get the result of the same frame. This module must not know which values are wanted or safe, nor whether
+writing is allowed at all.
 """
 
 from __future__ import annotations
@@ -18,12 +19,12 @@ from fieldtwin.gateway.devices.canopen_device import CanopenDriver
 from fieldtwin.gateway.devices.canopen_rpdo import Rpdo
 
 Done = Callable[[FieldtwinError | None], None]
-"""Told once how a write ended."""
+"""Called once with the result of a write."""
 
 
 @dataclass
 class _Staged:
-    """What shall go with an RPDO's next frame, and who waits for that."""
+    """The values for an RPDO's next frame, and the callbacks that wait for it."""
 
     values: dict[str, bytes] = field(default_factory=dict)
     waiting: list[Done] = field(default_factory=list)
@@ -32,12 +33,13 @@ class _Staged:
 class NodeWrites:
     """Writes to the node of `driver`. `timeout_s` is how long the bus may take to accept a frame.
 
-    At most one write of a tag is under way, which its caller sees to: so there are never more than a node has tags.
+    At most one write of a tag is under way, which the caller ensures. So there are never more pending writes than the
+    node has tags.
     """
 
     def __init__(self, driver: CanopenDriver, clock: Clock, timeout_s: float) -> None:
         self.frames = self.not_sent = 0
-        """RPDOs that went out, and repetitions for which the bus had no room."""
+        """RPDOs that were sent, and repetitions that the bus did not accept."""
         self._driver = driver
         self._clock = clock
         self._timeout_s = timeout_s
@@ -47,7 +49,7 @@ class NodeWrites:
         self._rpdo_wake, self._download_wake = asyncio.Event(), asyncio.Event()
 
     def write(self, tag: str, command: COMMAND, done: Done) -> None:
-        """Put one write on its way, by RPDO where the tag has one."""
+        """Start one write, by RPDO if the tag has one."""
         rpdo = self._driver.rpdo_of(tag)
         if rpdo is None:
             self._downloads.append((command, done))
@@ -59,7 +61,7 @@ class NodeWrites:
             self._rpdo_wake.set()
 
     def fail(self, error: FieldtwinError) -> None:
-        """The node or the bus is gone: whatever was on its way ends with `error`."""
+        """End all pending writes with `error`, because the node or the bus was lost."""
         waiting = [done for staged in self._staged.values() for done in staged.waiting]
         waiting += [done for _, done in self._downloads]
         self._staged.clear()
@@ -82,12 +84,12 @@ class NodeWrites:
                 try:
                     await self._driver.send()
                 except ConnectionLost:
-                    raise  # `fail` tells everybody
+                    raise  # `fail` reports it to every caller
                 except FieldtwinError as e:
                     error = e
                 finally:
-                    self._driver.consumer.queue.clear()  # what failed must not go out ahead of something newer
-                if self._downloads and self._downloads[0] is item:  # else it was told already that the node is gone
+                    self._driver.consumer.queue.clear()  # a failed command must not be sent before a newer one
+                if self._downloads and self._downloads[0] is item:  # otherwise `fail` has already ended this write
                     self._downloads.popleft()
                     done(error)
 
@@ -106,7 +108,7 @@ class NodeWrites:
         values, waiting = dict(staged.values), len(staged.waiting)
         error = await self._put_on_bus(rpdo, values)
         if self._staged.get(rpdo) is not staged:
-            return  # the node was lost meanwhile, and everybody told
+            return  # the node was lost meanwhile, and `fail` has reported it to every caller
         ended, staged.waiting = staged.waiting[:waiting], staged.waiting[waiting:]
         staged.values = {tag: data for tag, data in staged.values.items() if values.get(tag) != data}
         if not staged.waiting:
@@ -115,7 +117,7 @@ class NodeWrites:
             done(error)
 
     async def _put_on_bus(self, rpdo: Rpdo, values: dict[str, bytes]) -> FieldtwinError | None:
-        """Send; what went wrong, if something did. Nothing is sent to a node that would not take it."""
+        """Send an RPDO and return the error, or None. Nothing is sent to a node that would not accept it."""
         if not self._driver.operational or rpdo not in self._driver.rpdos:
             return Unreachable("the node is not OPERATIONAL: it takes no process data", where=self._driver.config.where)
         try:
@@ -133,11 +135,11 @@ class NodeWrites:
         return None
 
     async def _repeat(self) -> None:
-        """Once more what has not changed for its time: a node may watch over its RPDOs (1400h:05)."""
+        """Repeat RPDOs that have not changed for their event time: a node may monitor its RPDOs (1400h:05)."""
         now_ns = self._clock.monotonic_ns()
         for rpdo in [r for r, due_ns in self._repeat_ns.items() if due_ns <= now_ns]:
             if rpdo not in self._driver.rpdos or not self._driver.operational:
-                del self._repeat_ns[rpdo]  # it goes on with the next change
+                del self._repeat_ns[rpdo]  # the repetition starts again with the next change
             elif await self._put_on_bus(rpdo, {}) is not None:
                 self.not_sent += 1
                 self._repeat_ns[rpdo] = now_ns + rpdo.repeat_ms * NS_PER_MS
@@ -149,4 +151,4 @@ class NodeWrites:
             async with asyncio.timeout(left_s):
                 await self._rpdo_wake.wait()
         except TimeoutError:
-            pass  # something is to be repeated
+            pass  # an RPDO is due for repetition

@@ -1,4 +1,4 @@
-"""One output: its tag, its device, what is wanted and how far the last write got. It decides nothing."""
+"""One output: its tag, its device, its wanted value and how far the last write got. It makes no decisions."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Output:
     held: float | None = None
     held_since_ns: int = 0
     compared: TagValue | None = None
-    """What the device was last heard to hold, found to be what it was told."""
+    """The last value read from the device that was compared with the sent value and found equal."""
     pending: bool = False
     refused: tuple[float, str] | None = None
     not_a_number: bool = False
@@ -38,17 +38,17 @@ class Output:
     """Since when the output waits for a device that does not answer; `AWAY_REPORTED` once the journal has it."""
     next_try_ns: int = 0
     commanded: bool = False
-    """Whether a program writes it. Else the gateway writes its safe value, and what a client asks for, and nothing more."""
+    """Whether a program writes it. If not, the gateway writes only its safe value and what a client requests."""
     untouched: bool = True
-    """Nothing was written to it yet, and its device was not lost: what the device holds may be what is wanted."""
+    """No value was written to it yet, and its device was not lost: the device may already hold the wanted value."""
     due_since_ns: int | None = None
-    """Since when the first write is due and the device there (monotonic)."""
+    """Since when (monotonic) the first write has been due while the device was online."""
     asked: Callable[[FieldtwinError | None], None] | None = None
-    """Who asked for one write and waits for its end; None for what the PLC or the safe state commands."""
+    """The callback of the client that requested one write; None for what the PLC or the safe state commands."""
 
     @property
     def ready(self) -> bool:
-        """Whether the device takes a write now."""
+        """Whether the device accepts a write now."""
         if isinstance(self.driver, CanopenDriver):
             assert isinstance(self.bus, CanopenBus)
             return self.bus.takes(self.driver, self.local)
@@ -57,21 +57,22 @@ class Output:
 
     @property
     def frame(self) -> object | None:
-        """What it shares one frame with: the same object for each of those outputs. None where it is written by itself."""
+        """The frame that carries this output: the same object for each output that shares it, None for one that is
+        written by itself."""
         if isinstance(self.bus, CanopenBus) and isinstance(self.driver, CanopenDriver):
             return self.bus.frame_of(self.driver, self.local)
         return None
 
     @property
     def settle_ns(self) -> int:
-        """How long after a write the device may still be heard to say what it held before."""
+        """How many nanoseconds after a write the device may still report the value before it."""
         if isinstance(self.bus, CanopenBus) and isinstance(self.driver, CanopenDriver):
             return self.bus.settle_ns(self.driver, self.local)
         return 0
 
     @property
     def read_back(self) -> bool:
-        """Whether the gateway reads it again and again: by polls, or by process data that the node sends."""
+        """Whether the gateway reads it cyclically: by polls, or by process data that the node sends."""
         driver, tag = self.driver, self.driver.profile.tags[self.local]
         if not tag.readable:
             return False
@@ -80,7 +81,7 @@ class Output:
         return any(tag in driver.profile.group(group) for group in driver.config.poll)
 
     def submit(self, command: COMMAND, done: Callable[[FieldtwinError | None], None]) -> None:
-        """Put the write on its way."""
+        """Start the write."""
         if isinstance(self.driver, CanopenDriver):
             assert isinstance(self.bus, CanopenBus)
             self.bus.write(self.driver, self.local, command, done)
@@ -90,11 +91,12 @@ class Output:
             self.bus.submit(Job(self.driver, self.driver.send, done))
 
     def shown(self, value: object) -> object:
-        """`value` as the audit log may show it: a secret is not written down."""
+        """Return `value` as the audit log may show it: a secret is not written down."""
         return "(secret)" if self.driver.profile.tags[self.local].secret else value
 
     def answer(self, error: FieldtwinError | None) -> None:
-        """Tell who asked how it ended. It was for once: nothing is written again behind a person's back."""
+        """Report the result to the client that requested the write. The request was for one write, so the gateway does
+        not write the value again later."""
         asked, self.asked = self.asked, None
         if asked is not None:
             if not self.by.startswith(SAFE):
@@ -103,7 +105,7 @@ class Output:
 
 
 def as_sent(output: Output) -> bytes:
-    """What `output` holds, as it would be sent now; empty where it may not be sent any more."""
+    """Return the bytes that `output` would send now for the value it holds; empty if it may no longer be sent."""
     try:
         return output.driver.command(output.local, output.held).data if output.held is not None else b""
     except NotAllowed:

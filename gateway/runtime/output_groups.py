@@ -1,12 +1,12 @@
-"""Outputs of one device that are written whole or not at all.
+"""Outputs of one device that are written together or not at all.
 
-A drive that is started with its old setpoint because the new one was refused is worse than one that is not started. So the
-members of a group are checked before any of them is written: when a program's value for one of them is refused, or is not there
-yet, the others are held back. Adjacent registers are written with one request, objects that share an RPDO with one frame, and all
-else in the group's order, each write after the one before it was confirmed. What the wire then interrupts is reported, and the
-whole group is written again.
+A drive that is started with its old setpoint because the new one was refused is worse than one that is not started. So
+the members of a group are checked before any of them is written: when a program's value for one of them is refused, or
+does not exist yet, the others are held back. Adjacent registers are written with one request, and objects that share an
+RPDO with one frame. All other members are written in the group's order, each write after the previous one was
+confirmed. If a communication error interrupts the writes, it is reported, and the whole group is written again.
 
-The safe state does not ask: safe values are written one by one, whatever the programs want.
+The safe state is independent of groups: safe values are written one by one, whatever the programs want.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from fieldtwin.gateway.runtime.output import Output
 from fieldtwin.gateway.runtime.refusals import HeldBack
 
 Ended = Callable[[Output, FieldtwinError | None], None]
-"""Called once for each member with how its write ended."""
+"""Called once for each member with the result of its write."""
 
 
 class OutputGroup:
@@ -32,11 +32,11 @@ class OutputGroup:
         self.name = name
         self.outputs = tuple(outputs)
         self.told: tuple[object, ...] = ()
-        """What the journal was told last about values that are held back, so that it is told once."""
+        """The last report to the journal about values that are held back, so that each is reported once."""
 
     @property
     def obstacle(self) -> tuple[Output, str] | None:
-        """The member because of which the group may not be written, and why; None where it may."""
+        """The member that prevents the group from being written, and the reason; None if nothing prevents it."""
         for output in self.outputs:
             if output.not_a_number or (output.wanted is not None and output.refused == (output.wanted, output.by)):
                 return output, f"{output.tag} was refused"
@@ -47,15 +47,15 @@ class OutputGroup:
 
     @property
     def by_programs(self) -> bool:
-        """Whether programs command it: not while any member is at, or on its way to, its safe value."""
+        """Whether programs command the group: False while a member is at its safe value or on the way to it."""
         return all(output.by in ("plc", "") for output in self.outputs)
 
     def differing(self) -> list[Output]:
-        """The members whose device does not hold what is wanted."""
+        """Return the members whose device does not hold the wanted value."""
         return [o for o in self.outputs if o.wanted is not None and o.held != o.wanted]
 
     def submit(self, commands: Sequence[COMMAND], ended: Ended) -> None:
-        """Write all members. `commands` are theirs, in their order."""
+        """Write all members. `commands` are the members' commands, in the same order."""
         first = self.outputs[0]
         if isinstance(first.driver, RegisterDriver) and isinstance(first.bus, ModbusBus):
             self._submit_registers(first.driver, first.bus, commands, ended)
@@ -79,7 +79,8 @@ class OutputGroup:
 
 
 class _InOrder:
-    """Writes outputs one after another, those that share a frame together; after one that failed the others are not sent."""
+    """Writes outputs one after another, and those that share a frame together. After a failed write the rest are not
+    sent."""
 
     def __init__(self, outputs: Sequence[Output], commands: Sequence[COMMAND], ended: Ended) -> None:
         self._ended = ended
@@ -97,7 +98,7 @@ class _InOrder:
         self._error: FieldtwinError | None = None
 
     def next(self) -> None:
-        """Start the next step, or end the rest after a failure."""
+        """Start the next step, or end the remaining steps after a failure."""
         if self._error is not None:
             rest, self._steps = self._steps, []
             for output, _ in (item for step in rest for item in step):
@@ -121,7 +122,7 @@ def _not_sent(output: Output) -> HeldBack:
 
 
 def groups_of(outputs: Sequence[Output]) -> list[OutputGroup]:
-    """The groups that the devices of `outputs` declare."""
+    """Return the groups that the devices of `outputs` declare."""
     found = []
     by_tag = {output.tag: output for output in outputs}
     for config in {id(o.driver): o.driver.config for o in outputs}.values():

@@ -1,10 +1,11 @@
-"""Outputs: what the PLC commands, what is safe, and whether it may be written at all.
+"""Output writing: what the PLC commands, which values are safe, and whether a write is allowed at all.
 
-A dead PLC cannot make anything safe, so the gateway holds each output's safe value and writes it when the PLC's heartbeat
-stops (DESIGN.md, "Who makes outputs safe"). A value is written when it differs from what the device last confirmed; a device
-that comes back, or that reads back something else, gets it again. At the start the writer waits for the first reading of an
-output, and writes nothing where the device holds what is wanted already. Outputs that share one frame (an RPDO) are written
-together. Nothing is written to a plant that was not allowed, and every write and refusal is on record before it is on the wire.
+A stopped PLC cannot make anything safe, so the gateway holds each output's safe value and writes it when the PLC's
+heartbeat stops (DESIGN.md, "Who makes outputs safe"). A value is written when it differs from what the device last
+confirmed; a device that comes back, or that reads back a different value, gets it again. At the start the writer waits
+for the first reading of an output, and writes nothing if the device already holds the wanted value. Outputs that share
+one frame (an RPDO) are written together. Nothing is written to a plant where writing is not allowed, and every write
+and refusal is recorded in the audit log before it is sent.
 """
 
 from __future__ import annotations
@@ -25,15 +26,15 @@ from fieldtwin.gateway.runtime.refusals import Cause, Refusals, cause_of
 from fieldtwin.gateway.runtime.tags import TagTable
 
 MIN_SPACING_NS = 100 * NS_PER_MS
-"""At most ten writes a second to one tag; what changes faster is written with its newest value."""
+"""At most ten writes per second go to one tag; an output that changes faster is written with its newest value."""
 RETRY_NS = NS_PER_S
 AWAY_AFTER_NS = NS_PER_S
-"""An output that has waited so long for its device is reported as refused (cause "away")."""
+"""An output that has waited this long for its device is reported as refused (cause "away")."""
 AWAY_REPORTED = -1
 
 
 class OutputWriter:
-    """Brings every output's device to what is wanted. `tick` starts writes and never waits for one."""
+    """Writes the wanted values to the devices. `tick` starts writes and never waits for one."""
 
     def __init__(self, outputs: list[Output], tags: TagTable, audit: AuditLog, allow_writes: bool) -> None:
         self.outputs = outputs
@@ -41,7 +42,7 @@ class OutputWriter:
         self._group_of = {output.tag: group for group in self._groups for output in group.outputs}
         self.allow_writes = allow_writes
         self.journal = Refusals(audit)
-        """Every write that did not reach its device, and why."""
+        """The journal of every write that did not reach its device, with its cause."""
         self.writes = self.refusals = self.failures = self.rewrites = self.superseded = 0
         """`superseded`: values of programs that a newer value replaced before they were written."""
         self.safe_active = False
@@ -50,8 +51,8 @@ class OutputWriter:
         self._now_ns = 0
 
     def want(self, tag: str, value: float) -> None:
-        """The PLC commands `value`. A value that cannot be written is refused now, not when its turn would come: by then a
-        newer value may have taken its place."""
+        """Take the PLC's command `value` for `tag`. A value that cannot be written is refused now, not when its turn
+        comes: by then a newer value may have replaced it."""
         for output in self.outputs:
             if output.tag == tag and (output.wanted != value or output.by != "plc" or output.not_a_number):
                 self._command(output, value)
@@ -70,7 +71,7 @@ class OutputWriter:
             self.journal.settle(output.tag)
 
     def want_no_number(self, tag: str) -> None:
-        """The PLC's program set the output to something that is not a number: the device keeps what it holds."""
+        """Handle a program that set the output to something that is not a number: the device keeps its value."""
         for output in self.outputs:
             if output.tag == tag and not output.not_a_number:
                 output.not_a_number, output.by = True, "plc"
@@ -79,10 +80,11 @@ class OutputWriter:
                 self.refusals += 1
 
     def request(self, tag: str, value: float, by: str, done: Callable[[FieldtwinError | None], None]) -> None:
-        """A client (`by`) asks for one write of a tag that the PLC does not command. `done` is told how it ended.
+        """Write a tag once for a client (`by`); the tag must not be one that the PLC commands. `done` is called with
+        the result.
 
-        While the outputs are in their safe state, those that have a safe value keep it. A write that is not carried out is in the
-        journal and in the audit log, whatever the reason.
+        While the outputs are in their safe state, those that have a safe value keep it. A write that is not carried out
+        is recorded in the journal and in the audit log, whatever the reason.
         """
         output = next((o for o in self.outputs if o.tag == tag), None)
         where = output.driver.config.where if output is not None else tag
@@ -100,7 +102,7 @@ class OutputWriter:
             self._start(output, value)
 
     def _turned_away(self, output: Output | None, tag: str, where: str) -> tuple[Cause, FieldtwinError | None]:
-        """Why a client's write of a tag is not even started; no error where it is."""
+        """Return why a client's write of a tag is not started; the error is None if it may start."""
         if output is None or output.by == "plc":
             return Cause.NOT_WRITABLE, NotAllowed(f"{tag} cannot be commanded from here", where=where)
         if output.tag in self._group_of:
@@ -118,46 +120,50 @@ class OutputWriter:
         return Cause.NOT_NOW, None
 
     def make_safe(self, why: str) -> None:
-        """Command every output's safe value; outputs without one keep what they have."""
+        """Command every output's safe value; outputs without one keep their value."""
         self.safe_active = True
         for output in self.outputs:
             if output.safe is not None:
                 output.wanted, output.by = output.safe, f"{SAFE}{why}"
 
     def release(self) -> None:
-        """The PLC is back: its commands count again. The gateway leaves alone what no program writes; an output that a program
-        writes keeps its safe value until the program has started."""
+        """Follow the PLC's commands again. The gateway stops writing an output that no program writes; an output that a
+        program writes keeps its safe value until the program has started."""
         self.safe_active = False
         for output in self.outputs:
             if not output.commanded and output.by.startswith(SAFE):
                 output.wanted, output.by = None, ""
 
     def restated(self, driver: RegisterDriver | CanopenDriver, held: Mapping[str, bytes]) -> None:
-        """The configuration of a driver's device is another one. `held` is what it held, as sent, by tag: what that would
-        be sent as otherwise now is written again. What was refused may be allowed now."""
+        """Apply the new configuration of a driver's device.
+
+        `held` is what the device held, as sent, by tag: a value that would now be sent as different bytes is written
+        again. Values that were refused may be allowed now.
+        """
         for output in self.outputs:
             if output.driver is not driver:
                 continue
             output.safe, output.refused = driver.config.safe.get(output.local), None
             if self.safe_active and output.safe is not None and output.by.startswith(SAFE):
                 output.wanted = output.safe
-            # Also what may not be written any more: what is wanted is then refused, and on record.
+            # This includes tags that may no longer be written: the wanted value is then refused, and the refusal is
+            # recorded.
             if output.tag in held and as_sent(output) != held[output.tag]:
                 output.held = None
 
     def as_sent(self, driver: RegisterDriver | CanopenDriver) -> dict[str, bytes]:
-        """What a device's outputs hold, as it was sent."""
+        """Return the values that a device's outputs hold, by tag, as the bytes that were sent."""
         return {o.tag: as_sent(o) for o in self.outputs if o.driver is driver and o.held is not None}
 
     def forget(self, driver: RegisterDriver | CanopenDriver) -> None:
-        """A device was lost: what it holds when it comes back is not known."""
+        """Forget what a lost device holds: after its return the values are unknown."""
         for output in self.outputs:
             if output.driver is driver:
                 output.held, output.untouched = None, False
 
     @property
     def settled(self) -> bool:
-        """True when no output that could be written still differs from what is wanted."""
+        """True when no output that could be written still differs from its wanted value."""
         return not any(
             o.pending or (o.wanted is not None and o.held != o.wanted and self._possible(o)) for o in self.outputs
         )
@@ -166,14 +172,15 @@ class OutputWriter:
         return output.ready and output.refused != (output.wanted, output.by) and not self.held_back(output)
 
     def held_back(self, output: Output) -> bool:
-        """Whether the group of an output is not written, or is the safe state's business, so that the output waits with it."""
+        """Return whether the output has to wait with its group, because the group may not be written or is in its safe
+        state."""
         group = self._group_of.get(output.tag)
         if group is None or output.by.startswith(SAFE):
             return False
         return not group.by_programs or group.obstacle is not None
 
     def tick(self, now_ns: int) -> None:
-        """Start what needs writing now."""
+        """Start the writes that are due now."""
         self._now_ns = now_ns
         due: list[tuple[Output, float]] = []
         unread: set[object] = set()
@@ -186,7 +193,7 @@ class OutputWriter:
                 unread |= {output.tag, output.frame}
                 continue
             if output.tag in self._group_of and not output.by.startswith(SAFE):
-                continue  # with its group, below
+                continue  # written with its group, below
             if output.held == output.wanted or output.refused == (output.wanted, output.by):
                 output.waits_since_ns = None
             elif not output.ready:
@@ -203,7 +210,8 @@ class OutputWriter:
                 self._tick_group(group)
 
     def _waits_for_reading(self, output: Output) -> bool:
-        """Before the first write: whether to wait until the device was read. What it is found to hold is not written again."""
+        """Return whether the first write has to wait until the device was read. A value that the device already holds
+        is not written again."""
         current = self._tags.current(output.tag, self._now_ns)
         if waits_for_reading(output, current, self._now_ns):
             return True
@@ -215,7 +223,8 @@ class OutputWriter:
         return False
 
     def _may(self, output: Output) -> bool:
-        """Whether what is wanted may be written. What may not is refused, also where the device holds it."""
+        """Return whether the wanted value may be written. A value that is not allowed is refused even if the device
+        already holds it."""
         try:
             self._check(output)
             output.driver.command(output.local, output.wanted or 0.0)
@@ -224,7 +233,7 @@ class OutputWriter:
         return output.refused != (output.wanted, output.by)
 
     def _tick_group(self, group: OutputGroup) -> None:
-        """Write a group whose device does not hold what its programs want, or hold it back as a whole."""
+        """Write a group whose device does not hold what its programs want, or hold the whole group back."""
         differing = group.differing()
         if not differing or not group.by_programs or any(o.pending for o in group.outputs):
             return
@@ -269,7 +278,7 @@ class OutputWriter:
         group.submit(commands, lambda output, error: self._done(output, wanted[output.tag], by[output.tag], error))
 
     def _wait(self, output: Output, value: float) -> None:
-        """The device takes no write now. What waits for longer than a moment is reported, once."""
+        """Note that the device accepts no write now. An output that waits for `AWAY_AFTER_NS` is reported, once."""
         since_ns = output.waits_since_ns
         if since_ns is None:
             output.waits_since_ns = self._now_ns
@@ -284,18 +293,19 @@ class OutputWriter:
                 self._note(output, value, Cause.AWAY, error, output.by)
 
     def _waiting_frames(self, now_ns: int) -> set[object]:
-        """Frames of which an output has to wait: the others wait with it, so that what a scan commanded goes out whole."""
+        """Return the frames with an output that has to wait. The other outputs of the frame wait too, so that the
+        commands of one scan are sent together."""
         waits = [o for o in self.outputs if o.pending or now_ns < o.next_try_ns]
         return {o.frame for o in waits if o.frame is not None}
 
     def _compare_with_device(self, output: Output, now_ns: int) -> None:
-        """A device that reads back something else lost what it was told (a restart): tell it again.
+        """Write a value again if the device reads back a different one: it lost the commanded value (a restart).
 
-        Compared as sent: a device may hold a rounded value, and that is no other one.
+        The bytes as sent are compared, because a device that holds the rounded value holds the commanded value.
         """
         current = self._tags.current(output.tag, now_ns)
         if current is output.compared:
-            return  # nobody heard anything new of it
+            return  # the device has reported nothing new about it
         if (
             output.held is None
             or current.t_ns <= output.held_since_ns + output.settle_ns
@@ -325,13 +335,13 @@ class OutputWriter:
         output.submit(command, partial(self._done, output, value, output.by))
 
     def _refuse(self, output: Output, value: float, error: NotAllowed) -> None:
-        """The value may not be written: it is not tried again until another one is wanted."""
+        """Refuse a value that may not be written. It is not tried again until a different value is wanted."""
         output.refused = (value, output.by)
         self.refusals += 1
         self._note(output, value, self._cause(output), error, output.by)
 
     def _cause(self, output: Output) -> Cause:
-        """Why a check refused a value of this output."""
+        """Return why a check refused a value of this output."""
         if not self.allow_writes:
             return Cause.READ_ONLY
         if output.local not in output.driver.config.writable:
@@ -355,7 +365,8 @@ class OutputWriter:
         )
 
     def _on_record(self, output: Output, name: str, old: object, value: float) -> bool:
-        """Note the write before it happens. Without a record only a safe value is written; the rest is tried again."""
+        """Record the write in the audit log before it is sent. Without a record only a safe value is written; other
+        writes are tried again later."""
         try:
             self._audit.note(
                 "write",
@@ -388,24 +399,26 @@ class OutputWriter:
             raise NotAllowed(f"{output.tag} is not marked writable in the system file", where=where)
 
     def _done(self, output: Output, value: float, by: str, error: FieldtwinError | None) -> None:
-        """A write of `value` ended. `by` is who asked for it, which may be somebody else than who commands the output now."""
+        """Handle the end of a write of `value`. `by` requested it; the output may be commanded by a different source
+        now."""
         output.pending = False
         output.next_try_ns = self._now_ns + (MIN_SPACING_NS if error is None else RETRY_NS)
         if error is None:
             self.writes += 1
             output.held, output.held_since_ns = value, self._now_ns
             if not output.read_back and output.tag in self._tags:
-                self._tags.put_bad([output.tag], Reason.STALE)  # what was read before the write, and never again
+                # the last reading is older than the write, and there will be no newer one
+                self._tags.put_bad([output.tag], Reason.STALE)
             self.journal.settle(output.tag)
         else:
             self.failures += 1
             self._note(output, value, cause_of(error), error, by, audit=False)
-            output.driver.consumer.queue.clear()  # the command that failed must not go out ahead of a newer one
+            output.driver.consumer.queue.clear()  # the command that failed must not be sent before a newer one
         result = "done" if error is None else f"failed: {error}"
         try:
             self._audit.note(
                 "write", output.driver.config.name, by=by, result=result, tag=output.tag, new=output.shown(value)
             )
         except Unreachable:
-            self.failures += 1  # counted; the next write will not start without a record
+            self.failures += 1  # counted; the next write does not start without a record
         output.answer(error)

@@ -1,8 +1,8 @@
-"""When a device's poll groups are due: each with its own period, at its own place in it.
+"""When a device's poll groups are due: each with its own period, and at its own phase in that period.
 
-Groups of one period are spread over it in the file's order, so that a bus is not asked for everything at once. All times are
-on a grid that begins with the bus: a period that was missed is counted and skipped, never made up for. Pure: times are
-monotonic nanoseconds, passed in.
+Groups of one period are spread over it in the file's order, so that a bus does not get all requests at the same time.
+All times are on a grid that begins with the bus: a missed period is counted and skipped, and not made up for later.
+Pure: times are monotonic nanoseconds, passed in.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from fieldtwin.gateway.core.clock import NS_PER_MS
 
 K = TypeVar("K", bound=Hashable)
 SOONER = 8
-"""A group that is not at its place goes there by at most one part in so many of its period, each time that it is read."""
+"""A group that is moving to its phase moves by at most 1/`SOONER` of its period each time that it is read."""
 
 
 class Rate(NamedTuple):
-    """A group's period, and where in it the group is read (0 to less than the period), in nanoseconds."""
+    """A group's period, and the phase at which the group is read (0 to less than the period), in nanoseconds."""
 
     period_ns: int
     phase_ns: int
@@ -27,10 +27,10 @@ class Rate(NamedTuple):
 def spread(
     groups: Sequence[tuple[K, int]], stated_ms: Mapping[K, int] | None = None, offset: float = 0.0
 ) -> dict[K, Rate]:
-    """A place in its period for each of `groups` (key, period in ms), which are all on one bus.
+    """Return a phase for each of `groups` (key, period in ms), which are all on one bus.
 
-    The k-th of the n groups of one period P stands at P x (k + offset) / n. `offset`, 0 to less than 1, keeps several
-    buses apart. A phase that is stated counts as it is, modulo the period.
+    The k-th of the n groups of one period P is at P x (k + offset) / n. `offset`, 0 to less than 1, keeps several buses
+    apart. A configured phase is used as it is, modulo the period.
     """
     stated = stated_ms or {}
     members: dict[int, list[K]] = {}
@@ -46,10 +46,10 @@ def spread(
 
 
 class PollSchedule:
-    """One device's groups: `rates` of those read again and again, and `once` those read after connecting.
+    """One device's groups: `rates` of those read cyclically, and `once` those read after connecting.
 
-    `due_ns` holds what is to be read and since when; it is empty while the device is away. `missed` counts, group by
-    group, the periods in which a device that was there was not read.
+    `due_ns` holds the groups to be read and since when each is due; it is empty while the device is away. `missed`
+    counts, group by group, the periods in which an online device was not read.
     """
 
     def __init__(self, rates: Mapping[str, Rate], once: Sequence[str]) -> None:
@@ -57,22 +57,23 @@ class PollSchedule:
         self._once = tuple(once)
         self._epoch_ns = 0
         self._goal_ns: dict[str, int] = {}
-        """The phase of a group that is on its way to its place."""
+        """The target phase of a group that is still moving to it."""
         self.due_ns: dict[str, int] = {}
         self.missed = dict.fromkeys(rates, 0)
 
     def anchor(self, epoch_ns: int) -> None:
-        """The grid begins at `epoch_ns`."""
+        """Set the start of the grid to `epoch_ns`."""
         self._epoch_ns = epoch_ns
 
     def restate(self, rates: Mapping[str, Rate], stated: Collection[str], now_ns: int, *, there: bool) -> None:
-        """From now on `rates`, which hold all groups that are read again and again; `stated` are those whose phase counts.
+        """Use `rates` from now on; it holds all groups that are read cyclically. `stated` are those with a configured
+        phase.
 
-        One that has another period is due that long behind its last place, or now: no interval is shorter than the shorter of
-        both periods, none longer than the longer. From there a group goes to its new place little by little, always sooner:
-        until it is there, an interval is up to an eighth shorter than its period, and none is longer. With a phase that is
-        stated it goes there at once, by at most half a period sooner or later. What is overdue stays so. A new group is
-        read now if the device is `there`.
+        A group whose period changed is due one new period after its last slot, or now: no interval is shorter than the
+        shorter of both periods, and none is longer than the longer. From there a group moves to its new phase in small
+        steps, always earlier: until it is there, an interval is up to an eighth shorter than its period, and none is
+        longer. A group with a configured phase moves there in one step, by at most half a period earlier or later. An
+        overdue group stays overdue. A new group is read now if the device is online (`there`).
         """
         kept, self._rates = self._rates, dict(rates)
         self._goal_ns.clear()
@@ -98,23 +99,23 @@ class PollSchedule:
             self.due_ns.pop(group, None)
 
     def _place(self, rate: Rate, after_ns: int) -> int:
-        """The first place on the grid of `rate` behind `after_ns`."""
+        """Return the first slot on the grid of `rate` after `after_ns`."""
         start_ns = self._epoch_ns + rate.phase_ns
         return start_ns + ((after_ns - start_ns) // rate.period_ns + 1) * rate.period_ns
 
     def start(self, now_ns: int) -> None:
-        """The device is there: everything is read once now, and then at its places on the grid."""
+        """Start polling an online device: every group is read once now, and then at its slots on the grid."""
         for group, phase_ns in self._goal_ns.items():
             self._rates[group] = self._rates[group]._replace(phase_ns=phase_ns)
         self._goal_ns.clear()
         self.due_ns = dict.fromkeys([*self._rates, *self._once], now_ns)
 
     def stop(self) -> None:
-        """The device is away: nothing is due, and nothing is missed."""
+        """Stop polling, because the device is away: no group is due, and no period counts as missed."""
         self.due_ns = {}
 
     def took(self, group: str, now_ns: int) -> None:
-        """`group` is being read now: it is due again at its next place on the grid after now."""
+        """Note that `group` is being read now: it is due again at its next slot on the grid."""
         due_ns = self.due_ns.pop(group)
         rate = self._rates.get(group)
         if rate is None:
@@ -127,10 +128,10 @@ class PollSchedule:
             self._go_sooner(group, rate, now_ns)
 
     def _go_sooner(self, group: str, rate: Rate, now_ns: int) -> None:
-        """A group on its way to its place, which is read now: the next time it is a step nearer."""
+        """Move a group that is read now one step towards its target phase."""
         step_ns, most_ns = (rate.phase_ns - self._goal_ns[group]) % rate.period_ns, rate.period_ns // SOONER
         if self.due_ns[group] - now_ns < rate.period_ns - most_ns:
-            return  # it is read late, and the next time would be too close behind
+            return  # this read is late, and the next one would follow too soon
         if step_ns <= most_ns:
             del self._goal_ns[group]
         else:
@@ -139,12 +140,12 @@ class PollSchedule:
         self._rates[group] = Rate(rate.period_ns, (rate.phase_ns - step_ns) % rate.period_ns)
 
     def free_until_ns(self) -> int | None:
-        """Until when something else may have the bus without a period being missed: the middle of the period of the group
-        that is due first. None where nothing is read again and again."""
+        """Return until when another task may use the bus without a period being missed: the middle of the period of the
+        group that is due first. None if no group is read cyclically."""
         return min(
             (due + self._rates[g].period_ns // 2 for g, due in self.due_ns.items() if g in self._rates), default=None
         )
 
     def defer(self, group: str, until_ns: int) -> None:
-        """`group` is wanted again at `until_ns`, whatever its grid says: the device asked for time."""
+        """Make `group` due at `until_ns`, whatever its grid: the device asked for time."""
         self.due_ns[group] = until_ns

@@ -1,6 +1,7 @@
-"""The tag table: every tag's newest value, and the journal of what was published as good.
+"""The tag table: every tag's newest value, and the journal of values that were published as good.
 
-A value that nobody refreshed for its device's `stale_after_ms` is bad when it is looked at, whoever last called it good.
+A value that was not refreshed within its device's `stale_after_ms` is returned as bad, even if it was last published as
+good.
 """
 
 from __future__ import annotations
@@ -16,12 +17,13 @@ from fieldtwin.gateway.core.values import NEVER, Quality, Reason, Scalar, TagVal
 
 FOREVER_NS = 2**63 - 1
 JOURNAL = 100_000
-"""Published values that are kept until somebody fetches them; the oldest are dropped and counted."""
-_GOOD, _BAD = Quality.GOOD, Quality.BAD  # an Enum's members are slow to look up
+"""How many published values are kept for the store to fetch; the oldest are dropped and counted."""
+_GOOD, _BAD = Quality.GOOD, Quality.BAD  # local names, because looking up an Enum's members is slow
 
 
 class Published(msgspec.Struct, frozen=True, gc=False):
-    """A good value as it was published: number (from 1), tag, what the device sent, engineering value, source time."""
+    """A good value as it was published: number (from 1), tag, bytes that the device sent, engineering value, source
+    time."""
 
     number: int
     tag: str
@@ -31,7 +33,7 @@ class Published(msgspec.Struct, frozen=True, gc=False):
 
 
 class Held:
-    """What the table has of one tag; its own."""
+    """The table's own entry for one tag."""
 
     __slots__ = ("limit_ns", "name", "refreshed_ns", "value")
 
@@ -44,12 +46,12 @@ class Held:
 
     @property
     def fresh_until_ns(self) -> int:
-        """As `TagTable.fresh_until_ns`."""
+        """See `TagTable.fresh_until_ns`."""
         return FOREVER_NS if self.limit_ns is None else self.refreshed_ns + self.limit_ns
 
 
 class TagTable:
-    """Values by full tag name. `TagSink` for the drivers, a source for image, status and store."""
+    """The values by full tag name: the `TagSink` of the drivers, and the source for image, status and store."""
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
@@ -57,7 +59,7 @@ class TagTable:
         self._news: dict[str, Held] = {}
         self._journal: deque[tuple[str, TagValue]] = deque(maxlen=JOURNAL)
         self.on_put: Callable[[str, TagValue], None] | None = None
-        """Told of every value that is another sample, other bytes or of another quality than the last. It may not raise."""
+        """Called with every value whose sample, bytes or quality differ from the last one. It must not raise."""
         self.published = 0
 
     def _of(self, name: str) -> Held:
@@ -67,13 +69,15 @@ class TagTable:
         return held
 
     def declare(self, names: list[str], stale_after_ms: int | None) -> None:
-        """Make tags known. A value not refreshed for `stale_after_ms` is bad; None for what does not age (an identity)."""
+        """Add tags. A value not refreshed for `stale_after_ms` is bad; None is for values that do not age (an
+        identity)."""
         for name in names:
             held = self._news[name] = self._of(name)
             held.limit_ns = None if stale_after_ms is None else stale_after_ms * NS_PER_MS
 
     def restate(self, name: str, stale_after_ms: int | None) -> None:
-        """Another limit for a tag. What is fresh is not made stale by that: it counts as refreshed now, once."""
+        """Set a new limit for a tag. The change does not make a fresh value stale: the value counts as refreshed now,
+        once."""
         now_ns = self._clock.monotonic_ns()
         limit = None if stale_after_ms is None else stale_after_ms * NS_PER_MS
         held = self._of(name)
@@ -84,7 +88,8 @@ class TagTable:
         self.declare([name], stale_after_ms)
 
     def amend(self, name: str, value: TagValue) -> None:
-        """What a tag holds, understood in another way: no newer, and told as any other change."""
+        """Replace a tag's value by a new interpretation of the same bytes. Its age stays; the change is reported like
+        any other."""
         held = self._news[name] = self._of(name)
         before, held.value = held.value, value
         if self.on_put is not None and value != before:
@@ -98,7 +103,7 @@ class TagTable:
         return name in self._held
 
     def put(self, name: str, value: TagValue) -> None:
-        """The newest value of a tag. A good one is journalled when it is another sample or other bytes."""
+        """Store the newest value of a tag. A good value is added to the journal if its sample or its bytes differ."""
         try:
             held = self._held[name]
         except KeyError:
@@ -117,7 +122,7 @@ class TagTable:
                 self.on_put(name, value)
 
     def put_bad(self, names: list[str], reason: Reason) -> None:
-        """The tags are bad from now on; their last value and its time stay readable."""
+        """Mark the tags as bad from now on; their last value and its time stay readable."""
         for name in names:
             held = self._of(name)
             before = held.value
@@ -128,9 +133,9 @@ class TagTable:
                     self.on_put(name, held.value)
 
     def current(self, name: str, now_ns: int) -> TagValue:
-        """The value of a tag as of `now_ns`: bad with reason STALE when it was not refreshed in time.
+        """Return the value of a tag as of `now_ns`: bad with reason STALE if it was not refreshed in time.
 
-        A tag that nobody reads (one that can only be written) was never read.
+        A tag that is not read (one that can only be written) has the reason NEVER_READ.
         """
         held = self._held.get(name)
         if held is None:
@@ -141,17 +146,18 @@ class TagTable:
         return replace(value, quality=_BAD, reason=Reason.STALE)
 
     def held(self, name: str) -> TagValue:
-        """The value as it was put last, however old."""
+        """Return the value as it was stored last, however old."""
         held = self._held.get(name)
         return NEVER if held is None else held.value
 
     def fresh_until_ns(self, name: str) -> int:
-        """From when on `current` says STALE unless the tag is refreshed; beyond all time where it never does."""
+        """Return the time after which `current` returns STALE unless the tag is refreshed; `FOREVER_NS` if it never
+        does."""
         held = self._held.get(name)
         return FOREVER_NS if held is None else held.fresh_until_ns
 
     def take_news(self) -> Collection[Held]:
-        """The tags that were put since the last call, for the one who mirrors the table."""
+        """Return the tags that were stored since the last call, for the one reader that mirrors the table."""
         if not self._news:
             return ()
         news, self._news = self._news, {}
@@ -159,11 +165,11 @@ class TagTable:
 
     @property
     def journal_dropped(self) -> int:
-        """Entries that nobody can fetch any more."""
+        """How many entries were dropped from the journal."""
         return self.published - len(self._journal)
 
     def journal_since(self, number: int) -> list[Published]:
-        """What was published as good after entry `number`, as far as it is still kept."""
+        """Return the values that were published as good after entry `number`, as far as they are still kept."""
         newer: list[Published] = []
         for at, (name, value) in zip(range(self.published, number, -1), reversed(self._journal), strict=False):
             newer.append(Published(at, name, value.raw, value.value, value.t_ns))

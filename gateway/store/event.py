@@ -1,8 +1,8 @@
-"""What knowledge is made of: events, each with its time, and the store that keeps them, whatever database it is.
+"""Events, of which the stored knowledge consists, and the interface of the store, whatever its database.
 
-An event is a value with its quality, a command, a refusal, a state, a verdict, a payload as it was, or the admission that some
-were lost. Events of one origin are numbered from 1 without holes: two stores hold the same knowledge of an origin when they
-hold the same numbers. Pure: no database and no clock here.
+An event is a value with its quality, a command, a refusal, a state, a verdict, a payload as received, or a record that
+some events were lost. Events of one origin are numbered from 1 without gaps: two stores hold the same knowledge of an
+origin if they hold the same numbers. This module uses no database and no clock.
 """
 
 from __future__ import annotations
@@ -17,33 +17,35 @@ from fieldtwin.gateway.core.values import Quality, Reason, Scalar, TagValue
 
 INT_MIN, INT_MAX = -(1 << 63), (1 << 63) - 1
 MAX_VALUE_BYTES = 4096
-"""A text or a payload that is longer is no value of a tag."""
+"""A text or a payload is cut off at this length."""
 
 
 class Kind(IntEnum):
-    """What an event tells. The numbers are stored and sent: they never change, and there is room for 7."""
+    """The kind of an event. The numbers are stored and sent, so they never change; there is room for 7."""
 
     VALUE = 0
-    """`name` is a tag; `value` in engineering units, None where it has none."""
+    """`name` is a tag; `value` is in engineering units, None if it has none."""
     COMMAND = 1
-    """`value` is the payload of a command (bytes) as it was sent; `name` who sent it."""
+    """`value` is the payload of a command (bytes) as it was sent; `name` is its sender."""
     REFUSAL = 2
-    """`value` says why a command or plan was refused; `name` by whom."""
+    """`value` is why a command or plan was refused; `name` is what refused it."""
     STATE = 3
-    """`value` is a STATUS, state and period (bytes, `fieldtwin.twin.model.status`); `name` is whose state machine it is."""
+    """`value` is a STATUS: state and period (bytes, `fieldtwin.twin.model.status`); `name` is the owner of the state
+    machine."""
     VERDICT = 4
-    """`value` is what an analysis found; `name` of what."""
+    """`value` is what an analysis found; `name` is what it analysed."""
     PAYLOAD = 5
-    """`value` is a RESPONSE as it was received (bytes); `name` of which program or device."""
+    """`value` is a RESPONSE as it was received (bytes); `name` is the program or device that sent it."""
     LOSS = 6
-    """`value` says how many events were never kept; `name` why."""
+    """`value` is how many events were never stored; `name` is the reason."""
 
 
 Value = None | int | float | str | bytes
 
 
 class Event(NamedTuple):
-    """One event of an origin. `sequence` is 0 until it is in a log; `t_ms` is UTC in milliseconds; the rest as `Kind` says."""
+    """One event of an origin. `sequence` is 0 until it is in a log; `t_ms` is UTC in milliseconds; for the rest see
+    `Kind`."""
 
     sequence: int
     t_ms: int
@@ -55,7 +57,7 @@ class Event(NamedTuple):
 
 
 def of_tag(t_ms: int, name: str, value: TagValue) -> Event:
-    """A tag's value as an event. What a database cannot hold exactly is not made up: NaN is no value, with its reason."""
+    """Return a tag's value as an event. NaN, which is not a value for a database, becomes None with a reason."""
     kept, quality, reason = plain(value.value), value.quality, value.reason
     if isinstance(value.value, float) and math.isnan(value.value) and quality < Quality.BAD:
         quality, reason = Quality.BAD, Reason.NOT_A_NUMBER
@@ -63,7 +65,8 @@ def of_tag(t_ms: int, name: str, value: TagValue) -> Event:
 
 
 def plain(value: Scalar | None) -> Value:
-    """`value` as stores and threads keep it: 0 and 1 for a bool, None for NaN, a float for an integer beyond 64 bits."""
+    """Return `value` as stores and threads keep it: 0 and 1 for a bool, None for NaN, a float for an integer beyond 64
+    bits."""
     if isinstance(value, bool):
         return int(value)
     if isinstance(value, int):
@@ -71,76 +74,82 @@ def plain(value: Scalar | None) -> Value:
     if isinstance(value, float):
         return None if math.isnan(value) else value
     if isinstance(value, str):
-        text = value.replace("\0", "")  # PostgreSQL's text has no NUL
+        text = value.replace("\0", "")  # PostgreSQL's text type cannot hold NUL
         return text.encode(errors="replace")[:MAX_VALUE_BYTES].decode(errors="ignore")
     return value[:MAX_VALUE_BYTES] if value is not None else None
 
 
 class StoreFull(Unreachable):
-    """There is no room for more: the disk is full, or the store has reached its bound. Nothing that it holds is harmed."""
+    """There is no room for more: the disk is full, or the store has reached its limit. The stored events are intact."""
 
 
 class KnowledgeStore(Protocol):
-    """Keeps events of several origins. Every method may raise `Unreachable` (`StoreFull` where room is what lacks).
+    """A store for events of several origins. Every method may raise `Unreachable` (`StoreFull` if room is lacking).
 
-    What a method returned from is kept: through a killed process and a lost power supply.
+    When a method has returned, its change is permanent: it survives a killed process and a power failure.
     """
 
     async def own(self, name: str, *, system: str, prototype: bool, log: str) -> str:
-        """The origin under which this side of `system` writes: the one it has already, else ``name:log``.
+        """Return the origin under which this side of `system` writes: the existing one, or a new one named
+        ``name:log``.
 
-        `prototype` is part of what it is (SPEC ruling 15). `log` tells a new store from one that was there before.
+        `prototype` is part of the identity of an origin (SPEC ruling 15). `log` distinguishes a new store from an
+        earlier one.
         """
         ...
 
     async def origins(self, system: str = "") -> dict[str, bool]:
-        """Every origin in the store, and whether its events come from a prototype. With `system`: those of it, and those of
-        which an older store does not say whose they are."""
+        """Return every origin in the store, and whether its events come from a prototype. With `system`: the origins of
+        that system, and those for which an older store does not record the system."""
         ...
 
     async def append(self, origin: str, events: Sequence[Event]) -> int:
-        """Number `events` and keep all of them or none; the last number. For the one who writes this origin's log."""
+        """Number `events` and store all of them or none; return the last number. Only the writer of this origin's log
+        calls this."""
         ...
 
     async def keep(self, origin: str, events: Sequence[Event], *, system: str = "", prototype: bool = False) -> int:
-        """Keep numbered events of somebody else's log, of `system`; how many were new. The same event twice is one."""
+        """Store numbered events of another writer's log, of `system`; return how many were new. A repeated event is
+        stored once."""
         ...
 
     async def span(self, origin: str) -> tuple[int, int]:
-        """First and last number that there ever was of an origin and is not forgotten; (1, 0) where there is none."""
+        """Return the first and the last number of an origin's events that are not forgotten; (1, 0) if there are
+        none."""
         ...
 
     async def gaps(self, origin: str) -> list[tuple[int, int]]:
-        """Ranges of numbers up to the last that are missing, first and last of each; without those known to be lost."""
+        """Return the ranges of missing numbers up to the last, each as first and last; events known to be lost are not
+        included."""
         ...
 
     async def read(self, origin: str, first: int, limit: int) -> list[Event]:
-        """At most `limit` events from number `first` on, in order."""
+        """Return at most `limit` events from number `first` on, in order."""
         ...
 
     def replay(self, origin: str, since_ms: int, until_ms: int) -> AsyncIterator[list[Event]]:
-        """All events of a time, in order, in blocks."""
+        """Yield all events of a time range, in order, in blocks."""
         ...
 
     async def note_lost(self, origin: str, first: int, last: int) -> None:
-        """Its writer has these no more: they are gone, and gaps no longer."""
+        """Note that the writer no longer has these events: they are lost, and no longer count as gaps."""
         ...
 
     async def forget(self, origin: str, through: int) -> int:
-        """Drop an origin's events up to a number; how many there were."""
+        """Delete an origin's events up to a number; return how many there were."""
         ...
 
     def room_bytes(self) -> int | None:
-        """How much more fits, as far as can be told; None where it cannot."""
+        """Return how many more bytes fit, as far as this is known; otherwise None."""
         ...
 
     async def aclose(self) -> None:
-        """Close; the store stays."""
+        """Close the connection; the store remains."""
         ...
 
 
 def merged(ranges: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Ranges in order, those that touch or overlap as one."""
+    """Return the ranges in order, with those that touch or overlap joined."""
     out: list[tuple[int, int]] = []
     for first, last in sorted(ranges):
         if out and first <= out[-1][1] + 1:
@@ -151,7 +160,7 @@ def merged(ranges: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
 
 
 def without(ranges: Iterable[tuple[int, int]], holes: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
-    """`ranges` less what is in `holes`, in order."""
+    """Return `ranges` without what is in `holes`, in order."""
     out = merged(ranges)
     for hole_first, hole_last in merged(holes):
         parts: list[tuple[int, int]] = []

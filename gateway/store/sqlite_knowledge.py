@@ -1,6 +1,6 @@
 """Knowledge in a SQLite file (write-ahead log), the default: no server, one file, readable while it is written.
 
-Work on the file goes through `offload`: a thread of its own on the wall clock (`in_thread`), in place under virtual time.
+Work on the file goes through `offload`: a separate thread on the wall clock (`in_thread`), in place under virtual time.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ T = TypeVar("T")
 Work = Callable[[], Any]
 Offload = Callable[[Work], Awaitable[Any]]
 BLOCK = 20_000
-"""Events that a replay reads at once: enough that the way to the thread does not count."""
+"""How many events a replay reads in one block: enough that the switch to the thread does not matter."""
 NAMES_MAX = 100_000
 PAGE = 4096
 BUSY_S = 5.0
@@ -29,14 +29,15 @@ _COLUMNS = "sequence, t_ms, kind, name, value, quality, reason"
 
 
 async def in_place(work: Work) -> Any:
-    """Do it at once: under virtual time, where threads are no part of the world."""
+    """Run the work at once: for virtual time, in which no threads are used."""
     return work()
 
 
 class SqliteKnowledge:
-    """See `fieldtwin.gateway.store.event.KnowledgeStore`. `max_bytes` bounds the file; 0 leaves it to the disk.
+    """A SQLite store, see `fieldtwin.gateway.store.event.KnowledgeStore`. `max_bytes` limits the file; 0: only the disk
+    limits it.
 
-    ``store = await SqliteKnowledge.open(path)``. Raises `FileInvalid` for a file that is no store of ours.
+    ``store = await SqliteKnowledge.open(path)``. Raises `FileInvalid` for a file that is not a fieldtwin store.
     """
 
     def __init__(self, path: Path, max_bytes: int, offload: Offload | None) -> None:
@@ -46,11 +47,11 @@ class SqliteKnowledge:
         self._offload = offload or self._in_thread
         self._origins: dict[str, int] = {}
         self._whose: set[str] = set()
-        """Origins of others of which the store says whose they are."""
+        """Origins of other writers for which the store records the system."""
         self._names: dict[str, int] = {}
         self._texts: dict[int, str] = {}
         self._unsure = False
-        """Whether the numbers of names and origins have to be looked up again before anything is written under them."""
+        """Whether the numbers of names and origins have to be read again before they are used for writing."""
 
     @classmethod
     async def open(cls, path: Path, *, max_bytes: int = 0, offload: Offload | None = None) -> SqliteKnowledge:
@@ -71,7 +72,8 @@ class SqliteKnowledge:
         try:
             refuse_newer(self._db, self.path)
             self._db.execute("PRAGMA journal_mode=WAL")
-            self._db.execute("PRAGMA synchronous=FULL")  # a number that was told to the other twin is never given twice
+            # a number that the other twin has received must never be assigned twice
+            self._db.execute("PRAGMA synchronous=FULL")
             if self._max_bytes:
                 self._db.execute(f"PRAGMA max_page_count={max(64, self._max_bytes // PAGE)}")
             migrate(self._db, self.path)
@@ -96,7 +98,8 @@ class SqliteKnowledge:
                     self._learn()
                 return work()
             except Exception as e:
-                # What was just added may not be there. SQLite itself takes a transaction back when the disk is full.
+                # The names and origins just added may not be stored: SQLite itself rolls a transaction back when the
+                # disk is full.
                 self._unsure = True
                 if self._db.in_transaction:
                     self._db.execute("ROLLBACK")
@@ -255,7 +258,7 @@ class SqliteKnowledge:
         ]
 
     def _text(self, number: int) -> str:
-        """A name that another process added."""
+        """Return a name that another process added."""
         row = self._db.execute("SELECT text FROM event_name WHERE id = ?", (number,)).fetchone()
         if row is None:
             raise FileInvalid(f"damaged: there are events of name {number}, and no such name", path=str(self.path))

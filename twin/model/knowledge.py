@@ -1,7 +1,8 @@
-"""The knowledge of a twin: what it has seen, decided and refused, written as it comes and read back as it was.
+"""The knowledge of a twin: a record of what it observed, decided and refused, written continuously and replayed later.
 
-`KnowledgeWriter` stands between those who notice things, who never wait, and the store, which may be slow or full. Its queue
-has a bound; what does not fit is counted, and the count is knowledge too. It knows no database.
+`KnowledgeWriter` decouples the sources of events, which must never wait, from the store, which may be slow or full. Its
+queue is bounded. It counts the events that do not fit, and records that count as knowledge too. It does not depend on
+any database.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from fieldtwin.gateway.core.errors import Unreachable
 from fieldtwin.gateway.store.event import Event, Kind, KnowledgeStore, StoreFull
 
 QUEUE = 200_000
-"""Four seconds of the fastest writing that we promise."""
+"""Four seconds of events at the highest write rate that the project promises."""
 BATCH = 10_000
 EVERY_MS = 100
 RETRY_MS = 1000
@@ -28,15 +29,15 @@ _SAYS_WHAT_IS = {int(Kind.VALUE), int(Kind.STATE)}
 _NAME_OF = itemgetter(3)
 
 MakeRoom = Callable[[], Awaitable[int]]
-"""Forgets events in the store; how many. 0: there is nothing that may go."""
+"""Forgets events in the store and returns how many. 0 means that no event may be forgotten."""
 
 
 class KnowledgeWriter:
     """Writes one origin's events in batches. `observe` never waits and never fails; `run` writes until cancelled.
 
-    `on_trouble` is told once when the room runs short (`reserve_bytes`), once when nothing can be written, and with ``""`` when
-    that is over. `on_written` is told the last number after each batch. `make_room` may forget what nobody needs any more
-    when the store is full.
+    The writer calls `on_trouble` once when less than `reserve_bytes` of room is left, once when nothing can be written,
+    and with ``""`` when the trouble is over. After each batch it calls `on_written` with the last number written. When
+    the store is full, `make_room` may forget events that are no longer needed.
     """
 
     def __init__(
@@ -65,15 +66,15 @@ class KnowledgeWriter:
         self._on_written = on_written
         self._make_room = make_room
         self._lost = 0
-        """Dropped, and not yet on record."""
+        """Events that were dropped and whose loss is not on record yet."""
 
     @property
     def queued(self) -> int:
-        """Events that were noticed and are not in the store yet."""
+        """Number of events that were observed and are not in the store yet."""
         return len(self._queue)
 
     def observe(self, event: Event) -> None:
-        """Take an event. A full queue drops its oldest."""
+        """Queue an event. A full queue drops its oldest event."""
         if len(self._queue) >= self._capacity:
             self._queue.popleft()
             self.dropped += 1
@@ -81,13 +82,15 @@ class KnowledgeWriter:
         self._queue.append(event)
 
     async def run(self) -> None:
-        """Write what comes, for good. A store that refuses is tried again; nothing that it took is written twice."""
+        """Write queued events until cancelled. A store that refuses is tried again; an event that the store has taken
+        is never written twice.
+        """
         while True:
             wait_ms = EVERY_MS if await self.try_to_flush() else RETRY_MS
             await self._clock.sleep_until_ns(self._clock.monotonic_ns() + wait_ms * NS_PER_MS)
 
     async def try_to_flush(self) -> bool:
-        """As `flush`; a store that refuses is told of, and False."""
+        """Call `flush`; if the store refuses, report the trouble and return False."""
         try:
             await self.flush()
         except Unreachable as e:
@@ -96,7 +99,9 @@ class KnowledgeWriter:
         return True
 
     async def flush(self) -> int:
-        """Write everything that is queued; how many events. Raises `Unreachable`, and keeps what was not written."""
+        """Write every queued event and return how many were written. Raises `Unreachable`, and keeps the events not
+        written.
+        """
         done = 0
         while self._queue or self._lost:
             try:
@@ -117,7 +122,7 @@ class KnowledgeWriter:
         except asyncio.CancelledError:
             with suppress(
                 Unreachable
-            ):  # it may be in the store or not: who is asked to stop looks, so that nothing is there twice
+            ):  # cancelled while writing: wait for the outcome, so that no event is stored twice
                 await writing
                 batch = []
             self._give_back(batch)
@@ -131,7 +136,7 @@ class KnowledgeWriter:
         return len(batch)
 
     def _give_back(self, batch: list[Event]) -> None:
-        """Put events back in front; the oldest go when there came too many meanwhile."""
+        """Put events back at the front of the queue. If too many arrived meanwhile, drop the oldest."""
         room = max(0, self._capacity - len(self._queue))
         gone = max(0, len(batch) - room)
         self.dropped += gone
@@ -146,14 +151,14 @@ class KnowledgeWriter:
             self._say("")
 
     def _say(self, text: str) -> None:
-        if text.partition(":")[0] != self.trouble.partition(":")[0]:  # not again because there is a MiB less
+        if text.partition(":")[0] != self.trouble.partition(":")[0]:  # do not report again because one MiB less is left
             self.trouble = text
             self._on_trouble(text)
 
 
 @dataclass
 class Known:
-    """What knowledge says was so at a time: the latest event of each tag and state machine, and how many events said so."""
+    """The knowledge at a given time: the latest event of each tag and state machine, and the number of events replayed."""
 
     latest: dict[str, Event] = field(default_factory=dict)
     commands: list[Event] = field(default_factory=list)
@@ -161,9 +166,9 @@ class Known:
     lost: int = 0
 
     def learn(self, events: list[Event]) -> None:
-        """Take a block of events, in order."""
+        """Add a block of events, in order."""
         self.events += len(events)
-        if {event[2] for event in events} <= _SAYS_WHAT_IS:  # most blocks, and those of a day are many
+        if {event[2] for event in events} <= _SAYS_WHAT_IS:  # fast path, taken by most blocks
             self.latest.update(zip(map(_NAME_OF, events), events, strict=True))
             return
         for event in events:
@@ -176,7 +181,7 @@ class Known:
 
 
 async def known_at(blocks: AsyncIterator[list[Event]]) -> Known:
-    """Replay blocks of events into what was known at their end."""
+    """Replay blocks of events and return what was known at their end."""
     known = Known()
     async for block in blocks:
         known.learn(block)

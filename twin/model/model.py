@@ -1,7 +1,7 @@
-"""The digital model: one state machine, the variables that the system declares, and nothing that could reach the plant.
+"""The digital model: one state machine and the variables that the system declares. It cannot reach the plant.
 
-Every twin has an instance of its own: the prototype's, the shadow's, and the one by which a run judges what its control logic
-did. It changes by events alone, and may know no wire, no clock and no store.
+Each twin has its own instance: the prototype, the shadow, and each run that judges its control logic. It changes by
+events alone, and must not depend on a connection, a clock or a store.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from fieldtwin.twin.model.variables import Variable, Variables
 
 
 class DigitalModel:
-    """SPEC row DigitalModel. Init: STANDBY, period 0, nothing known of any variable. ProcessEvent is the state machine's.
+    """SPEC row DigitalModel. Init: STANDBY, period 0, all variables unknown. ProcessEvent is the state machine's.
 
-    `declared`: the system's variables (`fieldtwin.twin.plant.declared`). What is heard of them is `variables`; no command and no
-    status changes that, and none of them changes the state.
+    `declared` holds the system's variables (`fieldtwin.twin.plant.declared`), and `variables` their last reported
+    values. Commands and statuses do not change `variables`, and reported values do not change the state.
     """
 
     __slots__ = ("state_machine", "variables")
@@ -32,9 +32,11 @@ class DigitalModel:
 
     @property
     def period_s(self) -> int:
-        """The period in seconds as last commanded, also when it is 0 or negative."""
+        """The last commanded period in seconds, even if it is 0 or negative."""
         return self.state_machine.period_s
 
     def process_event(self, command: COMMAND) -> STATE:
-        """Take a command; the new state. Raises `Desync` for one that is none, which changes nothing."""
+        """Apply a command and return the new state. Raises `Desync` if it cannot be decoded; the model then stays
+        unchanged.
+        """
         return self.state_machine.process_event(command)

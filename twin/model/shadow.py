@@ -1,7 +1,7 @@
-"""The digital shadow: Monitor and Analyze over what arrives from the plant. It cannot send: it holds nothing that could.
+"""The digital shadow: Monitor and Analyze over what arrives from the plant. It holds no object that could send.
 
-What it receives is a queue (SPEC ruling 16). Whoever fills that queue, acknowledges and asks for what is missing stands outside
-of this module, which import contracts keep from connections, drivers, transmitters and threads.
+It receives from a queue (SPEC ruling 16). Filling that queue, acknowledging events and requesting missing ones is done
+outside this module; import contracts keep it free of connections, drivers, transmitters and threads.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ VERDICTS = 1000
 
 
 class DigitalShadow:
-    """SPEC row DigitalShadow: a digital model of its own, thread processes, and a connection that only receives.
+    """SPEC row DigitalShadow: its own digital model, thread processes, and a receive-only connection.
 
-    `step` runs the stages, one after the other, on what has arrived. `declared` are the variables of the model: events alone
-    change them. `verdicts` is a consumer for whoever wants to know.
+    `step` runs the stages one after the other on what has arrived. `declared` are the variables of the model, which
+    only events change. `verdicts` is a consumer for callers that want to read the verdicts.
     """
 
     def __init__(
@@ -47,11 +47,11 @@ class DigitalShadow:
 
     @property
     def processes(self) -> tuple[DTDigitalThreadProcess, ...]:
-        """The thread processes; what they share is this side's knowledge."""
+        """The thread processes, whose shared events are the knowledge of this side."""
         return (self.monitor, self.analyze)
 
     def recall(self, events: Iterable[Event]) -> None:
-        """Begin with what was known before a restart, the last of each name: the model as it was, and what was wrong."""
+        """Restore the knowledge from before a restart, the last event of each name: the model's state and the findings."""
         for event in events:
             self.monitor.arrived(event, event.t_ms)
             self.monitor.handle_state()
@@ -60,7 +60,7 @@ class DigitalShadow:
             self.analyze.recall()
 
     def step(self) -> int:
-        """Take in what arrived and analyze it, one by one: each is compared with the model as it was then. How many events."""
+        """Analyze the arrived events one by one, each against the model as it was then. Return the number of events."""
         count = 0
         now_ms = self._clock.utc_ns() // NS_PER_MS
         while self.receiving.queue:
@@ -76,7 +76,7 @@ class DigitalShadow:
         return count
 
     def describe(self) -> dict[str, Any]:
-        """The model, and the figures of twinning."""
+        """Return the model and the figures of twinning."""
         variables = self.digital_model.variables
         return {
             "state": self.digital_model.state.name,

@@ -1,6 +1,7 @@
-"""The processes whose knowledge a digital thread shares: bounded queues of events, of the physical twin or of the digital one.
+"""The processes whose knowledge a digital thread shares: bounded queues of events of the physical or the digital twin.
 
-What a shadow is made of stands on this. It must never know a connection, nor anything that could send a command.
+The shadow is built on these classes. This module must never depend on a connection, nor on anything that could send a
+command.
 """
 
 from __future__ import annotations
@@ -16,11 +17,13 @@ from fieldtwin.gateway.core.values import DATA, RESPONSE, STATUS, TagValue
 from fieldtwin.gateway.store.event import Event, Kind, of_tag, plain
 
 KNOWLEDGE = 10_000
-"""Events that a process keeps to be shared."""
+"""Number of events that a process keeps to be shared."""
 
 
 class DigitalThreadProcess(ABC):  # noqa: B024  the schema has state and no operations
-    """SPEC row DigitalThreadProcess: shareable knowledge, in order, bounded; a full one drops its oldest, counted (ruling 2)."""
+    """SPEC row DigitalThreadProcess: shareable knowledge, in order, bounded. A full queue drops its oldest event and
+    counts it (ruling 2).
+    """
 
     side: ClassVar[str] = ""
 
@@ -35,9 +38,10 @@ class DigitalThreadProcess(ABC):  # noqa: B024  the schema has state and no oper
         self._clock = clock
 
     def share(self, kind: Kind, name: str, value: DATA | TagValue | str | int | float | None, t_ms: int = 0) -> Event:
-        """Add to what is to be shared: a payload as it is, a tag with its quality, or a word of the process itself.
+        """Add an event to the knowledge to share: an unchanged payload, a tag with its quality, or a word of the
+        process itself.
 
-        `t_ms` is when it was so, UTC; now, where nothing is said.
+        `t_ms` is the time (UTC) at which it was true; by default now.
         """
         t_ms = t_ms or self._clock.utc_ns() // NS_PER_MS
         if isinstance(value, TagValue):
@@ -50,36 +54,38 @@ class DigitalThreadProcess(ABC):  # noqa: B024  the schema has state and no oper
         return event
 
     def collect(self) -> list[Event]:
-        """Take everything that is there to be shared, in order."""
+        """Remove and return all events to share, in order."""
         taken = list(self.knowledge)
         self.knowledge.clear()
         return taken
 
 
 class PTDigitalThreadProcess(DigitalThreadProcess):
-    """One of the physical twin: the control logic, and the gateway with its values."""
+    """A process of the physical twin: the control logic, and the gateway with its values."""
 
     side = "physical"
 
     def put(self, name: str, value: TagValue) -> None:
-        """A tag has a new value (`TagTable.on_put`)."""
+        """Share a tag's new value (`TagTable.on_put`)."""
         self.share(Kind.VALUE, name, value)
 
     def respond(self, program: str, response: RESPONSE) -> None:
-        """The control logic sent this to its transmitter: a STATUS, or a measurement whose payload stays as it is."""
+        """Share what the control logic sent to its transmitter: a STATUS, or a measurement whose payload stays
+        unchanged.
+        """
         self.share(Kind.STATE if isinstance(response, STATUS) else Kind.PAYLOAD, program, response)
 
 
 class DTDigitalThreadProcess(DigitalThreadProcess):
-    """One of the digital twin: Monitor, Analyze, Plan, Execute, a database. This one commands nobody
-    (`fieldtwin.twin.thread.thread.Operator`)."""
+    """A process of the digital twin: Monitor, Analyze, Plan, Execute or a database. It cannot command; the process that
+    can is `fieldtwin.twin.thread.thread.Operator`."""
 
     side = "digital"
 
 
 class ReceivingEnd(EventHandler):
-    """What arrives over a thread, as a queue, bounded as every other (ruling 2). All that a shadow holds of a connection
-    (ruling 16): the transmitter that polls, acknowledges and asks for what is missing is assembled elsewhere."""
+    """A bounded queue of what arrives over a thread (ruling 2). This is all that a shadow holds of a connection (ruling
+    16): the transmitter that polls, acknowledges and requests missing events is assembled elsewhere."""
 
     def __init__(self, event: str, capacity: int = KNOWLEDGE) -> None:
         super().__init__(event)
@@ -87,13 +93,13 @@ class ReceivingEnd(EventHandler):
         self.dropped = 0
 
     def observe(self, origin: str, event: Event) -> None:
-        """Append an event of an origin; a full queue drops its oldest and counts it."""
+        """Append an event of an origin; a full queue drops its oldest event and counts it."""
         if len(self.queue) == self.queue.maxlen:
             self.dropped += 1
         self.queue.append((origin, event))
 
     def consume(self) -> tuple[str, Event]:
-        """Take the first. The queue must not be empty."""
+        """Remove and return the first event. The queue must not be empty."""
         if not self.queue:
             raise Bug("consume from an empty queue", where=self.event)
         return self.queue.popleft()

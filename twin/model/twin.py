@@ -1,7 +1,7 @@
-"""The digital twin: the shadow, and the way back: Plan and Execute, and a producer whose commands go to the plant.
+"""The digital twin: a shadow that can also command, with Plan, Execute and a producer whose commands go to the plant.
 
-What carries the commands is a process of the thread (`fieldtwin.twin.thread.thread.Operator`), which takes what
-`execute.transmitter` emits. Whether the plant obeys is the plant's to say.
+A process of the thread (`fieldtwin.twin.thread.thread.Operator`) carries the commands that `execute.transmitter` emits.
+The plant decides whether it obeys them.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from fieldtwin.twin.model.variables import Variable
 class DigitalTwin(DigitalShadow):
     """SPEC row DigitalTwin. `step` runs Monitor, Analyze, Plan and Execute, one after the other, on what has arrived.
 
-    While a prototype is asked about a command, the shadow goes on; what it finds waits to be planned for.
+    While a prototype is asked about a command, the shadow continues; its findings wait to be planned for.
     """
 
     def __init__(

@@ -1,7 +1,8 @@
-"""The declared variables of a digital model: what each is, and the last that was heard of it, with its quality and time.
+"""The declared variables of a digital model: their declarations, and the last reported value of each with quality and
+time.
 
-Which ones there are is fixed when the model is made, from the system file. They change by events alone. Pure: no wire, no clock,
-no store; when something was so is what the event says.
+The set of variables is fixed when the model is made, from the system file. Their values change by events alone. Pure:
+no connection, no clock, no store; the time of a value comes from its event.
 """
 
 from __future__ import annotations
@@ -14,15 +15,15 @@ from typing import Any
 from fieldtwin.gateway.core.values import Quality, Reason, Scalar
 
 Limits = tuple[float, float]
-"""The least and the most that a value may be."""
+"""Smallest and largest permitted value."""
 
 
 @dataclass(frozen=True, slots=True)
 class Variable:
-    """A variable as it is declared (`name`, `kind`, `unit`, `limits`) and as it was last heard of.
+    """A variable: its declaration (`name`, `kind`, `unit`, `limits`) and its last reported value.
 
-    `t_ms` is when it was so, as the plant says, UTC; 0 where nothing was ever heard of it. What a plant cannot read any more it
-    reports as bad, with the last value that it had.
+    `t_ms` is the time (UTC) that the plant gives for the value; 0 if the plant has never reported the variable. When the
+    plant can no longer read a variable, it reports the last value with bad quality.
     """
 
     name: str
@@ -36,21 +37,23 @@ class Variable:
 
     @property
     def heard(self) -> bool:
-        """Whether the plant ever said anything of it."""
+        """Whether the plant ever reported this variable."""
         return self.t_ms > 0
 
     @property
     def good(self) -> bool:
-        """Whether it can be trusted as far as any value can."""
+        """Whether the quality is good."""
         return self.quality is Quality.GOOD
 
     def declared(self) -> dict[str, Any]:
-        """What it is, for ``model.json``."""
+        """Return the declaration, for ``model.json``."""
         limits = {"limits": list(self.limits)} if self.limits is not None else {}
         return {"kind": self.kind, **({"unit": self.unit} if self.unit else {}), **limits}
 
     def describe(self) -> dict[str, Any]:
-        """What is known of it, for JSON: bytes as hex, what is infinite as a word, the time None where it was never heard of."""
+        """Return value, unit, quality, reason and time as JSON data: bytes as hex, infinities and NaN as text, the time
+        None if the variable was never reported.
+        """
         value = self.value.hex() if isinstance(self.value, bytes) else self.value
         if isinstance(value, float) and not math.isfinite(value):
             value = str(value)
@@ -60,9 +63,9 @@ class Variable:
 
 
 class Variables(Mapping[str, Variable]):
-    """The variables of one model, by name, in the order of their declaration. Two models never share one.
+    """The variables of one model, by name, in the order of their declaration. Two models never share a variable.
 
-    `undeclared` counts what was told of names that the model does not have: it is no part of the model.
+    `undeclared` counts reports about names that the model does not declare. It is not part of the model.
     """
 
     __slots__ = ("_held", "undeclared")
@@ -81,7 +84,7 @@ class Variables(Mapping[str, Variable]):
         return len(self._held)
 
     def changed(self, name: str, value: Scalar | None, quality: Quality, reason: Reason, t_ms: int) -> bool:
-        """Event: the plant says that `name` is `value` since `t_ms`. False for one that the model does not declare."""
+        """Event: the plant reports `value` for `name` since `t_ms`. Return False if the model does not declare `name`."""
         held = self._held.get(name)
         if held is None:
             self.undeclared += 1
@@ -90,11 +93,11 @@ class Variables(Mapping[str, Variable]):
         return True
 
     def silent(self, name: str) -> None:
-        """Event: `name` was not heard of for too long. Its last value stays to be read, and is bad."""
+        """Event: `name` was not reported for too long. Its last value stays readable, with bad quality."""
         held = self._held.get(name)
         if held is not None:
             self._held[name] = replace(held, quality=Quality.BAD, reason=Reason.STALE)
 
     def describe(self) -> dict[str, dict[str, Any]]:
-        """What is known of each, for JSON."""
+        """Return the last reported state of each variable, for JSON."""
         return {name: held.describe() for name, held in self._held.items()}

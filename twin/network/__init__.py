@@ -1,1 +1,1 @@
-"""Several systems and the water between their modems."""
+"""Several systems and the acoustic channel between their modems."""

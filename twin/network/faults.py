@@ -1,4 +1,6 @@
-"""Where a fault of a network goes: into the water, or into one of its systems, under the names that it has there. Pure."""
+"""Assigns the faults of a network: to the acoustic channel, or to one of its systems under that system's own names.
+Pure.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,7 @@ from fieldtwin.twin.prototype.fault_aims import target
 
 
 def check_network_fault(network: Network, spec: FaultSpec) -> None:
-    """Raises `WrongAim` for what is not there, in the systems or between them."""
+    """Check a fault's aim. Raises `WrongAim` if it is neither in the systems nor in the acoustic channel."""
     if spec.aim.bus == WATER:
         check_water_fault(network, spec)
     else:
@@ -20,7 +22,9 @@ def check_network_fault(network: Network, spec: FaultSpec) -> None:
 
 
 def placed(network: Network, fault: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
-    """The system that a fault is in, or `WATER`, and the fault as it is told there. Raises `UsageError` for no such system."""
+    """Return the system of a fault, or `WATER`, and the fault with that system's own names. Raises `UsageError` for an
+    unknown system.
+    """
     if fault.get("bus") == WATER:
         return WATER, dict(fault)
     member, _ = network.split(str(fault.get("device") or fault.get("bus") or ""))
@@ -29,7 +33,7 @@ def placed(network: Network, fault: Mapping[str, Any]) -> tuple[str, dict[str, A
 
 
 def placed_all(network: Network, faults: Iterable[Mapping[str, Any]]) -> dict[str, tuple[dict[str, Any], ...]]:
-    """All of them, by where they are in; a system without one is not among them."""
+    """Return all faults by their place. A system without a fault is not included."""
     found: dict[str, tuple[dict[str, Any], ...]] = {}
     for fault in faults:
         where, local = placed(network, fault)

@@ -1,7 +1,7 @@
-"""A network: systems whose modems are in one water. What a network file says, resolved and checked as a whole.
+"""A network: systems whose modems share one acoustic channel. A network file, resolved and checked as a whole.
 
-Each system is a plant of its own, with its own file, and knows nothing of the network. Where one view of all is
-wanted (a scenario, a report) `Network.whole` is one: every name with its system's in front, `west.ctd.pressure`.
+Each system is a separate plant with its own file, and does not know about the network. `Network.whole` is one view of
+all systems, for scenarios and reports: every name is prefixed with its system's, as in `west.ctd.pressure`.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from fieldtwin.twin.site.schema import InputForm, PlcForm, ProgramForm
 from fieldtwin.twin.site.system import System, load_system
 
 WATER = "water"
-"""What faults call the water, as they call a bus."""
+"""The name of the acoustic channel in faults, used like the name of a bus."""
 SHIP = "ship"
 
 
 @dataclass(frozen=True)
 class Member:
-    """A system of a network. `modem`: the device that is in the water, at `at_m`."""
+    """A system of a network. `modem` is the device in the acoustic channel, at position `at_m`."""
 
     name: str
     system: System
@@ -38,13 +38,13 @@ class Member:
 
     @property
     def profile(self) -> DeviceProfile:
-        """The modem's."""
+        """The profile of the modem."""
         return self.prototype.devices[self.modem].profile
 
 
 @dataclass(frozen=True)
 class Network:
-    """A network file, resolved. `members` in the file's order."""
+    """A network file, resolved. `members` are in the file's order."""
 
     name: str
     path: Path
@@ -56,16 +56,16 @@ class Network:
 
     @property
     def places(self) -> dict[str, tuple[float, ...]]:
-        """Where everybody is that speaks and hears."""
+        """Positions of all modems in the acoustic channel."""
         places = {name: member.at_m for name, member in self.members.items()}
         return places | ({SHIP: tuple(self.ship.at_m)} if self.ship is not None else {})
 
     def medium(self, seed: int, spoils: Spoils | None = None) -> AcousticMedium:
-        """The water, with everybody in it."""
+        """Return the acoustic channel with all its modems."""
         return AcousticMedium(self.water, self.places, seed, spoils)
 
     def split(self, name: str) -> tuple[str, str]:
-        """``west.ctd.pressure`` as ``west`` and ``ctd.pressure``. Raises `UsageError`."""
+        """Split ``west.ctd.pressure`` into ``west`` and ``ctd.pressure``. Raises `UsageError`."""
         member, _, local = name.partition(".")
         if member not in self.members or not local:
             raise UsageError(
@@ -77,7 +77,7 @@ class Network:
 
     @property
     def whole(self) -> System:
-        """All systems as if they were one, under their names; for those who read, never to be run."""
+        """All systems combined as one, under prefixed names. For readers only; it must never be run."""
         first = next(iter(self.members.values())).system
         return System(
             name=self.name,
@@ -123,7 +123,7 @@ def _renamed(program: ProgramForm, member: Member) -> ProgramForm:
 
 
 def load_network(path: Path, profiles: Iterable[Path] = ()) -> Network:
-    """Read a network file and all that it names. Raises `FileInvalid` at its spot."""
+    """Read a network file and all files that it names. Raises `FileInvalid` with the place of the error."""
     file, profiles = load(path), tuple(profiles)
     form = validate(file, NetworkForm)
     members = {name: _member(file, form, name, path, profiles) for name in form.systems}
@@ -163,12 +163,12 @@ def _member(file: YamlFile, form: NetworkForm, name: str, path: Path, profiles: 
 
 
 def _files(folder: Path) -> list[Path]:
-    """System files there, and where a folder of profiles has them."""
+    """Return the system files in `folder`, and in its folder of systems."""
     return [p for place in (folder, folder / "systems") for p in sorted(place.glob("*.yaml")) if "." not in p.stem]
 
 
 def _check(file: YamlFile, form: NetworkForm, members: dict[str, Member]) -> None:
-    """What only all of them together can be wrong in."""
+    """Check what concerns several systems: coordinates, names, mailbox sizes and modem addresses."""
     first = next(iter(form.systems.values()))
     places: list[tuple[tuple[Key, ...], list[float]]] = [(("systems", n), m.at_m) for n, m in form.systems.items()]
     if form.ship is not None:

@@ -1,4 +1,6 @@
-"""What a network file may say: systems, and the water between their modems. Of the prototype alone: no plant opens it."""
+"""The pydantic models of a network file: systems, and the acoustic channel between their modems. Only the prototype
+uses it; no plant opens it.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,7 @@ Place = Annotated[list[float], Field(min_length=2, max_length=3)]
 
 
 class WaterForm(Strict):
-    """The water: how far it carries, how fast, how much, and what it loses."""
+    """The acoustic channel: its range, propagation speed, data rate and losses."""
 
     range_m: float = Field(gt=0, le=1_000_000)
     sound_m_per_s: float = Field(default=1500.0, ge=100, le=10_000)
@@ -26,7 +28,7 @@ class WaterForm(Strict):
 
 
 class MemberForm(Strict):
-    """A system of the network, which of its devices is the modem, and where that is."""
+    """A system of the network, which of its devices is the modem, and the modem's position."""
 
     system: str
     modem: Name
@@ -37,7 +39,7 @@ class MemberForm(Strict):
 
 
 class ShipForm(Strict):
-    """Where commands come from: a modem that says each of them more than once, since nobody acknowledges."""
+    """The source of commands: a topside modem that sends each command several times, because none is acknowledged."""
 
     at_m: Place
     says: int = Field(default=3, ge=1, le=10)
@@ -47,7 +49,7 @@ class ShipForm(Strict):
 
 
 class NetworkForm(Strict):
-    """Systems that hear each other, as prototypes: all of them, and what is between."""
+    """Several systems whose modems hear each other, all run as prototypes, and the acoustic channel between them."""
 
     fieldtwin: Literal[1]
     network: Name

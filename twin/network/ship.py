@@ -1,4 +1,4 @@
-"""The ship of a network: a modem in the water with nothing behind it but whoever commands (`far end`), on a socket of its own."""
+"""The topside modem of a network, on its own socket: it sends what the topside controller (`far end`) commands."""
 
 from __future__ import annotations
 
@@ -18,7 +18,9 @@ MOST_CLIENTS = 4
 
 
 class Ship:
-    """``await ship.open(ports)``, then `endpoint` is where its modem is served; its kind is that of the first system's."""
+    """Serves the modem at the endpoint that ``await ship.open(ports)`` returns. The modem is of the same kind as that
+    of the first system.
+    """
 
     def __init__(self, network: Network, medium: AcousticMedium, clock: Clock) -> None:
         assert network.ship is not None
@@ -31,7 +33,7 @@ class Ship:
         self._listener: Listening | None = None
 
     async def open(self, ports: Ports) -> Endpoint:
-        """Raises `EndpointBusy`."""
+        """Start to listen and return the endpoint. Raises `EndpointBusy`."""
         slave = MbapSlave({self.like.system.devices[self.like.modem].address: self._unit})
         self._listener = await ports.listen(
             Endpoint.parse("tcp://127.0.0.1:0"), lambda c: serve_mbap(c, slave, self._clock, 0.0), MOST_CLIENTS

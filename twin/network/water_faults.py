@@ -1,4 +1,6 @@
-"""The faults of a network's water: what is said and does not arrive. Aimed by the network file, told as those of a bus."""
+"""The faults of a network's acoustic channel: packets that are sent and do not arrive. Aimed by the network file, and
+written like those of a bus.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,7 @@ _AIMS = frozenset({"bus", "device", "nth", "every", "from_", "until", "probabili
 
 
 class WaterFaults:
-    """What is in. `start_ns`: when the run began; `from` and `until` count from then."""
+    """The active faults. `start_ns` is when the run began; `from` and `until` count from then."""
 
     def __init__(self, network: Network, seed: int) -> None:
         self.start_ns = 0
@@ -34,11 +36,11 @@ class WaterFaults:
         self._numbers = {name: number for number, name in enumerate(network.places, 1)}
 
     def spoils(self, t_ns: int, listener: int, payload: bytes) -> bool:
-        """`fieldtwin.emulators.wires.acoustic.Spoils`."""
+        """Return whether a fault strikes this packet (`fieldtwin.emulators.wires.acoustic.Spoils`)."""
         return self._wire.decide(Frame(Way.REPLY, Framing.RAW, payload, listener), t_ns) is not None
 
     def inject(self, said: Mapping[str, Any]) -> str:
-        """Put one in; its id. Raises `UsageError`."""
+        """Inject a fault and return its id. Raises `UsageError`."""
         spec = parse_fault(dict(said), number=len(self._wire.active) + 1)
         check_water_fault(self._network, spec)
         if spec.id in self._wire.active:
@@ -61,11 +63,11 @@ class WaterFaults:
         return spec.id
 
     def clear(self, id: str) -> None:
-        """Take it away; one that is not in, or whose time is over, is none."""
+        """Clear a fault. Does nothing if it is not active or its time is over."""
         self._wire.take_away(id)
 
     def describe(self) -> list[dict[str, Any]]:
-        """What is in, and how often it struck."""
+        """Return the active faults, and how often each struck."""
         return [
             {"id": id, "name": active.fault.name, "bus": WATER, "device": active.aim.device, "struck": active.struck}
             for id, active in self._wire.active.items()
@@ -73,7 +75,7 @@ class WaterFaults:
 
 
 def check_water_fault(network: Network, spec: FaultSpec) -> None:
-    """Raises `WrongAim` for what the water cannot suffer, or somebody who is not in it."""
+    """Raises `WrongAim` for a fault that does not apply to the acoustic channel, or a modem that is not in it."""
     if spec.kind is not Drop:
         raise WrongAim("name", f"fault {spec.kind.name!r} is nothing of the water", expected=Drop.name)
     for key in sorted(spec.aim.model_fields_set - _AIMS):

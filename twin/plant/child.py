@@ -1,7 +1,8 @@
-"""A process that belongs to another: it ends in order when the one that started it dies, however that dies.
+"""A child process that shuts down in order when its parent dies, however the parent dies.
 
-``python -m fieldtwin.twin.plant.child PARENT_PID LINGER_S MODULE [ARG...]`` runs ``python -m MODULE ARG...`` like this. What
-stands for the plant lingers: the gateway needs it for a moment more, to make its outputs safe.
+``python -m fieldtwin.twin.plant.child PARENT_PID LINGER_S MODULE [ARG...]`` runs ``python -m MODULE ARG...`` in this
+way. The process of the simulated field devices lingers: the gateway needs it for a moment longer, to set its outputs to
+safe values.
 """
 
 from __future__ import annotations
@@ -18,17 +19,18 @@ MOST_FILES = 65_536
 
 
 def end_with_parent(parent: int, linger_s: float = 0.0) -> None:
-    """Let the kernel tell us when the process `parent` ends, and take it as SIGTERM `linger_s` seconds later.
+    """Make the kernel signal when the process `parent` ends, and raise SIGTERM in this process `linger_s` seconds
+    later.
 
-    Linux only; elsewhere nothing happens.
+    Linux only; on other systems this does nothing.
     """
     if not sys.platform.startswith("linux"):
         return
 
     libc = ctypes.CDLL(None, use_errno=True)
-    if linger_s <= 0:  # no timer: the PLC's own use of it would be lost
+    if linger_s <= 0:  # no timer: it would break the PLC's own use of it
         libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
-        if os.getppid() != parent:  # it died before we asked
+        if os.getppid() != parent:  # the parent died before the request
             os.kill(os.getpid(), signal.SIGTERM)
         return
 
@@ -41,13 +43,13 @@ def end_with_parent(parent: int, linger_s: float = 0.0) -> None:
     signal.signal(signal.SIGHUP, parent_ended)
     signal.signal(signal.SIGALRM, linger_over)
     libc.prctl(_PR_SET_PDEATHSIG, signal.SIGHUP, 0, 0, 0)
-    if os.getppid() != parent:  # it died before we asked
+    if os.getppid() != parent:  # the parent died before the request
         os.kill(os.getpid(), signal.SIGHUP)
 
 
 def allow_open_files() -> None:
-    """Let this process open as many files as it may, `MOST_FILES` at most: 1,000 devices are 2,000 sockets, and where a
-    process begins with 1,024 it is for programs that use select(2), which we do not."""
+    """Raise this process's limit of open files to its maximum, at most `MOST_FILES`: 1,000 devices need 2,000 sockets.
+    The usual limit of 1,024 exists for programs that use select(2), which this project does not."""
     try:
         import resource
     except ImportError:  # Windows, which has no such limit
@@ -59,13 +61,13 @@ def allow_open_files() -> None:
 
 
 def command(module: str, *args: str, linger_s: float = 0.0) -> list[str]:
-    """The command line that runs `module` as a child of this process."""
-    # -P: a module in the folder in which the user works, such as their own yaml.py, is none of ours.
+    """Return the command line that runs `module` as a child of this process."""
+    # -P: do not import modules from the user's working folder, such as a yaml.py of theirs.
     return [sys.executable, "-P", "-m", "fieldtwin.twin.plant.child", str(os.getpid()), str(linger_s), module, *args]
 
 
 def main(argv: list[str]) -> None:
-    """Become the module that is named."""
+    """Run the named module in this process."""
     parent, linger_s, module = int(argv[0]), float(argv[1]), argv[2]
     end_with_parent(parent, linger_s)
     allow_open_files()

@@ -1,10 +1,10 @@
-"""The plant's own say over commands from its digital twin: its switch, its limits, its rate, from its own file.
+"""The plant's own control over commands from its digital twin: its switch, limits and rate, from its own file.
 
-A plant does not rely on the twin that commands it. Every command is answered for: taken, or refused with the reason, and that is
-knowledge. What was taken once is never taken again: a thread tells each number once (`fieldtwin.twin.thread.end`), and numbers
-only grow.
+A plant does not rely on the twin that commands it. For every command the gate records as knowledge that it was taken,
+or why it was refused. A command is never taken twice: a thread passes on each number once
+(`fieldtwin.twin.thread.end`), and numbers only grow.
 
-Pure but for the clock that it is given.
+Pure, except for the clock that it is given.
 """
 
 from __future__ import annotations
@@ -16,16 +16,20 @@ from fieldtwin.twin.model.mape.execute import Bounds, CommandCheck
 from fieldtwin.twin.model.thread_process import PTDigitalThreadProcess
 
 OLD_MS = 10 * 60_000
-"""A command that was under way for longer is not obeyed: what it was meant for is over. Neither is one from so far ahead: its age
-would never count.
+"""A command that is older than this is refused, because its purpose has passed. So is one that is this far ahead of the
+local clock, because its age would never count.
 """
 
 
 class CommandGate(PTDigitalThreadProcess):
-    """`admit` looks at an event of the twin's log; the command, or None where it was refused. It shares what became of each."""
+    """Decides on commands: `admit` takes an event of the twin's log and returns the command, or None if it was refused.
+    The outcome of each command is shared.
+    """
 
     def __init__(self, *, remote: bool, bounds: Bounds, clock: Clock, old_ms: int = OLD_MS, since_ms: int = 0) -> None:
-        """`since_ms`: when the plant's own log began (UTC); what was commanded before may have been obeyed, and nobody knows."""
+        """`since_ms` is when the plant's own log began (UTC). An earlier command may already have been obeyed, so it is
+        refused.
+        """
         super().__init__("command gate", clock)
         self.taken = self.refused = 0
         self._remote = remote
@@ -35,12 +39,12 @@ class CommandGate(PTDigitalThreadProcess):
         self._last: dict[str, int] = {}
 
     def restate(self, *, remote: bool, bounds: Bounds) -> None:
-        """The switch and the limits as they are now: a plant that runs may have them changed."""
+        """Set a new switch position and new limits, which may change while the plant runs."""
         self._remote = remote
         self._check.restate(bounds)
 
     def admit(self, origin: str, event: Event) -> COMMAND | None:
-        """Take a command of the twin's log, or refuse it. What is no command is none of the gate's business."""
+        """Take a command of the twin's log, or refuse it. Events that are not commands are ignored."""
         if event.kind != Kind.COMMAND:
             return None
         if event.sequence <= self._last.get(origin, 0):

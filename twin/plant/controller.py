@@ -1,8 +1,9 @@
-"""The gateway's process: ``python -m fieldtwin.twin.plant.controller CONFIG.json``. The same for a plant and for its prototype.
+"""The gateway's process: ``python -m fieldtwin.twin.plant.controller CONFIG.json``. A plant and its prototype run the
+same.
 
-The configuration names the system file, the run directory and, for a prototype, where each plant endpoint is to be opened. That
-mapping goes into the Connector and nowhere else. Control verbs: ready, get, published, watch, gate, command, reload,
-stop.
+The configuration names the system file, the run directory and, for a prototype, where each plant endpoint is opened
+instead. Only the Connector receives that mapping. Commands of the control channel: ready, get, published, watch, gate,
+command, reload, stop.
 """
 
 from __future__ import annotations
@@ -42,15 +43,19 @@ from fieldtwin.twin.site.system import System, load_system
 FLUSH_EVERY_NS = NS_PER_S // 2
 LOOK_EVERY_NS = NS_PER_S // 20
 FLUSH_ROWS = 8
-"""As many rows are stored at once: the PLC keeps what is not stored, and holds 16 of each program."""
+"""Number of waiting rows that triggers an immediate flush: the PLC keeps what is not stored, and holds 16 rows of each
+program.
+"""
 MOST_COMMAND_BYTES = 64
 MOST_CHANGES_TOLD = 20
 PUBLISHED_AT_ONCE = 20_000
-"""What a line of the control channel takes."""
+"""The most that fits into one line of the control channel."""
 
 
 class ControllerConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What the process is told. `mapping` is None on a plant; `taps` is a file for what goes over the wires, or empty."""
+    """The configuration of the process. `mapping` is None on a plant; `capture` is a file for the recorded bus traffic,
+    or empty.
+    """
 
     system: str
     run_dir: str
@@ -59,11 +64,11 @@ class ControllerConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     profiles: tuple[str, ...] = ()
     capture: str = ""
     lent: tuple[str, ...] = ()
-    """Transmitters whose mailboxes belong to the digital thread."""
+    """Transmitters whose mailboxes are used by the digital thread."""
 
 
 class GatewayProcess:
-    """One gateway with its control channel, until told to stop."""
+    """One gateway with its control channel, which runs until it is stopped."""
 
     def __init__(self, config: ControllerConfig) -> None:
         self._config = config
@@ -96,7 +101,7 @@ class GatewayProcess:
         try:
             ecs = EmbeddedControlSystem(system)
             with attached(ecs.layout, run_dir / "image") as image:
-                # What emulators did or taught is no fact about the devices of a plant.
+                # Keep the prototype's files apart: data learnt from emulators does not describe the plant's devices.
                 of = "" if self._config.mapping is None else ".prototype"
                 self._gateway = ecs.gateway(
                     connector,
@@ -158,7 +163,7 @@ class GatewayProcess:
             socket.unlink(missing_ok=True)
 
     async def _flush(self) -> None:
-        """Store what was logged, twice a second, or sooner if there is much. A disk that refuses is reported and tried again."""
+        """Store the log twice a second, or sooner if there is much. If the disk refuses, report it and try again."""
         flushed_ns = self._clock.monotonic_ns()
         while True:
             await self._clock.sleep_until_ns(self._clock.monotonic_ns() + LOOK_EVERY_NS)
@@ -193,7 +198,7 @@ class GatewayProcess:
         }
 
     async def _published(self, args: dict[str, Any]) -> dict[str, Any]:
-        """At most `PUBLISHED_AT_ONCE` entries, the oldest first: who wants them all asks again."""
+        """Return at most `PUBLISHED_AT_ONCE` entries, the oldest first; a caller that needs more asks again."""
         since = int(args.get("since", 0))
         tags = self._gateway.tags
         newer = tags.journal_since(since)[:PUBLISHED_AT_ONCE]
@@ -201,16 +206,20 @@ class GatewayProcess:
         return {"entries": entries, "published": tags.published, "dropped": tags.journal_dropped}
 
     async def _watch(self, args: dict[str, Any]) -> dict[str, Any]:
-        """Changes of tags since the last question, and some tags now (`fieldtwin.twin.plant.watching`)."""
+        """Return changes of tags since the last question, and the current values of some tags
+        (`fieldtwin.twin.plant.watching`).
+        """
         return self._watching.answer(args)
 
     async def _gate(self, args: dict[str, Any]) -> dict[str, Any]:
-        """The plant's switch, and what a digital twin may command, as they are now."""
+        """Return the plant's current switch position and the current limits of commands from a digital twin."""
         may = self._system.commands
         return {"remote": self._gateway.config.remote, "period_s": list(may.period_s), "per_minute": may.per_minute}
 
     async def _command(self, args: dict[str, Any]) -> dict[str, Any]:
-        """A command of the digital twin, ``payload`` in hex, as if the transmitter had brought it: the control logic decides."""
+        """Pass on a command of the digital twin (``payload`` in hex) as if the transmitter had received it: the control
+        logic decides.
+        """
         if len(self._gateway.pumps) != 1:
             raise UsageError("a command for the transmitter", expected="one", got=str(len(self._gateway.pumps)))
         try:
@@ -222,10 +231,10 @@ class GatewayProcess:
         return {"taken": self._gateway.pumps[0].command(payload, str(args.get("by", "digital twin")))}
 
     async def _reload(self, args: dict[str, Any]) -> dict[str, Any]:
-        """Read the files again and take over what is otherwise in them: all of it, or nothing where some needs a restart.
+        """Read the files again and apply the changes: all of them, or none if one needs a restart.
 
-        With "check" nothing is taken over. Polls go on meanwhile. Raises `FileInvalid` for files that are not right; `limits` in
-        the answer are for the PLC.
+        With "check" nothing is applied. Polling continues meanwhile. Raises `FileInvalid` for invalid files. The PLC
+        needs the `limits` in the answer.
         """
         async with self._reloading:
             new = await asyncio.to_thread(self._load)
@@ -258,10 +267,12 @@ class GatewayProcess:
             }
 
     async def _request_stop(self, args: dict[str, Any]) -> dict[str, Any]:
-        """Safe outputs first; the answer says whether the devices confirmed them, and holds the final counters."""
+        """Set outputs to safe values, then stop. The answer says whether the devices confirmed them, and holds the
+        final counters.
+        """
         safe = await self._gateway.shut_down()
         await self._places.settle()
-        with suppress(Unreachable):  # then it is learnt again
+        with suppress(Unreachable):  # the data will be learnt again
             self._learnt.save()
         status = self._status()
         asyncio.get_running_loop().call_later(0.05, self._stop.set)
@@ -273,7 +284,7 @@ def _plain(value: object) -> object:
 
 
 def main(argv: list[str]) -> int:
-    """Run the process; errors go to stderr as one line."""
+    """Run the process; an error is printed to stderr as one line."""
     try:
         config = msgspec.json.decode(Path(argv[0]).read_bytes(), type=ControllerConfig)
         return run(GatewayProcess(config).run())

@@ -1,5 +1,6 @@
-"""The variables that a system file declares: every tag with a value or a payload that the plant reports, and of each program
-whether it runs. The digital model's are these, whichever twin it is in, and so are those of a template's ``model.json``."""
+"""The variables that a system file declares: every tag whose value or payload the plant reports, and for each program
+whether it runs. These are the variables of the digital model in every twin, and those of a template's ``model.json``.
+"""
 
 from __future__ import annotations
 
@@ -12,9 +13,10 @@ from fieldtwin.twin.site.system import System
 
 
 def declared_variables(system: System, limits: Mapping[str, Limits] | None = None) -> tuple[Variable, ...]:
-    """One for each, in the system file's order. `limits` are held against values instead of those of the profiles.
+    """Return the declared variables, in the system file's order. `limits`, if given, replace those of the profiles.
 
-    A transmitter's inbox is none: what comes in there are commands, which a model takes as such (`DigitalModel.process_event`).
+    A transmitter's inbox is not a variable: it receives commands, which a model takes as such
+    (`DigitalModel.process_event`).
     """
     tags = [
         Variable(tag.name, tag.kind.name.lower(), tag.unit, tag.limits if limits is None else limits.get(tag.name))

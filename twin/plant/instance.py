@@ -1,7 +1,7 @@
-"""An instance: one running system on this host, with a run directory of its own (DESIGN.md, "Instances").
+"""An instance: one running system on this host, with its own run directory (DESIGN.md, "Instances").
 
-Sockets, virtual serial ports, process image, logs and store live there; only its owner may enter. Two instances of one system
-run side by side; one name runs once.
+Sockets, virtual serial ports, process image, logs and store are in that directory, which only its owner may enter. Two
+instances of one system can run at the same time, under different names; an instance name can be in use once only.
 """
 
 from __future__ import annotations
@@ -27,13 +27,14 @@ else:
 TEMPORARY = Path("/tmp")
 
 SOCKET_PATH_MAX = 100
-"""A Unix socket's path is at most 107 bytes (sockaddr_un); our longest file name takes some of it."""
+"""Longest path of a run directory plus file name. A Unix socket's path is at most 107 bytes (sockaddr_un)."""
 
 
 def runtime_root() -> Path:
-    """Where run directories are made: FIELDTWIN_RUN, else the user's runtime folder, else a folder of theirs in /tmp.
+    """Return where run directories are made: FIELDTWIN_RUN, else the user's runtime folder, else a folder of the user
+    in /tmp.
 
-    Raises `Unreachable` if the folder in /tmp was created by another user, or other users may write to it.
+    Raises `Unreachable` if the folder in /tmp was created by another user, or if other users may write to it.
     """
     if chosen := os.environ.get("FIELDTWIN_RUN"):
         return Path(chosen)
@@ -47,7 +48,9 @@ def runtime_root() -> Path:
 
 
 def _refuse_a_strangers(folder: Path) -> None:
-    """Everybody may create a file in /tmp: whoever owns the folder could replace what is made in it, sockets included."""
+    """Refuse a folder that another user owns or may write to. Any user may create a file in /tmp, and the folder's
+    owner could replace its contents, sockets included.
+    """
     try:
         found = folder.lstat()
     except FileNotFoundError:
@@ -63,7 +66,9 @@ def _refuse_a_strangers(folder: Path) -> None:
 
 
 class Instance:
-    """``with Instance("observatory") as instance``: the directory is ours until the end. Raises `EndpointBusy`."""
+    """``with Instance("observatory") as instance``: locks the directory until the end of the block. Raises
+    `EndpointBusy`.
+    """
 
     def __init__(self, name: str, root: Path | None = None) -> None:
         if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,39}", name):
@@ -104,5 +109,5 @@ class Instance:
             self._lock = None
 
     def path(self, name: str) -> Path:
-        """A file of this instance."""
+        """Return the path of a file of this instance."""
         return self.dir / name

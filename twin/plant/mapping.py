@@ -1,6 +1,6 @@
-"""Where the prototype differs from the plant: an endpoint is opened elsewhere. Applied below every driver.
+"""The one difference between the prototype and the plant: endpoints are opened elsewhere. Applied below every driver.
 
-Emulators are unknown here: this is a Connector around a Connector (DESIGN.md, "Who opens a wire").
+Emulators are unknown here: this is a Connector that wraps a Connector (DESIGN.md, "Who opens a wire").
 """
 
 from __future__ import annotations
@@ -11,7 +11,9 @@ from fieldtwin.gateway.core.errors import UsageError
 
 
 class MappedConnector:
-    """Opens `mapping[plant endpoint]` instead of the plant endpoint. One that is not mapped is refused, never opened."""
+    """Opens `mapping[plant endpoint]` instead of the plant endpoint. An endpoint that is not mapped is refused, never
+    opened.
+    """
 
     def __init__(self, inner: Connector, mapping: dict[Endpoint, Endpoint]) -> None:
         self._inner = inner
@@ -35,8 +37,8 @@ class MappedConnector:
 
 
 def mapped_endpoint(plant: Endpoint, listening: Endpoint) -> Endpoint:
-    """What the controller opens for `plant` when its emulator listens on `listening`: a pty is opened as the serial
-    port that it stands for, with the plant's baud rate and frame."""
+    """Return what the controller opens for `plant` when its emulator listens on `listening`. A pty is opened as the
+    serial port that it replaces, with the plant's baud rate and character format."""
     if listening.scheme == "pty":
         return plant.with_path(listening.path)
     if plant.is_serial:

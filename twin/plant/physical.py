@@ -1,7 +1,8 @@
 """The physical twin: gateway and PLC of a system, and the memory that they share.
 
-Everything that both processes must agree on is made here, once: the process image's layout from the system file, the file that
-holds it, and each process's own configuration. Emulators are unknown (`fieldtwin run --plant` works without that folder).
+Everything on which both processes must agree is made here, once: the process image's layout from the system file, the
+file that holds the image, and the configuration of each process. Emulators are unknown here (`fieldtwin run --plant`
+works without that folder).
 """
 
 from __future__ import annotations
@@ -36,25 +37,25 @@ from fieldtwin.twin.site.system import System
 
 MESSAGE_DEPTH = 16
 PLC_LOST_CYCLES = 50
-"""The PLC's outputs count no more when it has not published for so many cycles, and for `PLC_LOST_MS` at least."""
+"""The PLC's outputs are ignored when it has not published for this many cycles, and for at least `PLC_LOST_MS`."""
 PLC_LOST_MS = 500
 GATEWAY_LOST_MS = 1000
 MIN_STUCK_MS = 200
 
 
 def fastest_ms(system: System) -> int:
-    """The interval of the PLC's fastest cyclic task: how often it publishes."""
+    """Return the interval of the PLC's fastest cyclic task, which is how often the PLC publishes."""
     intervals = [task.interval_ms for task in system.plc.tasks.values() if task.interval_ms]
     return min(intervals, default=system.plc.cycle_ms)
 
 
 def plc_lost_ms(system: System) -> int:
-    """How old the PLC's last scan is when it counts as lost, and its outputs are made safe."""
+    """Return the age in ms of the last scan at which the PLC counts as lost and its outputs are set to safe values."""
     return max(PLC_LOST_MS, PLC_LOST_CYCLES * fastest_ms(system))
 
 
 def gateway_lost_ms(system: System) -> int:
-    """How old what the gateway published last is when it counts as dead, and everything that it read as bad."""
+    """Return the age in ms of the last publication at which the gateway counts as dead and all its values as bad."""
     return max(GATEWAY_LOST_MS, 10 * fastest_ms(system))
 
 
@@ -65,7 +66,7 @@ def _kind(tag: Tag) -> TagKind:
 
 
 def plant_tags(system: System) -> dict[str, TagSpec]:
-    """Every tag of the system that a process image can hold: numbers, messages and mailboxes."""
+    """Return every tag of the system that a process image can hold: numbers, messages and mailboxes."""
     specs: dict[str, TagSpec] = {}
 
     def add(spec: TagSpec) -> None:
@@ -85,7 +86,7 @@ def plant_tags(system: System) -> dict[str, TagSpec]:
 
 
 def programs_of(system: System) -> tuple[ProgramConfig, ...]:
-    """The PLC's programs as its process wants them."""
+    """Return the configuration of the PLC's programs for its process."""
     return tuple(
         ProgramConfig(
             name,
@@ -104,7 +105,9 @@ def _start_policy(form: StartForm) -> StartPolicy:
 
 
 def image_layout(system: System) -> ImageLayout:
-    """The process image of a system: what its programs are bound to, and every other number for watchers."""
+    """Return the process image of a system: the tags to which its programs are bound, and every other number for
+    watchers.
+    """
     _check_tasks(system)
     folder = str(system.path.parent)
     plant = plant_tags(system)
@@ -133,7 +136,9 @@ def image_layout(system: System) -> ImageLayout:
 
 
 def _check_tasks(system: System) -> None:
-    """Every program is in a task that there is, and one of them runs by itself and looks at the triggers of the others."""
+    """Check that every program's task exists and that at least one task is cyclic: cyclic tasks evaluate the triggers
+    of the SINGLE tasks.
+    """
     names = list(system.plc.tasks) or ["main"]
     for program, form in system.plc.programs.items():
         if form.task and form.task not in names:
@@ -144,7 +149,7 @@ def _check_tasks(system: System) -> None:
 
 
 def _check_variables(system: System, bound: BoundProgram) -> None:
-    """What the file binds must be variables of the program, of the right kind."""
+    """Check that every name that the file binds is a variable of the program with the right role."""
     for key, role, names in (("inputs", Role.INPUT, bound.inputs), ("outputs", Role.OUTPUT, bound.outputs)):
         declared = [v.name for v in bound.variables(role)]
         for name in names:
@@ -164,9 +169,10 @@ def gateway_config(
     true_silences: bool | None = None,
     lent: Sequence[str] = (),
 ) -> GatewayConfig:
-    """What the gateway runs. With `free_ports` it serves and bridges where there is room, so that several run on one host.
-    Without `true_silences` no line is strict about them: those of virtual ports say nothing, which `free_ports` implies. The
-    mailboxes of the transmitters `lent` are left to a digital thread."""
+    """Return the gateway's configuration. With `free_ports` it serves and bridges on free ports, so that several
+    gateways can run on one host. Without `true_silences` no line checks the pauses in RTU frames, because those of
+    virtual ports carry no information; `free_ports` implies this by default. The mailboxes of the transmitters in
+    `lent` are left to a digital thread."""
     true_silences = not free_ports if true_silences is None else true_silences
     serving = system.serving.for_run(allow_writes=allow_writes, free_ports=free_ports)
     outputs = {tag for form in system.plc.programs.values() for tag in form.outputs.values()}
@@ -190,7 +196,7 @@ def _without_inbox(device: DeviceConfig) -> DeviceConfig:
 
 
 def plc_config(system: System, run_dir: Path, *, cold: bool = False) -> PlcConfig:
-    """What the PLC process is told. With `cold` its retained variables begin with their initial values."""
+    """Return the configuration of the PLC process. With `cold` its retained variables start with their initial values."""
     watchdog = system.plc.watchdog
     return PlcConfig(
         image_path=str(run_dir / "image"),
@@ -217,7 +223,7 @@ def plc_config(system: System, run_dir: Path, *, cold: bool = False) -> PlcConfi
 
 
 def make_image(layout: ImageLayout, path: Path) -> None:
-    """Make the file that holds the image, readable and writable for its owner only. It replaces an older one."""
+    """Create the file that holds the image, readable and writable for its owner only. It replaces an older one."""
     temporary = path.with_suffix(".new")
     try:
         with open(os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o600), "r+b") as file:
@@ -242,15 +248,16 @@ def attached(layout: ImageLayout, path: Path) -> Iterator[Image]:
 
 
 def make_drivers(system: System, tags: TagTable, clock: Clock) -> dict[str, RegisterDriver | CanopenDriver]:
-    """The driver of every device, in the file's order, attached to nothing yet."""
+    """Return the driver of every device, in the file's order, not attached to a bus yet."""
     return {d.name: make_driver(d, system.buses[d.bus], tags, clock) for d in system.devices.values()}
 
 
 class EmbeddedControlSystem:
-    """SPEC row EmbeddedControlSystem: the drivers and the control logic of a system, from its file and nothing else.
+    """SPEC row EmbeddedControlSystem: the drivers and the control logic of a system, built from its file alone.
 
-    The plant and its prototype run this very class. It is spread over two processes, the gateway with the drivers and the PLC
-    with the control logic, which share the process image; what each is told, and the gateway itself, is made here.
+    The plant and its prototype run this same class. It spans two processes, the gateway with the drivers and the PLC
+    with the control logic, which share the process image. This class makes the gateway and the configuration of both
+    processes.
     """
 
     def __init__(self, system: System) -> None:
@@ -273,19 +280,22 @@ class EmbeddedControlSystem:
         lent: Sequence[str] = (),
         taken: TakenFile | None = None,
     ) -> Gateway:
-        """The gateway with its drivers. Which wires `connector` opens, and where `listen` lets clients in, nobody from here
-        on knows. `taken` keeps which commands need not be handed on again; None: nobody comes after it."""
+        """Return the gateway with its drivers. The gateway does not know which connections `connector` opens, or where
+        `listen` accepts clients. `taken` records which commands need not be handed on again after a restart; None if
+        there will be no restart."""
         config = gateway_config(
             self.system, allow_writes=allow_writes, free_ports=free_ports, true_silences=true_silences, lent=lent
         )
         return Gateway(config, connector, clock, image, audit, log, listen, taken)
 
     def command_lists(self, clock: Clock) -> dict[str, frozenset[str]]:
-        """What the driver of each device can ask of it."""
+        """Return the commands that the driver of each device can send."""
         return {name: d.command_list for name, d in make_drivers(self.system, TagTable(clock), clock).items()}
 
     def prepare(self, run_dir: Path, *, cold: bool = False) -> PlcConfig:
-        """Make the process image in `run_dir`; what the PLC's process is to be told. `cold`: without what was retained."""
+        """Create the process image in `run_dir` and return the PLC process's configuration. `cold`: discard retained
+        values.
+        """
         make_image(self.layout, run_dir / "image")
         return plc_config(self.system, run_dir, cold=cold)
 
@@ -293,8 +303,8 @@ class EmbeddedControlSystem:
 class PhysicalTwin:
     """SPEC row PhysicalTwin: sensors, transmitters and the embedded control system.
 
-    The devices are hardware out there; of them this side has what the system file says. CANopen nodes are sensors here (SPEC
-    ruling 13).
+    The devices are external hardware; this class holds what the system file says about them. CANopen nodes count as
+    sensors (SPEC ruling 13).
     """
 
     def __init__(self, system: System) -> None:

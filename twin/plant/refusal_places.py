@@ -1,7 +1,7 @@
-"""The line of the program that set each refused output: asked of the PLC's process, once for each entry of the journal.
+"""Finds the program line that set each refused output, by asking the PLC's process once for each journal entry.
 
-The gateway knows tags and values; the PLC's process knows which line of which program assigned them. A PLC that does not answer
-leaves the line unknown, and never delays the entry by more than `ANSWER_S`.
+The gateway knows tags and values; the PLC's process knows which line of which program assigned them. If the PLC does
+not answer, the line stays unknown. The entry is never delayed by more than `ANSWER_S`.
 """
 
 from __future__ import annotations
@@ -17,13 +17,15 @@ from fieldtwin.gateway.core.errors import FieldtwinError
 from fieldtwin.gateway.runtime.refusals import Refusal, Refusals
 
 ANSWER_S = 1.0
-"""How long the PLC may take to answer."""
+"""Seconds within which the PLC must answer."""
 MOST_WAITING = 64
-"""Entries that wait for their line; a further one is told without it."""
+"""Number of entries that may wait for their line; further ones are reported without it."""
 
 
 class RefusalPlaces:
-    """Completes the entries of `journal` over the PLC's control channel at `socket`. `tell` is called with each of them then."""
+    """Completes the entries of `journal` over the PLC's control channel at `socket`. It then calls `tell` with each
+    entry.
+    """
 
     def __init__(self, journal: Refusals, socket: Path, tell: Callable[[dict[str, Any]], None] | None = None) -> None:
         self._journal = journal
@@ -84,4 +86,4 @@ class RefusalPlaces:
             async with asyncio.timeout(ANSWER_S):
                 await self._idle.wait()
         except TimeoutError:
-            pass  # the entries are told without it
+            pass  # the entries are reported without their lines

@@ -1,8 +1,8 @@
-"""Two versions of a system's files: what is otherwise, and what of that a running gateway can take over.
+"""Compares two versions of a system's files: what changed, and which changes a running gateway can apply.
 
-Pace, periods, limits, scaling and safe values can change between two polls, and so can the plant's switch and what may be
-commanded over a thread. Ports, addresses, what a device is, programs and
-what is bound to them cannot: that is named, and nothing at all is taken over then. What is not listed here as changeable is not.
+Timing, periods, limits, scaling and safe values can change between two polls, and so can the plant's switch and the
+limits of commands over a thread. Ports, addresses, the kind of a device, programs and their bindings cannot. If one
+change needs a restart, it is named and nothing is applied. Keys that are not listed here as changeable need a restart.
 """
 
 from __future__ import annotations
@@ -22,9 +22,11 @@ from fieldtwin.twin.site.system import System
 
 Loc = tuple[Key, ...]
 GATE = frozenset({"remote", "commands"})
-"""Who may command, and what: the plant's own say, and nobody who throws a switch may have to stop a plant for it."""
+"""Keys of the command gate. They can change at run time, so that an operator never has to stop a plant to operate the
+switch.
+"""
 BUS = frozenset({"timeout_ms", "retries", "spacing_ms", "turnaround_ms", "connect_pause_ms", "probe_percent"})
-"""Of a Modbus bus. A CAN bus has nothing that could change."""
+"""Keys of a Modbus bus. A CAN bus has no key that could change."""
 DEVICE = frozenset({"poll", "stale_after_ms", "safe", "backoff_first_ms", "backoff_limit_ms"})
 MODBUS_DEVICE = DEVICE | {"timeout_ms", "retries", "spacing_ms", "writable"}
 PROFILE = frozenset({"source", "limits", "gaps", "timing"})
@@ -35,7 +37,7 @@ NOTHING = object()
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """One value that is otherwise: in which file and where there, under which keys, and whether it can be taken over."""
+    """One changed value: its file and place, its keys, the old and new text, and whether it can be applied at run time."""
 
     where: str
     what: str
@@ -48,7 +50,9 @@ class Change:
 
 
 def compare(old: System, new: System) -> list[Change]:
-    """What is otherwise in `new`, the system file first, in the order of its keys; then profiles, then what they name."""
+    """Return the changes in `new`: first the system file, in the order of its keys, then profiles, then the files that
+    they name.
+    """
     before, after = _dump(old), _dump(new)
     found = [
         _change(new.file, at, a, b, live=_is_live(new, at, before, after), secret=_is_secret(new, at))
@@ -61,7 +65,7 @@ def compare(old: System, new: System) -> list[Change]:
 
 
 def limits_changed(old: System, new: System) -> dict[str, tuple[float, float] | None]:
-    """The tags whose smallest and largest values are others now: the PLC has a copy of them, for forces."""
+    """Return the tags whose limits changed. The PLC has a copy of the limits, to check forces."""
     before, after = plant_tags(old), plant_tags(new)
     return {name: spec.limits for name, spec in after.items() if name in before and spec.limits != before[name].limits}
 
@@ -122,12 +126,12 @@ def _is_live_in_profile(before: DeviceProfile, after: DeviceProfile, at: Loc) ->
         return at[0] in PROFILE or at == ("sampled", "slack_ms")
     if len(at) < 3 or at[2] not in TAG:
         return False
-    tag = str(at[1])  # the process image holds it as a whole number, or not
+    tag = str(at[1])  # the process image stores the tag as an integer or not, which cannot change
     return at[2] not in SCALING or before.tags[tag].is_integer == after.tags[tag].is_integer
 
 
 def _unexplained(old: System, new: System) -> list[Change]:
-    """What differs though nothing that may change says so: a DCF or an EDS that the files name, a profile's messages."""
+    """Return differences that no changeable key explains: a DCF or an EDS that the files name, a profile's messages."""
     found = []
     for name, device in new.devices.items():
         before = old.devices[name]

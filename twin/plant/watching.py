@@ -1,6 +1,7 @@
-"""Who follows a gateway's tags from outside: every change since the last question, and some tags as they are now.
+"""Lets clients follow a gateway's tags: every change since the last question, and the current values of some tags.
 
-Nothing is kept until somebody asks for the first time; from then on the latest `MOST` changes, the older ones counted.
+Nothing is recorded before the first question; from then on the latest `MOST` changes are kept, and the older ones
+counted.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from fieldtwin.gateway.runtime.tags import TagTable
 
 MOST = 50_000
 AT_ONCE = 10_000
-"""What a line of the control channel takes."""
+"""The most that fits into one line of the control channel."""
 Change = tuple[int, int, str, Any, str, str]
 """Number (from 1), monotonic ns, tag, value (bytes as hex), quality, reason."""
 
@@ -32,11 +33,13 @@ class TagWatch:
         self._number = 0
 
     def answer(self, args: dict[str, Any]) -> dict[str, Any]:
-        """``now_ns``; ``changes`` after number `since`, the oldest first, `AT_ONCE` at most; ``dropped``, how many of them are
-        not kept any more; ``last``, the newest number; ``tags``: of each of `names` value, quality, reason, source time (ns);
-        ``refusals``: writes that did not reach their device, after the entry number `refused`.
+        """Return the answer to a `watch` question, with these keys:
 
-        Raises `UsageError` for a tag that there is not.
+        ``now_ns``; ``changes`` after number `since`, the oldest first, at most `AT_ONCE`; ``dropped``, how many of them
+        are no longer kept; ``last``, the newest number; ``tags``, with value, quality, reason and source time (ns) of
+        each of `names`; ``refusals``, writes that did not reach their device, after entry number `refused`.
+
+        Raises `UsageError` for an unknown tag.
         """
         if self._tags.on_put is None:
             self._tags.on_put = self._changed

@@ -1,1 +1,1 @@
-"""The digital twin prototype: the same gateway and PLC opposite simulated devices, and the faults that are put in."""
+"""The digital twin prototype: the same gateway and PLC with simulated field devices, and the injection of faults."""

@@ -1,6 +1,6 @@
-"""What a fault's aim means in a system: a bus, a device, a register or a tag by name become units, addresses and objects.
+"""Resolves a fault's aim in a system: names of buses, devices, registers and tags become units, addresses and objects.
 
-Pure: what makes no sense is found before anything runs. The physical twin knows nothing of it.
+Pure: an invalid aim is found before anything runs. The physical twin does not use this module.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from fieldtwin.twin.site.system import System
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """What is struck. `units` empty: all of the bus; `addresses` None and `functions` empty: all."""
+    """What a fault strikes. Empty `units` mean all of the bus; `addresses` None and empty `functions` mean all."""
 
     bus: str
     units: tuple[int, ...]
@@ -30,7 +30,9 @@ class Target:
 
 
 def target(system: System, spec: FaultSpec) -> Target:
-    """Raises `WrongAim` with the nearest name for what the system does not have, and for what such a bus cannot suffer."""
+    """Resolve the aim of `spec`. Raises `WrongAim` for a name that the system does not have, with the nearest one, and
+    for a fault that does not apply to this kind of bus.
+    """
     aim, kind = spec.aim, spec.kind.kind
     bus = _bus(system, spec)
     tag = None
@@ -58,7 +60,7 @@ def target(system: System, spec: FaultSpec) -> Target:
 
 
 def tag_of(system: System, device: str, tag: str, key: str = "") -> Tag:
-    """A device's tag by its name. Raises `WrongAim`."""
+    """Return a device's tag by its name. Raises `WrongAim`."""
     known("device", device, system.devices, "device")
     tags = system.devices[device].profile.tags
     known(f"tag of {device}", tag, tags, key)
@@ -66,7 +68,7 @@ def tag_of(system: System, device: str, tag: str, key: str = "") -> Tag:
 
 
 def known(what: str, name: str, names: Iterable[str], key: str = "") -> None:
-    """Raises `WrongAim` for a name that is none of `names`, with the nearest."""
+    """Check that `name` is one of `names`. Raises `WrongAim` with the nearest name otherwise."""
     names = list(names)
     if name not in names:
         hint = did_you_mean(name, names)

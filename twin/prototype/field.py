@@ -1,7 +1,7 @@
-"""The field side: the emulators of a prototype, on real wires, in one process.
+"""The simulated field devices: the emulators of a prototype on real connections, in one process.
 
-For each emulated bus one listener (a pty, a TCP socket, a software CAN bus or a kernel CAN interface) with every device of
-that bus behind it. Here the paper's emulators meet the system file; what gateway and PLC do is not known here.
+Each emulated bus has one listener (a pty, a TCP socket, a software CAN bus or a kernel CAN interface) that serves every
+device of that bus. This module connects the emulators to the system file; it does not know what gateway and PLC do.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ from fieldtwin.twin.site.system import System
 
 
 class FieldDevice:
-    """An emulated device as the field side knows it: its counters and what it held."""
+    """An emulated device in this process: its counters and the values that it held."""
 
     def __init__(
         self, emulated: EmulatedDevice, unit: EmulatedUnit | RecordedDevice | None, node: CanopenNode | None
@@ -63,19 +63,21 @@ class FieldDevice:
         self.node = node
         self.journal: HeldJournal = HeldJournal()
         self.remarks: list[str] = []
-        """What does not fit a node's data sheet, with what to do about it."""
+        """Remarks about values that do not fit a node's data sheet, with what to do about them."""
 
     @property
     def command_list(self) -> frozenset[str]:
-        """What this device accepts, by its own profile."""
+        """The commands that this device accepts, according to its own profile."""
         return self.emulated.profile.command_list
 
     def executed(self) -> dict[str, int]:
-        """How often each command of the list was executed; of a CANopen node, nobody counts them by name."""
+        """Return how often each command of the list was executed; empty for a CANopen node, whose commands are not
+        counted by name.
+        """
         return {} if self.unit is None else {c: self.unit.emulator.executed[c] for c in sorted(self.command_list)}
 
     def counters(self) -> dict[str, int]:
-        """Requests taken and replies sent, as the device counts them."""
+        """Return the requests taken and the replies sent, as the device counts them."""
         if self.node is not None:
             return dict(
                 self.node.counters.as_dict(),
@@ -88,24 +90,24 @@ class FieldDevice:
 
 
 def _taken(units: Mapping[int, EmulatedUnit | RecordedDevice]) -> tuple[int, int]:
-    """Requests and replies of all units of a line so far."""
+    """Return the numbers of requests and replies of all units of a line so far."""
     counters = [unit.counters for unit in units.values()]
     return sum(c.requests for c in counters), sum(c.replies for c in counters)
 
 
 def _advised(remark: Remark) -> str:
-    """A remark with what the prototype file can say about it."""
+    """Return a remark with the keys of the prototype file that can resolve it."""
     if remark.by_parameter_value:
         return f"{remark.text} (`parameter_values: false` starts with the DefaultValues)"
     return f"{remark.text} (`cia: 402` chooses a model, `cia: none` means it)" if remark.model else remark.text
 
 
 class FieldSide:
-    """Builds every emulator of a prototype and runs them on their wires.
+    """Builds every emulator of a prototype and runs them on their connections.
 
-    `run_dir` is where virtual serial ports get their links. After `open`, `listening` says where each emulated bus really
-    listens (free ports taken), and `far` where the far modems do. `water`: the ends of transmitters that are in a network's water
-    and have no far modem of their own.
+    Virtual serial ports get their links in `run_dir`. After `open`, `listening` holds the endpoint at which each
+    emulated bus listens (with the free ports that were chosen), and `far` those of the far modems. `water`: the
+    acoustic ends of transmitters that are in a network's acoustic channel and have no far modem of their own.
     """
 
     def __init__(
@@ -124,7 +126,7 @@ class FieldSide:
         self.far: dict[str, Endpoint] = {}
         self.far_units: dict[str, ModbusUnit] = {}
         self.signals: dict[str, Signals] = {}
-        """What devices play, by their names."""
+        """The signals that devices play, by device name."""
         self.faults = FieldFaults(system, prototype.seed, clock)
         self._run_dir = run_dir
         self._clock = clock
@@ -161,15 +163,16 @@ class FieldSide:
             self._replays.clear()
 
     async def run(self) -> None:
-        """Serve until cancelled; raises what an emulator raises."""
-        self._nursery.start(asyncio.Event().wait(), "until cancelled")  # sockets have no task of ours: it is not over
+        """Serve until cancelled. Raises any exception of an emulator."""
+        # Socket servers have no task in this nursery, so this task keeps it running.
+        self._nursery.start(asyncio.Event().wait(), "until cancelled")
         try:
             await self._nursery.wait()
         finally:
             await self.aclose()
 
     async def aclose(self) -> None:
-        """Stop every emulator and close every wire."""
+        """Stop every emulator and close every connection."""
         await self._nursery.__aexit__(None, None, None)
         for listener in self._listeners:
             await listener.aclose()
@@ -237,7 +240,9 @@ class FieldSide:
         return self._clients.setdefault(bus, ClientCounts())
 
     def _behind(self, bus: str, serve: Callable[[ByteConnection, str], Awaitable[None]]) -> OnClient:
-        """`serve` for clients that come through the faults of their bus; it is told each client's address."""
+        """Wrap `serve` so that clients connect through the faults of their bus. `serve` also gets each client's
+        address.
+        """
 
         async def client(connection: ByteConnection) -> None:
             if self.faults.refuses(bus):
@@ -256,7 +261,7 @@ class FieldSide:
         return listener.bound
 
     async def _open_far(self, device: DeviceConfig, latency_s: float) -> None:
-        """The far modem of a transmitter, on a socket of its own."""
+        """Open the far modem of a transmitter, on its own socket."""
         pair, form = self._pairs.get(device.name), self.prototype.devices[device.name].form
         if pair is None or form.far is None:
             return
@@ -285,7 +290,7 @@ class FieldSide:
             self._nursery.start(serve_node(connection, node, self._clock), f"node {device.name}")
 
     async def join(self, bus: str, name: str) -> CanConnection:
-        """An end on an emulated CAN bus for somebody who only listens; closing it is up to them."""
+        """Join an emulated CAN bus as a passive listener. The caller closes the connection."""
         for port in self._buses:
             if port.bound == self.listening.get(bus):
                 return await port.join(name)
@@ -323,7 +328,7 @@ class FieldSide:
         return unit
 
     def _modem(self, config: DeviceConfig, emulated: EmulatedDevice) -> MailboxModem:
-        """A transmitter: in a network's water, or with a far modem and a link of its own."""
+        """Return a transmitter: in a network's acoustic channel, or with its own far modem and link."""
         end, link = self._water.get(config.name), emulated.form.far_link
         if end is not None:
             return MailboxModem(emulated.profile, end, end, emulated.form.identity)
@@ -339,7 +344,7 @@ class FieldSide:
         return pair.near
 
     def _stated_unit(self, config: DeviceConfig, emulated: EmulatedDevice) -> EmulatedUnit:
-        """A device of which nothing is recorded: its profile, and what the prototype file says that its tags hold."""
+        """Return a device without a recording: its profile, and the values of its tags from the prototype file."""
         tags = emulated.profile.tags
         stated = {name: tags[name].number_of(value) for name, value in emulated.form.values.items()}
         values = {**stated, **emulated.form.identity}
@@ -362,11 +367,11 @@ class FieldSide:
         return unit
 
     def _recorded_unit(self, config: DeviceConfig, emulated: EmulatedDevice) -> RecordedDevice:
-        """A device that is known by its exchanges."""
+        """Return a device that replays its recorded exchanges."""
         assert emulated.recording is not None
         profile, at_end = emulated.profile, WhenUsedUp.parse(emulated.form.at_end)
         key = emulated.recording, profile.path, profile.hash, at_end
-        if key not in self._replays:  # a recording that many devices play is read once, and in memory once
+        if key not in self._replays:  # a recording shared by many devices is read and kept in memory once
             self._replays[key] = load_replay(profile, emulated.recording, at_end)
         replay, unit_id = self._replays[key]
         kind = self._kind(config)
@@ -380,7 +385,7 @@ class FieldSide:
         return RS232Connection if self.system.buses[config.bus].endpoint.is_serial else TCPConnection
 
     def _emulated_unit(self, config: DeviceConfig, bank: RegisterBank, context: Sized) -> EmulatedUnit:
-        """The device on a wire of the plant's kind, whatever carries that wire now."""
+        """Return the device on a connection of the plant's kind, whatever carries that connection in this run."""
         profile = self.prototype.devices[config.name].profile
         limits, parts = unit_limits(profile), parts_of(profile)
         return EmulatedUnit(bank, profile, self._kind(config), context, limits, config.name, parts)
@@ -415,7 +420,7 @@ class FieldSide:
         return CanLog(emulated.recording, emulated.form.speed, WhenUsedUp.parse(emulated.form.at_end))
 
     def _signals(self, emulated: EmulatedDevice) -> Signals:
-        """What the device plays: a simulation, or its recording from now on."""
+        """Return the signals that the device plays: of its simulation, or of its recording, starting now."""
         self.signals[emulated.name] = signals = self._made_signals(emulated)
         return signals
 
@@ -434,7 +439,9 @@ class FieldSide:
         )
 
     def _clients_by_bus(self) -> dict[str, dict[str, dict[str, int]]]:
-        """By bus and client, the requests that reached a device and their replies; no bus of a kernel, no line of a pty."""
+        """Return, by bus and client, the requests that reached a device and their replies. Kernel CAN buses and ptys
+        are not included.
+        """
         for line in self._lines:
             line.settle()
         found = {bus: counts.describe() for bus, counts in self._clients.items()}
@@ -445,7 +452,7 @@ class FieldSide:
     # -- what others see ------------------------------------------------------------------------------------------------
 
     def status(self) -> dict[str, Any]:
-        """Counters by device, for the control channel."""
+        """Return counters by device, for the control channel."""
         return {
             "system": self.system.name,
             "system_hash": self.system.hash,
@@ -481,7 +488,7 @@ class FieldSide:
         }
 
     def held_since(self, numbers: dict[str, int]) -> dict[str, list[tuple[int, str, str, int]]]:
-        """What each device held after the given journal numbers: (number, tag, hex, monotonic ns)."""
+        """Return the values that each device held after the given journal numbers: (number, tag, hex, monotonic ns)."""
         return {
             name: [(h.number, h.tag, h.raw.hex(), h.t_ns) for h in d.journal.since(numbers.get(name, 0))]
             for name, d in self.devices.items()
@@ -489,7 +496,7 @@ class FieldSide:
 
 
 def line_of(plant: Endpoint, units: Mapping[int, ModbusUnit]) -> LineSlave:
-    """The units of a serial line, in the framing that the plant's endpoint speaks."""
+    """Return the units of a serial line, in the framing of the plant's endpoint."""
     return AsciiSlave(units) if plant.scheme == "ascii" else RtuSlave(units)
 
 

@@ -1,6 +1,8 @@
-"""The faults of a field side: what is put in by name is aimed here, by the system file, at a bus, a device, a register or a tag.
+"""The faults of the simulated field devices: each fault is aimed, using the system file, at a bus, a device, a register
+or a tag.
 
-A plant has none of this. Whoever asks is `fieldtwin run --faults`, a scenario, or somebody at the control channel.
+A plant does not have this module. Faults are injected by `fieldtwin run --faults`, a scenario, or a client of the
+control channel.
 """
 
 from __future__ import annotations
@@ -34,8 +36,8 @@ MOST = 1_000
 
 
 class FieldFaults:
-    """What is in on the buses of a system, and in its devices. `start_ns`: when the run began; `from` and `until` count from
-    then."""
+    """The active faults on the buses of a system and in its devices. `start_ns` is when the run began; `from` and
+    `until` count from then."""
 
     def __init__(self, system: System, seed: int, clock: Clock) -> None:
         self.start_ns = clock.monotonic_ns()
@@ -54,40 +56,40 @@ class FieldFaults:
     # -- where faults can be --------------------------------------------------------------------------------------------
 
     def on_bytes(self, bus: str, connection: ByteConnection) -> FaultyEnd:
-        """An emulator's end of a line or socket, behind the faults of its bus."""
+        """Return an emulator's end of a line or socket, with the faults of its bus applied."""
         return FaultyEnd(connection, self._buses[bus])
 
     def on_datagrams(self, bus: str, socket: Datagrams) -> FaultyDatagrams:
-        """An emulator's UDP socket, behind the faults of its bus."""
+        """Return an emulator's UDP socket, with the faults of its bus applied."""
         return FaultyDatagrams(socket, self._buses[bus])
 
     def on_can(self, bus: str, connection: CanConnection, node: int) -> FaultyCan:
-        """A node's end of a bus, behind the faults of that bus."""
+        """Return a node's end of a bus, with the faults of that bus applied."""
         return FaultyCan(connection, self._buses[bus], node)
 
     def on_values(self, device: str, distortions: Distortions) -> None:
-        """What `device` holds can be distorted."""
+        """Register the distortions through which the values of `device` can be changed."""
         self._distortions[device] = distortions
 
     def on_wire(self, bus: str, disturb: Callable[[Rule], None], undisturb: Callable[[Rule], None]) -> None:
-        """A modelled CAN bus, on which errors can happen."""
+        """Register a modelled CAN bus, on which bus errors can be injected."""
         self._disturb[bus], self._undisturb[bus] = disturb, undisturb
 
     def refuses(self, bus: str) -> bool:
-        """Whether who connects to the emulators of `bus` is turned away now."""
+        """Return whether new clients of the emulators of `bus` are refused now."""
         return self._buses[bus].refuses(self._clock.monotonic_ns())
 
     def watch(self, told: Callable[[str, object, bool, bytes], None]) -> None:
-        """From now on `told` learns what is on each line and socket: the bus, who carries it (one for each connection), whether
-        it comes from an emulator, and the bytes. CAN buses have listeners of their own (`FieldSide.join`)."""
+        """Call `told` from now on for the traffic on each line and socket, with the bus, the connection object, whether
+        an emulator sent the bytes, and the bytes. CAN buses have their own listeners (`FieldSide.join`)."""
         for name, wire in self._buses.items():
             wire.watch = _watcher(name, told)
 
     # -- putting in and taking away -------------------------------------------------------------------------------------
 
     def inject(self, said: Mapping[str, Any], start_ns: int | None = None) -> str:
-        """Put a fault in; its id. Its times count from `start_ns`, by default from the run's start. Raises `UsageError` for what
-        makes no sense, or an id that is in already."""
+        """Inject a fault and return its id. Its times count from `start_ns`, by default from the run's start. Raises
+        `UsageError` for an invalid fault, or an id that is already active."""
         start_ns = self.start_ns if start_ns is None else start_ns
         spec = parse_fault(dict(said), number=len(self._active) + 1)
         if spec.id in self._active:
@@ -135,7 +137,7 @@ class FieldFaults:
             self._buses[bus].put_in(active)
 
     def clear(self, id: str) -> None:
-        """Take a fault away. Raises `UsageError` for an id that is not in."""
+        """Clear a fault. Raises `UsageError` for an id that is not active."""
         if id not in self._active:
             raise UsageError(f"no fault {id!r} is in", expected=", ".join(self._active) or "one; there is none")
         spec, _, bus = self._active.pop(id)
@@ -148,7 +150,7 @@ class FieldFaults:
             self._buses[bus].take_away(id)
 
     def set_value(self, device: str, tag: str, value: float | str | bool | None) -> None:
-        """From now on the device holds `value` for `tag`; None: what it says by itself again."""
+        """Make the device hold `value` for `tag` from now on; None ends that."""
         found = tag_of(self._system, device, tag)
         distortions = self._distortions.get(device)
         if distortions is None or found.is_text:
@@ -170,19 +172,19 @@ class FieldFaults:
         self._set[device, tag] = float(value)
 
     def value_set(self, device: str, tag: str) -> float | None:
-        """The value that `set_value` holds the device at; None where none is set."""
+        """Return the value at which `set_value` holds the tag; None if none is set."""
         return self._set.get((device, tag))
 
     def values_set(self) -> dict[str, float]:
-        """Each value that is set, by DEVICE.TAG."""
+        """Return each value that is set, by DEVICE.TAG."""
         return {f"{device}.{tag}": value for (device, tag), value in self._set.items()}
 
     def ids(self) -> list[str]:
-        """The ids of the faults that are in."""
+        """Return the ids of the active faults."""
         return list(self._active)
 
     def describe(self) -> list[dict[str, Any]]:
-        """What is in, and how often it struck."""
+        """Return the active faults, and how often each struck."""
         return [
             {"id": id, "name": spec.kind.name, "bus": bus, "device": spec.aim.device, "struck": active.struck}
             for id, (spec, active, bus) in self._active.items()
@@ -190,7 +192,7 @@ class FieldFaults:
 
 
 def framing_of(endpoint: Endpoint) -> Framing:
-    """How frames look on a bus."""
+    """Return the framing of a bus."""
     if endpoint.is_can:
         return Framing.RAW
     if endpoint.scheme == "ascii":

@@ -1,11 +1,11 @@
-"""Leases on the simulated field devices: what a judge puts in stays only as long as the judge renews its lease.
+"""Leases on the simulated field devices: the faults and values of a judge stay only while it renews its lease.
 
-A judge (a scenario on a running system) opens a lease on the control channel, puts faults and values in under its id, and renews
-it. Whatever happens to the judge, kill -9 and a cut network included, all that it put in is taken out when the lease ends: faults
-are cleared, and each device value is what it was before the judge's first `set`. One judge at a time: two of them would change
-each other's verdicts.
+A judge (a scenario on a running system) opens a lease on the control channel, injects faults and sets values under its
+id, and renews it. Whatever happens to the judge, including kill -9 and a lost network, everything that it injected is
+removed when the lease ends: faults are cleared, and each device value becomes what it was before the judge's first
+`set`. Only one judge at a time can hold the lease, because two would change each other's verdicts.
 
-Pure: the time is passed in. Times are ns on the clock of the field process.
+Pure: the time is passed in, in ns on the clock of the field process.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from typing import TYPE_CHECKING, Any
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.errors import UsageError
 
-if TYPE_CHECKING:  # a judge on a plant, which loads no emulators, takes its times from here
+if TYPE_CHECKING:  # a judge on a plant, which loads no emulators, needs LEASE_S from here
     from fieldtwin.twin.prototype.field_faults import FieldFaults
 
 
 LEASE_S = 10.0
-"""A lease that was not renewed for this many seconds ends, unless the judge asks for another time."""
+"""Seconds after which a lease that was not renewed ends, unless the judge asks for another time."""
 MOST_LEASE_S = 60.0
 MOST_ID = 100
 
 
 class LeaseEnded(UsageError):
-    """The lease has expired or was released: what was put in under it has been taken out."""
+    """The lease has expired or was released: the faults and values under it have been removed."""
 
 
 class LeaseTaken(UsageError):
@@ -40,7 +40,7 @@ class _Lease:
     until_ns: int
     faults: set[str] = field(default_factory=set)
     before: dict[tuple[str, str], float | None] = field(default_factory=dict)
-    """By device and tag: the value that was set before this lease, None where none was."""
+    """By device and tag: the value that was set before this lease, or None if none was set."""
 
 
 class FieldLeases:
@@ -50,11 +50,11 @@ class FieldLeases:
         self._faults = faults
         self._lease: _Lease | None = None
         self.expired = 0
-        """How many leases ended because their judge did not renew them."""
+        """Number of leases that ended because their judge did not renew them."""
 
     @property
     def until_ns(self) -> int | None:
-        """When the lease ends unless it is renewed; None without a lease."""
+        """Time at which the lease ends unless it is renewed; None without a lease."""
         return None if self._lease is None else self._lease.until_ns
 
     def open(self, id: str, for_s: float, now_ns: int) -> None:
@@ -73,11 +73,11 @@ class FieldLeases:
         self._lease.until_ns = now_ns + _duration_ns(for_s)
 
     def renew(self, id: str, for_s: float, now_ns: int) -> None:
-        """Prolong the lease, `for_s` seconds from now on. Raises `LeaseEnded`."""
+        """Prolong the lease to `for_s` seconds from now. Raises `LeaseEnded`."""
         self.of(id, now_ns).until_ns = now_ns + _duration_ns(for_s)
 
     def of(self, id: str, now_ns: int) -> _Lease:
-        """The lease `id`. Raises `LeaseEnded` where it is over."""
+        """Return the lease `id`. Raises `LeaseEnded` if it is over."""
         self.expire(now_ns)
         if self._lease is None or self._lease.id != id:
             raise LeaseEnded(
@@ -87,25 +87,25 @@ class FieldLeases:
         return self._lease
 
     def inject(self, id: str, said: dict[str, Any], start_ns: int | None, now_ns: int) -> str:
-        """Put a fault in under the lease; the fault's id."""
+        """Inject a fault under the lease and return the fault's id."""
         lease = self.of(id, now_ns)
         fault = self._faults.inject(said, start_ns)
         lease.faults.add(fault)
         return fault
 
     def set_value(self, id: str, device: str, tag: str, value: float | str | bool | None, now_ns: int) -> None:
-        """Set a device value under the lease, None: no longer. The lease's end restores what was set before."""
+        """Set a device value under the lease; None ends the setting. The lease's end restores what was set before."""
         lease, before = self.of(id, now_ns), self._faults.value_set(device, tag)
         self._faults.set_value(device, tag, value)
         lease.before.setdefault((device, tag), before)
 
     def release(self, id: str) -> None:
-        """Take out what was put in under the lease `id`. Does nothing where that lease has ended already."""
+        """Remove everything injected under the lease `id`. Does nothing if that lease has already ended."""
         if self._lease is not None and self._lease.id == id:
             self._end()
 
     def expire(self, now_ns: int) -> bool:
-        """End the lease where its time is over; whether it was."""
+        """End the lease if its time is over, and return whether it ended."""
         if self._lease is None or now_ns < self._lease.until_ns:
             return False
         self.expired += 1
@@ -121,13 +121,13 @@ class FieldLeases:
             self._faults.set_value(device, tag, value)
 
     def moved_to(self, faults: FieldFaults) -> None:
-        """The devices were made anew with `faults`: the lease goes on, and nothing is in under it."""
+        """Move the lease to newly made devices with `faults`. The lease continues, without any fault or value under it."""
         self._faults = faults
         if self._lease is not None:
             self._lease = _Lease(self._lease.id, self._lease.until_ns)
 
     def describe(self, now_ns: int) -> dict[str, Any]:
-        """For the control channel."""
+        """Return the lease's state for the control channel."""
         lease = self._lease
         held = None
         if lease is not None:

@@ -1,14 +1,15 @@
-"""The field side's process: ``python -m fieldtwin.twin.prototype.field_process CONFIG.json``, or inside `fieldtwin emulate
-SYSTEM`.
+"""The process of the simulated field devices: ``python -m fieldtwin.twin.prototype.field_process CONFIG.json``, or
+inside `fieldtwin emulate SYSTEM`.
 
-Control verbs: ready, get (listening endpoints, counters), held (what the devices really held), fault, clear, set, lease, fresh,
-stop. On a Unix socket in the run directory, and on TCP where asked for, so that a controller elsewhere learns where each plant
-endpoint's emulator listens.
+Commands of the control channel: ready, get (listening endpoints, counters), held (the values that the devices really
+held), fault, clear, set, lease, fresh, stop. The channel is a Unix socket in the run directory, and TCP if configured,
+so that a controller elsewhere learns where each plant endpoint's emulator listens.
 
-    lease     {"id": ..., "for_s": 10}: open the lease `id` on these devices (`fieldtwin.twin.prototype.field_leases`); {"renew":
-    true} prolongs it,
-              {"release": true} ends it. `fault` and `set` with "lease": ID are taken out when that lease ends
-    fresh     {"lease": ID}: every device, recording and simulation from its beginning, on the same ports and without a fault
+    lease     {"id": ..., "for_s": 10}: open the lease `id` on these devices (`fieldtwin.twin.prototype.field_leases`);
+              {"renew": true} prolongs it, {"release": true} ends it. What `fault` and `set` inject with "lease": ID is
+              removed when that lease ends
+    fresh     {"lease": ID}: restart every device, recording and simulation from its beginning, on the same ports and
+              without a fault
 """
 
 from __future__ import annotations
@@ -40,12 +41,13 @@ from fieldtwin.twin.prototype.prototype import DigitalTwinPrototype
 from fieldtwin.twin.site.system import System, load_system
 
 HELD_AT_ONCE = 5_000
-"""A field side that stood for hours holds more than a line of the control channel takes."""
+"""Entries of each device in one answer: after hours there are more than fit into one line of the control channel."""
 
 
 class FieldConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What the process is told. `recordings` maps a device to a file, `listen` a bus to an endpoint, over the prototype
-    file; `seed` None: the prototype file's; `control` is ``HOST:PORT`` for a TCP control channel, or empty."""
+    """The configuration of the process. `recordings` maps a device to a file, and `listen` a bus to an endpoint; both
+    override the prototype file. `seed` None means the prototype file's. `control` is ``HOST:PORT`` for a TCP control
+    channel, or empty."""
 
     system: str
     run_dir: str
@@ -58,16 +60,18 @@ class FieldConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     token: str = ""
     seed: int | None = None
     water: dict[str, tuple[str, str]] = {}
-    """Transmitters that are in a network's water: the Unix socket that serves it, and their names there."""
+    """Transmitters that are in a network's acoustic channel: the Unix socket that serves the channel, and their names
+    there.
+    """
 
 
 def resolve(config: FieldConfig) -> DigitalTwinPrototype:
-    """Read system and prototype file, apply what the command line says, and put both sides together, checked."""
+    """Read system and prototype file, apply the command line's options, and return the checked prototype of both sides."""
     return DigitalTwinPrototype(*resolve_files(config), WallClock())
 
 
 def resolve_files(config: FieldConfig) -> tuple[System, Prototype]:
-    """The field side's part of it: without the gateway's and the PLC's, and so without the programs."""
+    """Read system and prototype file for the field devices only, without gateway, PLC and programs."""
     system = load_system(config.system, [Path(p) for p in config.profiles])
     prototype = load_prototype(system, Path(config.prototype) if config.prototype else None)
     for device, path in config.recordings.items():
@@ -86,7 +90,7 @@ def resolve_files(config: FieldConfig) -> tuple[System, Prototype]:
 
 
 class FieldProcess:
-    """One field side with its control channel, until told to stop."""
+    """The simulated field devices with their control channel, which run until they are stopped."""
 
     def __init__(self, config: FieldConfig) -> None:
         self._config = config
@@ -98,10 +102,11 @@ class FieldProcess:
         self._field: FieldSide
         self._leases: FieldLeases
         self.control_port = 0
-        self._life = secrets.token_hex(8)  # of these devices: made anew, they have another one, and count from nothing
+        # Identity of these devices: devices that are made anew get a different one, and their counters restart.
+        self._life = secrets.token_hex(8)
 
     async def run(self, on_ready: Callable[[FieldSide], None] | None = None) -> int:
-        """Open, call `on_ready`, serve until stopped."""
+        """Open, call `on_ready`, and serve until stopped."""
         run_dir = Path(self._config.run_dir)
         twin = resolve(self._config)
         async with AsyncExitStack() as stack:
@@ -171,7 +176,7 @@ class FieldProcess:
                     await self._make_anew()
 
     async def _end_leases(self) -> None:
-        """Take out what a judge put in as soon as its lease has expired."""
+        """Remove what a judge injected as soon as its lease has expired."""
         while True:
             self._lease_changed.clear()
             until_ns = self._leases.until_ns
@@ -186,7 +191,7 @@ class FieldProcess:
                 self._leases.expire(self._clock.monotonic_ns())
 
     async def _make_anew(self) -> None:
-        """The devices again, from the same files, where the old ones listened. What fails ends the process."""
+        """Make the devices again from the same files, on the same endpoints. A failure ends the process."""
         old, done = self._field, self._fresh_done
         twin = resolve(self._config)
         prototype = _listening_as(twin.prototype, old)
@@ -214,13 +219,13 @@ class FieldProcess:
         }
 
     async def _held(self, args: dict[str, Any]) -> dict[str, Any]:
-        """At most `HELD_AT_ONCE` entries a device, the oldest first: who wants them all asks again."""
+        """Return at most `HELD_AT_ONCE` entries per device, the oldest first; a caller that needs more asks again."""
         since = {str(name): int(number) for name, number in (args.get("since") or {}).items()}
         return {name: held[:HELD_AT_ONCE] for name, held in self._field.held_since(since).items()}
 
     async def _fault(self, args: dict[str, Any]) -> dict[str, Any]:
-        """Put in ``{"fault": {"name": ..., "device": ...}}``; its times count from ``"start_ns"`` (monotonic), if given. With
-        ``"lease"`` it is taken out when that lease ends."""
+        """Inject ``{"fault": {"name": ..., "device": ...}}``; its times count from ``"start_ns"`` (monotonic), if
+        given. With ``"lease"`` it is removed when that lease ends."""
         start_ns = args["start_ns"] if isinstance(args.get("start_ns"), int) else None
         said = args.get("fault")
         if not isinstance(said, dict):
@@ -245,7 +250,7 @@ class FieldProcess:
         return {"number": self._field.faults.history.count}
 
     async def _lease(self, args: dict[str, Any]) -> dict[str, Any]:
-        """Open, prolong or end a judge's lease; what was in before it was opened is in the answer."""
+        """Open, prolong or end a judge's lease. The answer names the faults and values that are active."""
         id, for_s, now_ns = str(args.get("id", "")), args.get("for_s", LEASE_S), self._clock.monotonic_ns()
         if not isinstance(for_s, int | float):
             raise UsageError("how long a lease lasts", expected="a number of seconds", got=repr(for_s)[:60])
@@ -265,7 +270,9 @@ class FieldProcess:
         }
 
     async def _fresh(self, args: dict[str, Any]) -> dict[str, Any]:
-        """Returns when the new devices listen. Raises `LeaseEnded` or `UsageError`, and nothing has changed."""
+        """Make all devices anew, and return when the new devices listen. Raises `LeaseEnded` or `UsageError`, and
+        changes nothing then.
+        """
         self._leases.of(str(args.get("lease", "")), self._clock.monotonic_ns())
         if self._config.water:
             raise UsageError("devices in a network's water cannot be made anew one system at a time")
@@ -281,7 +288,9 @@ class FieldProcess:
 
 
 def _listening_as(prototype: Prototype, field: FieldSide) -> Prototype:
-    """`prototype` with every bus and every far modem where `field` has them: free ports were chosen once."""
+    """Return `prototype` with every bus and every far modem at the endpoint that it has in `field`, so that ports stay
+    the same.
+    """
     buses = {
         name: replace(bus, listen=field.listening[name]) if name in field.listening else bus
         for name, bus in prototype.buses.items()
@@ -296,7 +305,7 @@ def _listening_as(prototype: Prototype, field: FieldSide) -> Prototype:
 
 
 def main(argv: list[str]) -> int:
-    """Run the process; errors go to stderr as one line."""
+    """Run the process; an error is printed to stderr as one line."""
     try:
         config = msgspec.json.decode(Path(argv[0]).read_bytes(), type=FieldConfig)
         return run(FieldProcess(config).run())

@@ -1,5 +1,5 @@
-"""The prototype file: what is emulated, with what, and where. Read by the field side and by whoever starts it; never by
-the plant, and never by gateway or PLC."""
+"""The prototype file: which devices are emulated, from which data source, and at which endpoint. The process of the
+simulated field devices and its starter read it; the plant, gateway and PLC never do."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from fieldtwin.twin.site.system import System
 
 @dataclass(frozen=True)
 class EmulatedBus:
-    """Where the emulators of a bus listen; None: this bus is the plant's own."""
+    """The endpoint at which the emulators of a bus listen; None: the plant's own bus is used."""
 
     name: str
     listen: Endpoint | None
@@ -31,7 +31,7 @@ class EmulatedBus:
 
 @dataclass(frozen=True)
 class EmulatedDevice:
-    """What stands in for a device: its own profile, and a recording or a model."""
+    """An emulated device: its own profile, and a recording, a simulation or a model."""
 
     name: str
     profile: DeviceProfile
@@ -40,7 +40,7 @@ class EmulatedDevice:
 
     @property
     def plays(self) -> str:
-        """What stands in for the device, as a person reads it: what is synthetic is never shown as measured."""
+        """Description of the data source for people: synthetic data is never shown as measured."""
         if self.form.simulation is not None:
             return f"the simulation {self.form.simulation}"
         if self.recording is None:
@@ -60,14 +60,16 @@ class Prototype:
     form: PrototypeForm
 
     def with_listen(self, system: System, bus: str, listen: Endpoint) -> Prototype:
-        """The same, with the emulators of `bus` of `system` listening elsewhere. Raises `UsageError` where others are there."""
+        """Return a copy in which the emulators of `bus` of `system` listen elsewhere. Raises `UsageError` if another
+        bus is there.
+        """
         buses = {**self.buses, bus: replace(self.buses[bus], listen=listen)}
         if (clash := _clash(system, buses)) is not None:
             raise UsageError(clash.message, expected=clash.expected, got=f"{bus}={listen}")
         return replace(self, buses=buses)
 
     def with_recording(self, device: str, path: Path, speed: float | None = None) -> Prototype:
-        """The same, with `device` playing another recording."""
+        """Return a copy in which `device` plays another recording."""
         old = self.devices[device]
         form = old.form.model_copy(
             update={"recording": str(path), "simulation": None, "plays": {}, **({"speed": speed} if speed else {})}
@@ -75,7 +77,7 @@ class Prototype:
         return replace(self, devices={**self.devices, device: replace(old, form=form, recording=path)})
 
     def with_speed(self, speed: float) -> Prototype:
-        """The same, with every recording played `speed` times as fast."""
+        """Return a copy in which every recording is played `speed` times as fast."""
         devices = {
             n: replace(d, form=d.form.model_copy(update={"speed": speed})) if d.recording else d
             for n, d in self.devices.items()
@@ -84,7 +86,7 @@ class Prototype:
 
 
 def prototype_path(system: System) -> Path:
-    """Where a system's prototype file is by default: beside it, ``NAME.prototype.yaml``."""
+    """Return the default path of a system's prototype file: ``NAME.prototype.yaml`` in the same folder."""
     return system.path.with_name(f"{system.path.stem}.prototype.yaml")
 
 
@@ -155,14 +157,14 @@ def _bus(file: YamlFile, system: System, form: PrototypeForm, name: str) -> Emul
 
 
 def _anywhere(listen: Endpoint) -> bool:
-    """Whether it is on a port that is free then, which nobody else has."""
+    """Return whether the endpoint takes a port that is free at that time, and so cannot clash."""
     if listen.is_can:
         return listen.path.endswith(":0")
     return listen.scheme != "pty" and listen.port == 0
 
 
 class _Clash(NamedTuple):
-    """Two buses of one wire that cannot be there at once: the second and the first, and the nodes that have one id, if any."""
+    """Two buses that cannot share an endpoint: the second and the first, and the nodes with the same id, if any."""
 
     buses: tuple[str, str]
     nodes: tuple[str, str] | None
@@ -171,13 +173,14 @@ class _Clash(NamedTuple):
 
 
 def _clash(system: System, buses: Mapping[str, EmulatedBus]) -> _Clash | None:
-    """Several CAN buses may be one wire here, and then all nodes of it have ids of their own: two with one id are a fault, and
-    to be put in as one (`duplicate-node`). A port or a socket is of one bus."""
+    """Return the first clash between buses, if any. Several CAN buses may share one software bus if all their nodes
+    have different ids; a duplicate id is a fault, to be injected as such (`duplicate-node`). A port or a socket belongs
+    to one bus."""
     wires: dict[Endpoint, str] = {}
     nodes: dict[tuple[Endpoint, int], str] = {}
     for name, bus in buses.items():
         if bus.listen is None or _anywhere(bus.listen):
-            continue  # the plant's, or on a port of its own
+            continue  # the plant's own bus, or a free port
         wire = replace(bus.listen, params=())
         other = wires.setdefault(wire, name)
         if other != name and not wire.is_can:
@@ -246,8 +249,8 @@ def _device(file: YamlFile, system: System, name: str, whole: PrototypeForm) -> 
 
 
 def _check_stated(file: YamlFile, loc: tuple[Key, ...], form: EmulatedForm, profile: DeviceProfile) -> None:
-    """What is said of being busy is said of a Modbus device, and what of registers, of one without a recording; what is said of
-    a data sheet, of a CANopen device."""
+    """Check keys that apply to some devices only: `busy` to Modbus devices, `values` to Modbus devices without a
+    recording, and the keys about a data sheet to CANopen devices."""
     for key, said in (("cia", form.cia is not None), ("parameter_values", not form.parameter_values)):
         if said and profile.protocol != "canopen":
             raise file.error((*loc, key), f"`{key}` is about a data sheet (EDS)", expected="a CANopen device")
@@ -264,5 +267,5 @@ def _check_stated(file: YamlFile, loc: tuple[Key, ...], form: EmulatedForm, prof
 
 
 def file_path(file: YamlFile) -> Path:
-    """The path that a parsed file came from."""
+    """Return the path of a parsed file."""
     return Path(file.path)

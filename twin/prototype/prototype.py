@@ -1,7 +1,8 @@
 """The digital twin prototype: the physical twin's own software and configuration, with every device emulated.
 
-Here the two sides of the wire are put together and nowhere else: which emulator answers which driver is checked, and the field
-side is made. What runs left of the wire is `fieldtwin.twin.plant.physical`, unchanged and unaware.
+This is the only module that combines the two sides of the connection: it checks that each emulator accepts its driver's
+commands, and makes the simulated field devices. The controlling side is `fieldtwin.twin.plant.physical`, which is
+unchanged and does not know about this module.
 """
 
 from __future__ import annotations
@@ -22,10 +23,11 @@ from fieldtwin.twin.site.system import System
 
 
 class DigitalTwinPrototype:
-    """SPEC row DigitalTwinPrototype. Raises `CommandListMismatch` where an emulator and its driver differ (ruling 12).
+    """SPEC row DigitalTwinPrototype. Raises `CommandListMismatch` if the command lists of an emulator and its driver
+    differ (ruling 12).
 
-    `ecs` is the physical twin's class, made from the same system file; `model` is an instance of its own. `real` names the
-    devices that are not emulated, on buses that the prototype file calls `plant`; a whole prototype has none.
+    `ecs` is the physical twin's class, made from the same system file; `model` is a separate instance. `real` names the
+    devices that are not emulated, on buses that the prototype file marks `plant`; a complete prototype has none.
     """
 
     def __init__(self, system: System, prototype: Prototype, clock: Clock) -> None:
@@ -45,6 +47,7 @@ class DigitalTwinPrototype:
     def field(
         self, run_dir: Path, ports: Ports | None = None, water: Mapping[str, ModemEnd] | None = None
     ) -> FieldSide:
-        """The emulators on their wires, not opened yet: those of the operating system unless other `ports` are given.
-        Virtual serial ports get their links in `run_dir`. `water`: the ends of transmitters that are in a network's."""
+        """Return the emulators on their connections, not opened yet. The connections are the operating system's unless
+        other `ports` are given. Virtual serial ports get their links in `run_dir`. `water`: the acoustic ends of
+        transmitters that are in a network."""
         return FieldSide(self.ecs.system, self.prototype, run_dir, self._clock, ports, water)

@@ -1,4 +1,6 @@
-"""The simulations of a prototype: made of its file, played by its devices, fed with what these are written."""
+"""The simulations of a prototype: built from its file, played by its devices, and fed with the values written to these
+devices.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,9 @@ from fieldtwin.twin.site.system import System
 
 
 def check_simulations(file: YamlFile, form: PrototypeForm, system: System) -> None:
-    """What can be known of a prototype's simulations before they run; no Python of the file is run. Raises `FileInvalid`."""
+    """Check everything that can be known about a prototype's simulations without running its Python code. Raises
+    `FileInvalid`.
+    """
     for name, simulation in form.simulations.items():
         loc = ("simulations", name)
         if (simulation.python is None) == (not simulation.formulas):
@@ -41,7 +45,7 @@ def check_simulations(file: YamlFile, form: PrototypeForm, system: System) -> No
 
 
 def check_plays(file: YamlFile, form: PrototypeForm, name: str, profile: DeviceProfile) -> None:
-    """That what a device plays of a simulation are tags of its own, and names of the simulation where those are known."""
+    """Check that a device plays numeric tags of its own, from names that its simulation computes where those are known."""
     device = form.devices[name]
     if device.plays and device.simulation is None:
         raise file.error(("devices", name, "plays"), "nothing to play", expected="`simulation: NAME` beside it")
@@ -89,13 +93,15 @@ def _check_input(file: YamlFile, form: PrototypeForm, system: System, loc: tuple
 
 
 def _python(file: YamlFile, text: str) -> tuple[Path, str]:
-    """The file and the class of ``FILE.py:CLASS``, beside the prototype file."""
+    """Return the file and the class of ``FILE.py:CLASS``, relative to the prototype file."""
     path, _, name = text.rpartition(":")
     return Path(file.path).parent / path, name
 
 
 class Simulations:
-    """Those of one prototype. All begin at `start_ns`. Raises `FileInvalid` for a Python model that fails."""
+    """The simulations of one prototype, which all begin at `start_ns`. Raises `FileInvalid` for a Python model that
+    fails.
+    """
 
     def __init__(self, file: YamlFile, form: PrototypeForm, system: System, start_ns: int) -> None:
         self._file, self._form, self._system = file, form, system
@@ -110,7 +116,9 @@ class Simulations:
         return Simulation(step, start, inputs, start_ns, round(form.step_ms * NS_PER_MS))
 
     def signals_of(self, device: str, form: EmulatedForm, profile: DeviceProfile) -> SimulatedSignals:
-        """What `device` plays: what its entry says, else every value of the simulation that has the name of one of its tags."""
+        """Return the signals that `device` plays: those of its entry, else every value of the simulation that has a
+        tag's name.
+        """
         assert form.simulation is not None
         simulation = self._made[form.simulation]
         plays = form.plays or {n: n for n in simulation.names if n in profile.tags and not profile.tags[n].is_text}
@@ -131,7 +139,7 @@ class Simulations:
         return SimulatedSignals(simulation, plays, self._file.path)
 
     def connect(self, journals: Mapping[str, HeldJournal]) -> None:
-        """From now on what devices are written comes in."""
+        """Feed values that are written to devices into the simulations, from now on."""
         watchers: dict[tuple[str, str], list[Callable[[float, int], None]]] = {}
         for name, form in self._form.simulations.items():
             for input_name, text in form.inputs.items():

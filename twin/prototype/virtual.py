@@ -1,7 +1,8 @@
-"""A whole prototype in one loop, in virtual time: the unmodified gateway, PLC and emulators, with wires in memory between them.
+"""A whole prototype in one event loop, in virtual time: the unmodified gateway, PLC and emulators on in-memory
+connections.
 
-What differs from a run on this computer is who owns the time, the wires and the memory of the process image; nothing else. The
-same seed, configuration, version, Python minor and architecture give the same events, byte for byte.
+It differs from a run in real time only in the clock, the connections and the memory of the process image. The same
+seed, configuration, version, Python minor version and architecture give the same events, byte for byte.
 """
 
 from __future__ import annotations
@@ -37,17 +38,19 @@ from fieldtwin.twin.site.system import System
 
 FLUSH_EVERY_NS = 60 * NS_PER_S
 STARTING_NS = NS_PER_S // 20
-"""Between the field side and the control system: devices are there before somebody asks them, as on this computer."""
+"""Delay between the simulated devices and the control system: devices are ready before the first request, as in real
+time.
+"""
 _IN_MEMORY = Path(":memory:")
 
 
 class VirtualPrototype(Started):
-    """``async with VirtualPrototype(system, prototype, loop, run_dir) as run`` inside `loop`. `run_dir` takes the audit log and
-    what is retained; the exchange log is in memory.
+    """``async with VirtualPrototype(system, prototype, loop, run_dir) as run`` inside `loop`. `run_dir` takes the audit
+    log and retained values; the exchange log is in memory.
 
-    `seed` replaces the prototype file's. `taps` observe the gateway's wires. `prepare` is called when everything is made and
-    nothing has run yet. `water`: the ends of transmitters that are in a network's. After entering, `field`, `gateway` and `plc`
-    run.
+    `seed` replaces the prototype file's. `taps` observe the gateway's connections. `prepare` is called when everything
+    is made and nothing has run yet. `water`: the acoustic ends of transmitters that are in a network. After entering,
+    `field`, `gateway` and `plc` run.
     """
 
     def __init__(
@@ -75,7 +78,7 @@ class VirtualPrototype(Started):
         self.gateway: Gateway
         self.plc: Runner
         self.image: Image
-        """The process image, for whoever watches."""
+        """The process image, for observers."""
         self.mapping: dict[Endpoint, Endpoint] = {}
         self.started_ns = loop.now_ns
         self.outputs_confirmed_safe: bool | None = None
@@ -149,10 +152,10 @@ class VirtualPrototype(Started):
             self.outputs_confirmed_safe = await self.gateway.shut_down()
 
     async def stop_gateway(self) -> bool:
-        """Safe outputs while everything still runs; whether the devices confirmed them."""
+        """Set outputs to safe values while everything still runs, and return whether the devices confirmed them."""
         await self._stop()
         return bool(self.outputs_confirmed_safe)
 
     def failure(self) -> BaseException | None:
-        """Why a part of it ended by itself: a bug of ours."""
+        """Return the exception that ended a part of the prototype by itself, if any. It is a bug of this project."""
         return self._nursery.failure()

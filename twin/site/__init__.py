@@ -1,1 +1,1 @@
-"""What a site is: the system file, its schema, what it serves, and where its data files are."""
+"""A site: the system file, its schema, what the gateway serves, and the location of the data files."""

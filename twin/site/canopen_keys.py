@@ -1,6 +1,6 @@
-"""The CANopen keys of a system file, resolved: what a bus's master produces, and how each node is booted.
+"""The CANopen keys of a system file, resolved: what a bus's NMT master produces, and how each node is booted.
 
-A DCF is read here, so that what is wrong with it is told, with file, section and key, before anything is opened.
+DCF files are read here, so that an error in one is reported with file, section and key before any connection is opened.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ CANOPEN_KEYS = ("identity", "dcf", "store", "lss", "tpdos", "rpdo1", "rpdos")
 
 
 def canopen_bus(file: YamlFile, name: str, form: BusForm, *, is_can: bool) -> CanopenBusConfig:
-    """What the master of a bus does besides; refused on another bus than CAN."""
+    """Return what else the NMT master of a bus produces. The keys are refused for a bus that is not CAN."""
     if not is_can:
         _refuse(file, ("buses", name), form.model_fields_set.intersection(CANOPEN_BUS_KEYS), "a CAN bus")
     counter = form.sync.counter if form.sync else 0
@@ -44,7 +44,7 @@ def canopen_bus(file: YamlFile, name: str, form: BusForm, *, is_can: bool) -> Ca
 def canopen_node(
     file: YamlFile, loc: tuple[Key, ...], form: DeviceForm, path: Path, profiles: Iterable[Path], *, is_can: bool
 ) -> CanopenNodeConfig:
-    """How a node is booted; refused for another device than a CANopen node."""
+    """Return how a node is booted. The keys are refused for a device that is not a CANopen node."""
     if not is_can:
         _refuse(file, loc, form.model_fields_set.intersection(CANOPEN_KEYS), "a CANopen node")
         return CanopenNodeConfig()
@@ -64,7 +64,7 @@ def canopen_node(
 
 
 def check_rpdo1(file: YamlFile, loc: tuple[Key, ...], form: DeviceForm, profile: DeviceProfile, sync: bool) -> None:
-    """RPDO1's tags may be written and fit into 8 bytes; `sync`: the bus has a SYNC producer."""
+    """Check that RPDO1's tags may be written and fit into 8 bytes. `sync`: the bus has a SYNC producer."""
     if form.rpdo1 is None:
         return
     loc = (*loc, "rpdo1")

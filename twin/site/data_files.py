@@ -1,7 +1,8 @@
-"""Where shipped data lies: the wheel's copy, then the checkout (DESIGN.md decision 14).
+"""Locations of shipped data: the wheel's copy, then the checkout (DESIGN.md decision 14).
 
-The user's search order for profiles and systems: what a flag says, FIELDTWIN_PROFILES, ./profiles, shipped. Before all of that,
-a file in a template finds what the template brings: it is complete, and means its own files.
+Profiles and systems are searched in this order: the folders given by an option, FIELDTWIN_PROFILES, ./profiles, the
+shipped ones. A file inside a template searches the template first, because a template is complete and refers to its own
+files.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ _HERE = Path(__file__).absolute().parents[3].resolve()  # not resolved at once: 
 
 
 def data_root(base: Path = _HERE) -> Path:
-    """The folder that holds `profiles` and `recordings`."""
+    """Return the folder that holds `profiles` and `recordings`."""
     for candidate in (base / "fieldtwin" / "_data", base):
         if (candidate / "profiles").is_dir() and (candidate / "recordings").is_dir():
             return candidate
@@ -32,13 +33,15 @@ TEMPLATE = "template.json"
 
 
 def template_of(file: Path | None) -> list[Path]:
-    """The folder of the template that `file` is in, as a list of one; empty when it is in none."""
+    """Return the folder of the template that contains `file`, as a list of one; an empty list if no template contains
+    it.
+    """
     above = list(file.parents)[1:2] if file is not None else []
     return [folder for folder in above if (folder / TEMPLATE).is_file()]
 
 
 def search_path(extra: Iterable[Path] = ()) -> list[Path]:
-    """Folders that may hold `devices`, `systems` and `recordings`, best first."""
+    """Return the folders that may hold `devices`, `systems` and `recordings`, best first."""
     folders = [Path(p) for p in extra]
     folders += [Path(p) for p in os.environ.get("FIELDTWIN_PROFILES", "").split(os.pathsep) if p]
     folders += [Path("profiles"), data_root() / "profiles"]
@@ -46,9 +49,11 @@ def search_path(extra: Iterable[Path] = ()) -> list[Path]:
 
 
 def find(kind: str, name: str, beside: Path | None = None, extra: Iterable[Path] = ()) -> Path:
-    """The file that `name` means: a path, or a bare name in the search path (`kind` is ``systems`` or ``devices``).
+    """Return the file that `name` refers to: a path, or a bare name in the search path. `kind` is ``systems`` or
+    ``devices``.
 
-    `beside` is the file that names it: a relative path is tried there first. Raises `UsageError` listing what there is.
+    `beside` is the file that contains the reference: a relative path is tried in its folder first. Raises `UsageError`,
+    which lists the available names.
     """
     direct = Path(name)
     places = [beside.parent / direct] if beside else []
@@ -79,7 +84,7 @@ def find(kind: str, name: str, beside: Path | None = None, extra: Iterable[Path]
 
 
 def network_file(name: str, profiles: Iterable[Path] = ()) -> Path | None:
-    """The file that `name` means, if that is a network's; None for anything else, also for what is not there."""
+    """Return the file that `name` refers to if it is a network file; None otherwise, also if it does not exist."""
     try:
         path = find("systems", name, extra=profiles)
     except UsageError:
@@ -94,7 +99,9 @@ def network_file(name: str, profiles: Iterable[Path] = ()) -> Path | None:
 
 
 def find_recording(name: str, beside: Path | None = None) -> Path:
-    """A recording by path, beside the file that names it, in ./recordings or shipped."""
+    """Return a recording by path: in the folder of the file that names it, in its template, in ./recordings, or
+    shipped.
+    """
     folders = [beside.parent] if beside else []
     folders += [folder / "recordings" for folder in template_of(beside)]
     folders += [Path(), Path("recordings"), data_root() / "recordings"]

@@ -1,4 +1,4 @@
-"""The keys of a system file that say a pace, resolved: of a Modbus bus, and of each device, with what profiles ask for."""
+"""The timing keys of a system file, resolved: of a Modbus bus and of each device, including what profiles request."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MODBUS_KEYS = ("spacing_ms",)
 
 
 def modbus_bus(file: YamlFile, name: str, form: BusForm, endpoint: Endpoint) -> BusConfig:
-    """A bus with its pace; on CAN, and with framings that have no such thing, the keys are refused."""
+    """Return a bus with its timing. The keys are refused on CAN, and with framings to which they do not apply."""
     loc: tuple[Key, ...] = ("buses", name)
     bus = BusConfig(name, endpoint, form.timeout_ms / 1000, form.retries, form.bitrate)
     if endpoint.is_can:
@@ -43,7 +43,7 @@ def modbus_bus(file: YamlFile, name: str, form: BusForm, endpoint: Endpoint) -> 
 
 
 def device_pace(file: YamlFile, loc: tuple[Key, ...], form: DeviceForm, config: DeviceConfig) -> DeviceConfig:
-    """A device with its pace: what the system file says, else what its profile says, else as the bus."""
+    """Return a device with its timing: from the system file, else from its profile, else from the bus."""
     if config.profile.protocol != "modbus":
         _refuse(file, loc, form.model_fields_set.intersection(MODBUS_KEYS))
     timing = config.profile.form.timing
@@ -73,7 +73,9 @@ def device_pace(file: YamlFile, loc: tuple[Key, ...], form: DeviceForm, config: 
 def connect_pauses(
     buses: dict[str, BusConfig], form: SystemForm, devices: dict[str, DeviceConfig]
 ) -> dict[str, BusConfig]:
-    """`buses` with the longest pause that their devices' profiles ask for, where the system file states none."""
+    """Return `buses` with the longest connect pause that their devices' profiles request, where the system file states
+    none.
+    """
     asked = dict.fromkeys(buses, 0)
     for device in devices.values():
         asked[device.bus] = max(asked[device.bus], device.profile.form.timing.connect_pause_ms)

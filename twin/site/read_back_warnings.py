@@ -1,7 +1,8 @@
-"""Which tags the gateway may write and never reads again: the system file's author is warned of each.
+"""Warnings for the author of a system file about tags that the gateway may write and never reads back.
 
-Nobody can tell what the device holds in such a tag: its value is that of the start or none at all, a device that loses what it
-was told does not get it again, and every start writes it anew. Pure: it looks at a loaded system file.
+The value that the device holds in such a tag is unknown: the published value is the one read at the start, or there is
+none. A device that loses the written value does not get it again, and every start writes it again. Pure: it inspects a
+loaded system file.
 """
 
 from __future__ import annotations
@@ -14,9 +15,10 @@ from fieldtwin.gateway.devices.config import DeviceConfig
 
 
 def never_read_back(file: YamlFile, devices: Mapping[str, DeviceConfig]) -> tuple[str, ...]:
-    """One warning for each entry of `writable` that is readable and read neither by a poll nor by process data of its node.
+    """Return a warning for each entry of `writable` that is readable but read neither by a poll nor by process data of
+    its node.
 
-    A node whose process data is known only when it is there (``tpdos: node``) gives none.
+    A node whose process data is known only once it is connected (``tpdos: node``) gives no warning.
     """
     found = []
     for name, device in devices.items():

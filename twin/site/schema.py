@@ -1,6 +1,7 @@
-"""What a system file and a prototype file may say: the pydantic models of their YAML form.
+"""The pydantic models of the YAML form of system files and prototype files.
 
-The plant reads `SystemForm` only. `PrototypeForm` is another file, which the plant never opens (SPEC part 2, row 2).
+The plant reads `SystemForm` only. `PrototypeForm` describes a separate file, which the plant never opens (SPEC part 2,
+row 2).
 """
 
 from __future__ import annotations
@@ -17,20 +18,20 @@ TagName = Annotated[str, Field(pattern=r"^[a-zA-Z][a-zA-Z0-9_]*\.[a-zA-Z][a-zA-Z
 
 
 class Strict(BaseModel):
-    """Unknown keys are refused; values are not coerced."""
+    """Base class: unknown keys are refused, and values are not coerced."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
 
 class SyncForm(Strict):
-    """The SYNC producer of a CANopen bus (CiA 301: 1006h and 1019h in us)."""
+    """The SYNC producer of a CANopen bus (CiA 301: objects 1006h and 1019h of the master)."""
 
     period_ms: Milliseconds
     counter: int = Field(default=0, ge=0, le=240, description="highest value of the counter, 2 to 240; 0: no counter")
 
 
 class BusForm(Strict):
-    """A bus or line and the endpoint at which the plant has it."""
+    """A bus or serial line, and the endpoint at which the plant opens it."""
 
     url: str
     timeout_ms: Milliseconds = 1000
@@ -52,28 +53,32 @@ class BusForm(Strict):
 
 
 class PollForm(Strict):
-    """How often a poll group is read, and where in its period; by default groups of one period are spread over it."""
+    """How often a poll group is read, and its phase within the period. By default groups with the same period are
+    spread over it.
+    """
 
     every_ms: Milliseconds
     phase_ms: int | None = Field(default=None, ge=0, lt=3_600_000)
 
 
 class HeartbeatForm(Strict):
-    """CANopen heartbeat times (CiA 301: 1017h in the node, 1016h in us). Without `producer_ms` the node keeps its own time."""
+    """CANopen heartbeat times (CiA 301: 1017h in the node, 1016h in the master). Without `producer_ms` the node keeps
+    its own time.
+    """
 
     producer_ms: Milliseconds | None = None
     consumer_ms: Milliseconds
 
 
 class TpdoForm(Strict):
-    """What a TPDO of the node carries and how often."""
+    """The tags that a TPDO of the node carries, and how often it is sent."""
 
     map: list[Name] = Field(min_length=1, max_length=8)
     event_ms: Milliseconds
 
 
 class RpdoForm(Strict):
-    """What an RPDO of the node carries, and when its values count: at once, or from the next SYNC on."""
+    """The tags that an RPDO of the node carries, and when the node applies them: at once, or at the next SYNC."""
 
     map: list[Name] = Field(min_length=1, max_length=8)
     transmission: Literal["event", "sync"] = "event"
@@ -81,7 +86,7 @@ class RpdoForm(Strict):
 
 
 class IdentityForm(Strict):
-    """What a CANopen node has to hold in 1000h and 1018h (CiA 302: 1F84h to 1F88h in us)."""
+    """The values that a CANopen node must hold in 1000h and 1018h (CiA 302: objects 1F84h to 1F88h of the master)."""
 
     device_type: int | None = Field(default=None, ge=0, le=0xFFFF_FFFF)
     vendor: int | None = Field(default=None, ge=0, le=0xFFFF_FFFF)
@@ -127,8 +132,8 @@ class DeviceForm(Strict):
 
 
 class WatchdogForm(Strict):
-    """When a scan counts as late, after how many overruns in a row the PLC stops, when a scan that does not end is ended, and
-    how often the programs begin again after that."""
+    """When a scan counts as late, after how many consecutive overruns the PLC stops, when a scan that does not end is
+    aborted, and how often the programs are restarted after that."""
 
     late_ms: Milliseconds = 5
     stop_after: int = Field(default=3, ge=1, le=1000)
@@ -138,14 +143,16 @@ class WatchdogForm(Strict):
 
 
 class InputForm(Strict):
-    """Where a program's input comes from and what it sees while that is bad."""
+    """The source of a program's input, and the value that the program sees while that source is bad."""
 
     tag: TagName
     if_bad: Literal["hold", "pass", "trip"] | float = "pass"
 
 
 class StartForm(Strict):
-    """How long a program waits before its first scan until each input has been good once, and what happens after that."""
+    """How long a program waits before its first scan until each input has been good once, and what happens after that
+    time.
+    """
 
     timeout_ms: int = Field(default=10_000, ge=0, le=3_600_000, description="0: do not wait")
     at_timeout: Literal["wait", "stop", "start_anyway"] = Field(
@@ -155,7 +162,7 @@ class StartForm(Strict):
 
 
 class ProgramForm(Strict):
-    """A program of the PLC: its source and how its variables are bound to tags."""
+    """A program of the PLC: its source, and the tags to which its variables are bound."""
 
     source: str
     task: Name | None = Field(default=None, description="default: the first task")
@@ -165,7 +172,9 @@ class ProgramForm(Strict):
 
 
 class TaskForm(Strict):
-    """A task (IEC 61131-3): every `interval_ms`, or once at each rising edge of the tag `single`. Priority 0 is the highest."""
+    """A task (IEC 61131-3): runs every `interval_ms`, or once at each rising edge of the tag `single`. Priority 0 is
+    the highest.
+    """
 
     interval_ms: Milliseconds | None = None
     priority: int = Field(default=10, ge=0, le=31)
@@ -180,7 +189,7 @@ class TaskForm(Strict):
 
 
 class PlcForm(Strict):
-    """The soft PLC."""
+    """The soft PLC: its cycle, tasks and programs."""
 
     cycle_ms: Milliseconds = 10
     watchdog: WatchdogForm = WatchdogForm()
@@ -193,7 +202,9 @@ class PlcForm(Strict):
 
 
 class ServedTagForm(Strict):
-    """Where a tag is served: exactly one of the four tables, at a PDU address. `type` as the value is; 0 is good quality."""
+    """Where a tag is served: exactly one of the four tables, at a PDU address. `type` is the type of the served value.
+    A quality register holds 0 for good quality.
+    """
 
     input: Address | None = None
     holding: Address | None = None
@@ -220,7 +231,7 @@ class ServeForm(Strict):
 
 
 class AllowForm(Strict):
-    """What the clients of some networks may ask. Numbers, or ranges such as 0..99."""
+    """The requests that clients of some networks may send. Units and addresses are numbers, or ranges such as 0..99."""
 
     networks: list[str] = Field(default=["127.0.0.0/8", "::1/128"], alias="from", min_length=1)
     units: list[int | str] | None = None
@@ -230,7 +241,7 @@ class AllowForm(Strict):
 
 
 class BridgeForm(Strict):
-    """Modbus TCP clients, or the master of a serial line (`url`), reach units of the system's buses."""
+    """A bridge: lets Modbus TCP clients, or the client on a serial line (`url`), reach units of the system's buses."""
 
     url: str
     to: Name | None = Field(default=None, description="the bus on which units keep their ids")
@@ -245,7 +256,7 @@ class BridgeForm(Strict):
 
 
 class CommandsForm(Strict):
-    """What a digital twin may command over a thread, while `remote` says remote."""
+    """The commands that a digital twin may send over a thread while `remote` is set to remote."""
 
     period_s: list[int] = Field(
         default=[-32768, 32767], min_length=2, max_length=2, description="smallest and largest period in seconds"
@@ -260,7 +271,7 @@ class CommandsForm(Strict):
 
 
 class FollowsForm(Strict):
-    """Each time that `after` becomes true, `then` is so `within` a time, such as 2s."""
+    """Each time that `after` becomes true, `then` must become true `within` a time, such as 2s."""
 
     after: str
     then: str
@@ -268,7 +279,7 @@ class FollowsForm(Strict):
 
 
 class InvariantsForm(Strict):
-    """What holds in every run, scenario and campaign of this system: expressions as scenarios have them."""
+    """Conditions that must hold in every run, scenario and campaign of this system: expressions as in scenarios."""
 
     always: list[str] = Field(default=[], max_length=200)
     never: list[str] = Field(default=[], max_length=200)
@@ -276,11 +287,11 @@ class InvariantsForm(Strict):
 
 
 NONE_STATED = InvariantsForm()
-"""Of a system without invariants."""
+"""The invariants of a system that states none."""
 
 
 class SystemForm(Strict):
-    """A plant: read by the physical twin and by its prototype, byte for byte the same."""
+    """A plant. The physical twin and its prototype read the same file, byte for byte."""
 
     fieldtwin: Literal[1]
     system: Name
@@ -297,14 +308,16 @@ class SystemForm(Strict):
 
 
 class BusMappingForm(Strict):
-    """Where the emulators of a plant's bus listen."""
+    """Where the emulators of a bus of the plant listen."""
 
     listen: str
     pace: bool = True
 
 
 class FarLinkForm(Strict):
-    """The link between the two modems. Of what is lost by `loss` the modems take care, of the rest nobody does."""
+    """The acoustic link between the two modems. The modems recover from losses by `loss`; nothing recovers from `lost`,
+    `repeated` and `overtakes`.
+    """
 
     bytes_per_s: float = Field(default=80.0, gt=0)
     latency_ms: int = Field(default=900, ge=0, le=600_000)
@@ -317,14 +330,16 @@ class FarLinkForm(Strict):
 
 
 class BusyForm(Strict):
-    """Behind every so many requests that it took, a Modbus device answers with exception 06 for so long."""
+    """After every `every` accepted requests, a Modbus device answers with exception 06 (busy) for `for_ms`
+    milliseconds.
+    """
 
     every: int = Field(ge=1)
     for_ms: Milliseconds
 
 
 def _as_text(formula: object) -> object:
-    """A constant is a formula, too."""
+    """Accept a constant as a formula."""
     return repr(formula) if isinstance(formula, int | float) and not isinstance(formula, bool) else formula
 
 
@@ -332,7 +347,7 @@ Formula = Annotated[str, BeforeValidator(_as_text)]
 
 
 class SimulationForm(Strict):
-    """Values that are computed, step by step: by formulas, or by a class in Python."""
+    """Values that are computed step by step: by formulas, or by a Python class."""
 
     step_ms: float = Field(default=100.0, ge=0.1, le=60_000)
     formulas: dict[Name, Formula] = Field(default={}, description="name -> formula of t, dt, inputs and each other")
@@ -346,7 +361,7 @@ class SimulationForm(Strict):
 
 
 class EmulatedForm(Strict):
-    """What stands in for a device: a recording (time-keyed signals), a simulation, or a model."""
+    """The data source of an emulated device: a recording (time-keyed signals), a simulation, or a model."""
 
     recording: str | None = None
     simulation: str | None = Field(default=None, description="one of `simulations:`; the device plays values of it")
@@ -376,7 +391,7 @@ class EmulatedForm(Strict):
 
 
 class PrototypeForm(Strict):
-    """What is emulated, with what, and where. The plant never opens this file."""
+    """Which devices are emulated, from which data source, and at which endpoint. The plant never opens this file."""
 
     prototype_of: str
     unmapped: Literal["refuse"] = "refuse"

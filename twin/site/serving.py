@@ -1,7 +1,8 @@
-"""The `serve` and `bridge` sections of a system file, resolved: whom the gateway answers, with what, and what they may.
+"""The `serve` and `bridge` sections of a system file, resolved: which clients the gateway answers, with which data, and
+what they may request.
 
-Everything that is wrong is found here, with file, line and column: tags that do not exist or do not fit, registers that
-overlap, buses that are none, ranges that make no sense. Nothing is opened here.
+Every error is found here, and reported with file, line and column: tags that do not exist or do not fit, overlapping
+registers, unknown buses, invalid ranges. Nothing is opened here.
 """
 
 from __future__ import annotations
@@ -29,14 +30,14 @@ WORDS = {"read": READ_FUNCTIONS, "write": WRITE_FUNCTIONS}
 
 @dataclass(frozen=True)
 class Serving:
-    """Both sections, as the file says them."""
+    """Both sections, as the file states them."""
 
     serve: tuple[ServeConfig, ...] = ()
     bridges: tuple[BridgeConfig, ...] = ()
 
     def for_run(self, *, allow_writes: bool, free_ports: bool) -> Serving:
-        """As a gateway runs it. With `free_ports` (a prototype) sockets take a free port of the same host; a serial line is
-        somewhere else there too, but that is the connector's business."""
+        """Return the sections as a gateway runs them. With `free_ports` (a prototype) sockets take a free port of the
+        same host. A serial line is also opened elsewhere then, by the connector."""
         bridges = [replace(b, policy=replace(b.policy, allow_writes=allow_writes)) for b in self.bridges]
         if not free_ports:
             return Serving(self.serve, tuple(bridges))
@@ -68,7 +69,7 @@ def resolve_serving(
         *(("bridge", b.name, b.listen) for b in bridges),
     ]:
         if not listen.is_serial and listen.port == 0:
-            continue  # a free port of its own
+            continue  # the operating system chooses a free port
         if str(listen) in taken:
             raise file.error((section, name, "url"), f"{listen} is taken by {taken[str(listen)]}")
         taken[str(listen)] = f"{section} {name!r}"
@@ -146,7 +147,7 @@ def _tag(
 
 
 def _usual_type(tag: Tag) -> str:
-    """The device's own type where the value is a whole number, else float32."""
+    """Return the device's own type if the value is an integer, else a floating-point type."""
     if tag.type == "bool":
         return "uint16"
     if not tag.is_integer:
@@ -168,7 +169,7 @@ def _check_writable(
 
 
 def _check_overlaps(file: YamlFile, loc: tuple[Key, ...], tags: Iterable[ServedTag]) -> None:
-    """No register holds two things: values and quality registers alike."""
+    """Check that no two values or quality registers share a register."""
     taken: dict[tuple[str, int], str] = {}
     for served in tags:
         spans: list[tuple[ServedTable, int, int, str, str]] = [
@@ -254,7 +255,7 @@ def _rule(file: YamlFile, loc: tuple[Key, ...], form: AllowForm, url: str) -> Al
 
 
 def _roles(file: YamlFile, loc: tuple[Key, ...], roles: list[str] | None, url: str) -> frozenset[str] | None:
-    """Roles are in certificates: without TLS nobody has one."""
+    """Return the roles, which require TLS: a client's certificate names its roles."""
     if roles is None:
         return None
     if not url.lower().startswith("tls:"):
@@ -263,7 +264,7 @@ def _roles(file: YamlFile, loc: tuple[Key, ...], roles: list[str] | None, url: s
 
 
 def _span(file: YamlFile, loc: tuple[Key, ...], entry: int | str, most: int) -> tuple[int, int]:
-    """``7`` or ``"0..99"``: first and last."""
+    """Return the first and last number of ``7`` or ``"0..99"``."""
     first, dots, last = str(entry).partition("..")
     digits = (first, last if dots else first)
     if not all(d.isascii() and d.isdigit() for d in digits):

@@ -1,7 +1,8 @@
-"""Programs that wait at their start for what they have to command first: the system file's author is warned of each.
+"""Warnings for the author of a system file about programs whose start waits for a value that they must command first.
 
-A sampling sensor (`sampled:` in its profile) has no measured value before it is given a period. A program that gives it the
-period, and waits for a value of it before its first scan, never starts. Pure: it looks at a loaded system file.
+A sampling sensor (`sampled:` in its profile) has no measured value before it is given a period. A program that sets the
+period, and waits before its first scan for a value of that sensor, never starts. Pure: it inspects a loaded system
+file.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ def _commanded_by(device: DeviceConfig, tag: str, commanded: set[str]) -> str:
     sampled, known = device.profile.sampled, device.profile.tags.get(tag)
     if sampled is None or known is None or known.poll != sampled.poll:
         return ""
-    if not known.type.startswith("float"):  # an integer says 0 before the first sample
+    if not known.type.startswith("float"):  # an integer reads 0 before the first sample
         return ""
     period = f"{device.name}.{sampled.period}"
     return period if period in commanded else ""

@@ -1,7 +1,8 @@
-"""The system: what a system file says, resolved and checked as a whole. The plant and its prototype both start from it.
+"""The system: a system file, resolved and checked as a whole. The plant and its prototype both start from it.
 
-Everything that can be found wrong without a wire is found here, with file, line and column: unknown buses and profiles, two
-devices on one address, tags that no profile has, programs bound to nothing. Nothing here knows what is emulated.
+Every error that can be found without a connection is found here, and reported with file, line and column: unknown buses
+and profiles, two devices with the same address, tags that no profile has, programs bound to nothing. This module does
+not know what is emulated.
 """
 
 from __future__ import annotations
@@ -26,13 +27,13 @@ from fieldtwin.twin.site.serving import Serving, resolve_serving
 from fieldtwin.twin.site.start_warnings import waits_for_its_command
 
 SCHEMES = ("rtu", "ascii", "tcp", "rtu+tcp", "udp", "tls", "can")
-"""What the gateway can talk over so far."""
+"""The endpoint schemes that the gateway supports."""
 
 
 @dataclass(frozen=True)
 class System:
-    """A system, resolved. Dictionaries keep the file's order. `hash` tells one version of the file from another. `warnings` are
-    for the file's author, each with its place in the file."""
+    """A resolved system. Dictionaries keep the file's order. `hash` identifies a version of the file. `warnings` are for
+    the file's author, each with its place in the file."""
 
     name: str
     path: Path
@@ -48,7 +49,7 @@ class System:
     invariants: InvariantsForm = field(default_factory=InvariantsForm)
 
     def devices_on(self, bus: str) -> list[DeviceConfig]:
-        """The devices of a bus, in the file's order."""
+        """Return the devices of a bus, in the file's order."""
         return [d for d in self.devices.values() if d.bus == bus]
 
 
@@ -63,7 +64,7 @@ def load_system(name: str, profiles: Iterable[Path] = ()) -> System:
         raise file.error(("network",), "a network, not a system", expected="a system file", hint=hint)
     form = validate(file, SystemForm)
     buses = {n: _bus(file, n, b) for n, b in form.buses.items()}
-    known: dict[Path, DeviceProfile] = {}  # a profile that a hundred devices have is read once
+    known: dict[Path, DeviceProfile] = {}  # so that a profile used by a hundred devices is read once
     devices = {n: _device(file, n, d, buses, path, profiles, known) for n, d in form.devices.items()}
     buses = connect_pauses(buses, form, devices)
     _check_addresses(file, buses, devices)
@@ -152,7 +153,7 @@ def _device(
 
 
 def _check_device(file: YamlFile, loc: tuple[Key, ...], d: DeviceForm, config: DeviceConfig) -> None:
-    """Every tag and poll group that the device's entry names must be in its profile, and fit its use."""
+    """Check that every tag and poll group in the device's entry exists in its profile and fits its use."""
     profile = config.profile
     groups = [*profile.groups, *(["inbox"] if profile.inbox else [])]
     for group in d.poll:
@@ -172,7 +173,9 @@ def _check_device(file: YamlFile, loc: tuple[Key, ...], d: DeviceForm, config: D
 def _safe_outputs(
     file: YamlFile, loc: tuple[Key, ...], d: DeviceForm, profile: DeviceProfile
 ) -> dict[str, int | float]:
-    """Check `writable` and `safe`. Return the safe value of each tag as a number; the file may give the name of a value."""
+    """Check `writable` and `safe`. Return the safe value of each tag as a number; the file may give the name of a
+    value.
+    """
     mailbox = {"outbox", "inbox_ack"} if profile.inbox else set()
     for i, tag in enumerate(d.writable):
         if tag not in mailbox:
@@ -221,7 +224,7 @@ def _writable(file: YamlFile, loc: tuple[Key, ...], profile: DeviceProfile, name
 
 
 def _check_addresses(file: YamlFile, buses: dict[str, BusConfig], devices: dict[str, DeviceConfig]) -> None:
-    """Each device of a wire has an address of its own. Two buses on one CAN interface are one wire."""
+    """Check that the devices on a bus have different addresses. Two buses on one CAN interface count as one."""
     taken: dict[tuple[str, int], str] = {}
     for name, device in devices.items():
         endpoint = buses[device.bus].endpoint
@@ -239,13 +242,15 @@ def _check_addresses(file: YamlFile, buses: dict[str, BusConfig], devices: dict[
 
 
 def _check_programs(system: System) -> None:
-    """Inputs and outputs of programs are tags or messages of devices, and an output is written by one program only."""
+    """Check that inputs and outputs of programs are tags or messages of devices, and that one program only writes an
+    output.
+    """
     written: dict[str, str] = {}
     for name, program in system.plc.programs.items():
         loc: tuple[Key, ...] = ("plc", "programs", name)
         for variable, form in program.inputs.items():
             if form.tag.partition(".")[0] in system.plc.programs:
-                continue  # another program's variable: checked where the programs are put together
+                continue  # another program's variable: checked where the programs are assembled
             device, local = _split(system, (*loc, "inputs", variable, "tag"), form.tag)
             names = [t.name for t in device.profile.tags.values() if t.readable and not t.is_text]
             names += [*device.profile.messages, *(["inbox"] if device.profile.inbox else [])]

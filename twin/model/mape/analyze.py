@@ -1,7 +1,8 @@
-"""Analyze: the second stage. It compares what the plant reports with the digital model, and says what it finds.
+"""Analyze: the second stage. It compares what the plant reports with the digital model and emits its findings.
 
-State mismatch, values outside the model, bad and stale values; and the figures of twinning: how often the two agree, how often
-they hear of each other, how late. It must never know a connection, nor anything that could send a command.
+It finds state mismatches, values outside the model's limits, and bad and stale values. It also computes the twinning
+figures: how often plant and model agree, the twinning rate, and the lag. It must never depend on a connection, nor on
+anything that could send a command.
 """
 
 from __future__ import annotations
@@ -22,18 +23,19 @@ from fieldtwin.twin.model.thread_process import DTDigitalThreadProcess
 
 CAPACITY = 10_000
 LAGS = 10_000
-"""Arrivals of which the lag is kept for the figures."""
+"""Number of arrivals whose lag is kept for the figures."""
 LATE_MS = 10_000
-"""What is older than this when it arrives was backfilled: it is counted, and is no part of lag and rate. So was what is from
-before there was anybody to hear it."""
+"""An event that is older than this when it arrives was backfilled. It is counted, and excluded from lag and rate. So
+are events from before this twin was running."""
 
 
 class Analyze(DTDigitalThreadProcess):
-    """SPEC row Analyze. Values are held against the limits of the model's variables; what is not heard of for `stale_after_ms` is
-    stale.
+    """SPEC row Analyze. Compares values with the limits of the model's variables. A tag that is not reported for
+    `stale_after_ms` is stale.
 
-    Every status gets a verdict; of a tag only changes are told: outside and inside again, bad and good, stale and fresh. A change
-    that was history when it was heard of is told again when the plant says that it is so still: for who plans by what is.
+    Every status gets a verdict. For a tag only changes are emitted: outside and inside again, bad and good, stale and
+    fresh. A change that first arrived as history is emitted again as soon as the plant reports that it still holds,
+    because a planner acts on the present state only.
     """
 
     def __init__(self, model: DigitalModel, clock: Clock, *, stale_after_ms: int) -> None:
@@ -47,14 +49,16 @@ class Analyze(DTDigitalThreadProcess):
         self._lags: deque[int] = deque(maxlen=LAGS)
         self._heard: dict[str, int] = {}
         self._wrong: dict[str, set[str]] = {}
-        """What is wrong with a tag now."""
+        """The findings that currently hold for each tag."""
         self._history: set[tuple[str, str]] = set()
-        """Of what in `_wrong`, or no more in it, was heard as history only."""
+        """Changes of `_wrong` (additions and removals) that are known from history only."""
         self._began_ms = clock.utc_ns() // 1_000_000
         self._first_ms = self._last_ms = self._reports = 0
 
     def recall(self) -> None:
-        """Take in what was known before a restart. What was wrong then is told as soon as the plant says how it is now."""
+        """Restore what was known before a restart. A finding that held then is emitted again as soon as the plant
+        confirms it.
+        """
         for message in self.consumer.drain():
             if isinstance(message, SeenMeasurement) and message.event.kind == Kind.VALUE:
                 name = message.event.name
@@ -62,7 +66,9 @@ class Analyze(DTDigitalThreadProcess):
                 self._history |= {(name, wrong) for wrong in self._wrong[name]}
 
     def check_statuses(self, status: SeenStatus) -> bool | None:
-        """CheckStatuses: whether the reported state and period are the model's. None for a status that is none."""
+        """CheckStatuses: return whether the reported state and period equal the model's. None if the status cannot be
+        decoded.
+        """
         try:
             state, period_s = decode_status(status.data)
         except Desync:
@@ -70,7 +76,7 @@ class Analyze(DTDigitalThreadProcess):
         return (state, period_s) == (self.digital_model.state.name, self.digital_model.period_s)
 
     def compare(self) -> None:
-        """compare: consume ; CheckStatuses ; emit. A measurement is held against its limits."""
+        """compare: consume ; CheckStatuses ; emit. A measurement is compared with its limits."""
         for message in self.consumer.drain():
             if isinstance(message, SeenStatus):
                 self._note_lag(message.t_ms, message.arrived_ms)
@@ -105,7 +111,9 @@ class Analyze(DTDigitalThreadProcess):
             self._turn(event.name, wrong, right, is_wrong, text, event.t_ms, late=late)
 
     def _weighed(self, message: SeenMeasurement) -> Iterator[tuple[str, str, bool, str]]:
-        """What a value can be found to be: the word for wrong, the one for right, which of them it is, and in words."""
+        """Yield each possible finding about a value: the word for wrong, the word for right, whether it is wrong, and a
+        sentence.
+        """
         event = message.event
         bad = message.quality >= Quality.BAD
         why = f"{event.name} is {message.quality}: {message.reason}" if bad else f"{event.name} is good again"
@@ -119,7 +127,7 @@ class Analyze(DTDigitalThreadProcess):
         yield "outside", "inside", outside, text
 
     def look(self) -> None:
-        """Time has gone on: say which tags were not heard of for too long."""
+        """Report the tags that have not been updated for `stale_after_ms`. To be called as time passes."""
         now_ms = self._clock.utc_ns() // 1_000_000
         for name, heard_ms in self._heard.items():
             if now_ms - heard_ms > self._stale_after_ms:
@@ -153,7 +161,7 @@ class Analyze(DTDigitalThreadProcess):
         self._last_ms = arrived_ms
 
     def figures(self) -> dict[str, Any]:
-        """Twinning: how often the two agreed, how often they heard of each other, and how late (ms)."""
+        """Return the twinning figures: the agreement, the twinning rate (Hz), and the lag (ms)."""
         lags = sorted(self._lags)
         seconds = (self._last_ms - self._first_ms) / 1000
         return {

@@ -1,7 +1,7 @@
-"""Execute: the last stage. A command is held against the digital model first; only what the model accepts is sent.
+"""Execute: the last stage. It checks each command against the digital model, and sends only what the model accepts.
 
-Where it was told to, a prototype is asked as well. That takes time, and nobody waits: the commands behind it stay in the queue.
-No user steps in. A refusal is an event with its reason (SPEC ruling 9), and is kept.
+If configured, it also asks a prototype. That takes time and blocks nothing: later commands stay in the queue meanwhile.
+No user is involved. A refusal is an event with its reason (SPEC ruling 9), and is kept.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ MINUTE_NS = 60 * NS_PER_S
 
 @dataclass(frozen=True, slots=True)
 class Bounds:
-    """What may be commanded: periods from `least_s` to `most_s`, and how many commands in any minute."""
+    """The limits of commands: periods from `least_s` to `most_s`, and the number of commands in any minute."""
 
     least_s: int = PERIOD_MIN
     most_s: int = PERIOD_MAX
@@ -33,8 +33,8 @@ class Bounds:
 
 
 class CommandCheck:
-    """Whether a command is one, inside its bounds and not too often. Both twins have one of their own: whoever obeys does not
-    rely on who commands."""
+    """Checks that a command can be decoded, is inside its bounds and does not exceed the rate. Plant and twin each have
+    their own check: the plant does not rely on the twin that commands it."""
 
     def __init__(self, bounds: Bounds, clock: Clock) -> None:
         self.bounds = bounds
@@ -42,13 +42,13 @@ class CommandCheck:
         self._taken: deque[int] = deque(maxlen=bounds.per_minute)
 
     def restate(self, bounds: Bounds) -> None:
-        """Other bounds from now on; what was taken before counts."""
+        """Use new bounds from now on; commands taken before still count towards the rate."""
         if bounds != self.bounds:
             self.bounds = bounds
             self._taken = deque(self._taken, maxlen=bounds.per_minute)
 
     def objection(self, command: COMMAND) -> str:
-        """Why it is refused; empty when nothing speaks against it."""
+        """Return why the command is refused, or an empty text if it is acceptable."""
         try:
             period_s = decode_period(command)
         except Desync as e:
@@ -61,15 +61,15 @@ class CommandCheck:
         return ""
 
     def take(self) -> None:
-        """One was taken now."""
+        """Count a command as taken now."""
         self._taken.append(self._clock.monotonic_ns())
 
 
 class Execute(DTDigitalThreadProcess):
-    """SPEC row Execute: consume ; ChangeState ; emit. `transmitter` emits what is to be sent, in order.
+    """SPEC row Execute: consume ; ChangeState ; emit. `transmitter` emits the commands to send, in order.
 
-    `question` is what `what_if` is asked of each command for which the planner says nothing else. What is asked of is sent after
-    the answer that nothing speaks against it, and not without.
+    `question` is asked of `what_if` for each command for which the planner gives no question of its own. Such a command
+    is sent only after an answer without an objection.
     """
 
     def __init__(
@@ -93,11 +93,13 @@ class Execute(DTDigitalThreadProcess):
 
     @property
     def asking(self) -> bool:
-        """Whether a command waits for an answer; what is planned meanwhile waits behind it."""
+        """Whether a command waits for its answer; commands planned meanwhile wait in the queue."""
         return self._pending is not None
 
     def change_state(self, command: COMMAND) -> str:
-        """ChangeState: the model takes the command, or says why not and stays as it is."""
+        """ChangeState: apply the command to the model. If it is refused, return the reason and leave the model
+        unchanged.
+        """
         objection = self._check.objection(command)
         if not objection:
             self.digital_model.process_event(command)
@@ -105,7 +107,7 @@ class Execute(DTDigitalThreadProcess):
         return objection
 
     def execute(self) -> None:
-        """Deal with what is planned, in order, up to the first command of which an answer is still to come."""
+        """Process the planned commands in order, up to the first one whose answer is still pending."""
         while self._pending is not None or self.plans.queue:
             command, objection = self._next()
             if objection is None:
@@ -113,14 +115,16 @@ class Execute(DTDigitalThreadProcess):
             self._settle(command, objection or self.change_state(command))
 
     def give_up(self, why: str) -> None:
-        """The twin ends: what waits for an answer is not sent, nor what waits behind it."""
+        """Refuse the command that waits for an answer and all commands after it, because the twin ends."""
         waiting = [*self.plans.drain()] if self._pending is None else [self._pending, *self.plans.drain()]
         self._pending = None
         for command in waiting:
             self._settle(command, why)
 
     def _next(self) -> tuple[COMMAND, str | None]:
-        """The first command, and what speaks against it before the model takes it; None: that is still being asked."""
+        """Return the first command and the objection to it before the model takes it. None: the answer is still
+        pending.
+        """
         if self._pending is None:
             command = self.plans.consume()
             question = command.question if isinstance(command, PlannedCommand) else self._question
@@ -148,7 +152,7 @@ class Execute(DTDigitalThreadProcess):
 
 
 def _told(command: COMMAND, objection: str) -> str:
-    """The reason, and of which command where it does not say that by itself."""
+    """Return the reason, with the command's period where the reason does not already name it."""
     try:
         period_s = decode_period(command)
     except Desync:

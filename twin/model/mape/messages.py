@@ -1,4 +1,4 @@
-"""What the stages of a twin pass on to each other: statuses and measurements as they arrived, and verdicts on them. Pure."""
+"""Messages between the stages of a twin: statuses and measurements as they arrived, and verdicts on them. Pure."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _REASONS = frozenset(int(reason) for reason in Reason)
 
 @dataclass(frozen=True, slots=True)
 class SeenStatus(STATUS):
-    """A STATUS of `whose` state machine, at `t_ms` on the plant and `arrived_ms` here (UTC)."""
+    """A STATUS of the state machine `whose`, at `t_ms` on the plant and at `arrived_ms` on this side (both UTC)."""
 
     whose: str = ""
     t_ms: int = 0
@@ -21,27 +21,30 @@ class SeenStatus(STATUS):
 
 @dataclass(frozen=True, slots=True)
 class SeenMeasurement(MEASUREMENT):
-    """A value or a payload with everything that is known of it."""
+    """A value or a payload, with its complete event."""
 
     event: Event = Event(0, 0, 0, "")  # noqa: RUF009  immutable
     arrived_ms: int = 0
 
     @property
     def quality(self) -> Quality:
-        """How far it can be trusted. A worse word than any that is known here, from a newer plant, is bad."""
+        """Quality of the value. A quality worse than every known one, which a newer plant may send, is read as bad."""
         return Quality(min(self.event.quality, Quality.BAD))
 
     @property
     def reason(self) -> Reason:
-        """Why it is not good; one that is not known here, from a newer plant, is none."""
+        """Reason for a quality that is not good. A reason that is unknown to this version, from a newer plant, is read
+        as NONE.
+        """
         return Reason(self.event.reason) if self.event.reason in _REASONS else Reason.NONE
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict(DATA):
-    """What an analysis says of `subject`: `finding` is a word of `FINDINGS`, `text` a sentence. `data` is the text as UTF-8.
+    """A finding of an analysis about `subject`: `finding` is a key of `FINDINGS`, `text` a sentence. `data` is the text
+    as UTF-8.
 
-    `again`: the same was said when it was history, or before a restart; now it is so.
+    `again` is true if the same finding was emitted before, as history or before a restart, and now holds at present.
     """
 
     finding: str = ""
@@ -52,7 +55,7 @@ class Verdict(DATA):
 
     @property
     def fine(self) -> bool:
-        """Whether all is as it should be."""
+        """Whether the finding reports a normal condition."""
         return self.finding in ("agree", "inside", "good", "fresh")
 
 

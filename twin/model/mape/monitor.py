@@ -1,6 +1,7 @@
-"""Monitor: the first stage. It takes in what the plant reports, keeps the digital model up with it, and passes everything on.
+"""Monitor: the first stage. It takes what the plant reports, keeps the digital model up to date, and passes everything
+on.
 
-It must never know a connection, nor anything that could send a command.
+It must never depend on a connection, nor on anything that could send a command.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ class Monitor(DTDigitalThreadProcess):
         self.unreadable = 0
 
     def arrived(self, event: Event, arrived_ms: int) -> None:
-        """Sort an event into the two queues; what the plant knows beside statuses and measurements is its own business."""
+        """Sort an event into one of the two queues. Events other than statuses and measurements are ignored."""
         if event.kind == Kind.STATE:
             data = event.value if isinstance(event.value, bytes) else b""
             self.statuses.observe(SeenStatus(data, event.name, event.t_ms, arrived_ms))
@@ -40,7 +41,9 @@ class Monitor(DTDigitalThreadProcess):
             self.measurements.observe(SeenMeasurement(data, event, arrived_ms))
 
     def handle_state(self) -> None:
-        """handleState: per STATUS consume ; digitalModel.ProcessEvent ; emit. One that is none changes nothing, and counts."""
+        """handleState: per STATUS consume ; digitalModel.ProcessEvent ; emit. A status that cannot be decoded is
+        counted and leaves the model unchanged.
+        """
         for status in self.statuses.drain():
             try:
                 _, period_s = decode_status(status.data)
@@ -50,6 +53,6 @@ class Monitor(DTDigitalThreadProcess):
             self.emitter.emit(status)
 
     def handle_measurements(self) -> None:
-        """handleMeasurements: per MEASUREMENT consume ; emit. The model stays as it is."""
+        """handleMeasurements: per MEASUREMENT consume ; emit. The state machine of the model stays unchanged."""
         for measurement in self.measurements.drain():
             self.emitter.emit(measurement)

@@ -1,6 +1,6 @@
-"""Plan: the third stage. What was found becomes a command, by rules or by a planner that somebody wrote in Python.
+"""Plan: the third stage. It turns findings into commands, by rules or by a planner that the user wrote in Python.
 
-It decides and sends nothing: what it emits goes to Execute, which asks the digital model first.
+It decides and sends nothing: it emits commands to Execute, which checks them against the digital model first.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from fieldtwin.twin.model.thread_process import DTDigitalThreadProcess
 
 CAPACITY = 1000
 OLD_MS = 10_000
-"""What was so longer ago is history, backfilled: nothing is planned because of it."""
+"""A finding older than this is backfilled history: no command is planned because of it."""
 
 
 _ABOUT = {
@@ -32,20 +32,23 @@ _ABOUT = {
     **dict.fromkeys(("good", "bad"), "quality"),
     **dict.fromkeys(("fresh", "stale"), "age"),
 }
-"""What a finding is about: of one subject the newer one says how it is now."""
+"""The property that a finding is about. For the same subject and property, a newer finding supersedes an older one."""
 
 
 class Planner(Protocol):
-    """Planning: DATA to COMMAND; None: there is nothing to do about it. A `FieldtwinError` it raises is kept as a refusal."""
+    """Planning: from DATA to COMMAND, or None if no command is needed. A `FieldtwinError` that it raises is kept as a
+    refusal.
+    """
 
     def plan(self, data: DATA, model: DigitalModel) -> COMMAND | None: ...
 
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """When `finding` is told of `subject` (empty: of anything), command `period_s`.
+    """When `finding` is reported for `subject` (empty: for any subject), command `period_s`.
 
-    `ask`: what to ask a prototype first. True: what the twin asks of every command, if anything. False: nothing.
+    `ask` is the question for a prototype before the command is sent. True: the twin's default question, if it has one.
+    False: none.
     """
 
     finding: str
@@ -54,7 +57,7 @@ class Rule:
     ask: Question | bool = True
 
     def command(self) -> COMMAND:
-        """What it commands."""
+        """Return the command of this rule."""
         made = encode_period(self.period_s)
         if self.ask is True:
             return made
@@ -62,7 +65,7 @@ class Rule:
 
 
 class RulePlanner:
-    """The first rule that fits decides. A period that the model has already is not commanded again."""
+    """Applies the first rule that matches. A period that the model already has is not commanded again."""
 
     def __init__(self, rules: Iterable[Rule]) -> None:
         self.rules = tuple(rules)
@@ -79,8 +82,8 @@ class RulePlanner:
 class Plan(DTDigitalThreadProcess):
     """SPEC row Plan: consume ; Planning ; emit.
 
-    `take` consumes what was found, `plan_next` plans because of the first of it. In between findings may wait, while a prototype
-    is asked about a command: `overtaken` counts those that `only_newest` did not keep, because a newer one said otherwise.
+    `take` consumes findings, and `plan_next` plans for the first of them. Findings may wait while a prototype is asked
+    about a command; `overtaken` counts those that `only_newest` dropped because a newer finding superseded them.
     """
 
     def __init__(self, model: DigitalModel, planner: Planner, clock: Clock) -> None:
@@ -93,7 +96,7 @@ class Plan(DTDigitalThreadProcess):
         self._waiting: deque[Verdict] = deque()
 
     def take(self) -> None:
-        """Consume what was found. What was so long ago is history."""
+        """Consume findings. Those older than `OLD_MS` are counted and dropped."""
         now_ms = self._clock.utc_ns() // NS_PER_MS
         for message in self.consumer.drain():
             if now_ms - message.t_ms > OLD_MS:
@@ -102,16 +105,18 @@ class Plan(DTDigitalThreadProcess):
                 self._waiting.append(message)
 
     def only_newest(self) -> None:
-        """Of what waits keep the newest of each kind and subject: by what was otherwise since then nobody plans."""
+        """Keep only the newest waiting finding of each subject and property, so that no command is planned for an
+        outdated one.
+        """
         kept: dict[tuple[str, str], Verdict] = {}
         for message in self._waiting:
             about = (message.subject, _ABOUT.get(message.finding, message.finding))
-            self.overtaken += kept.pop(about, None) is not None  # and the newer one goes to the end
+            self.overtaken += kept.pop(about, None) is not None  # and move the newer one to the end
             kept[about] = message
         self._waiting = deque(kept.values())
 
     def plan_next(self) -> bool:
-        """Plan because of the first finding that waits. False: none does."""
+        """Plan for the first waiting finding. Return False if none is waiting."""
         if not self._waiting:
             return False
         try:
@@ -126,7 +131,7 @@ class Plan(DTDigitalThreadProcess):
         return True
 
     def plan(self) -> None:
-        """Take everything and plan because of it."""
+        """Consume all findings and plan for each of them."""
         self.take()
         while self.plan_next():
             pass

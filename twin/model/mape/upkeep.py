@@ -1,8 +1,8 @@
-"""Upkeep: who keeps the digital model's variables up with what the plant reports.
+"""Upkeep: keeps the digital model's variables up to date with what the plant reports.
 
-The Monitor leaves the model as it is at a measurement, and passes it on to whoever listens (SPEC row Monitor). This is one who
-listens, as a database is: so everything that is received updates the model (SPEC prose, row 5). It must never know a connection,
-nor anything that could send a command.
+The Monitor does not change the model when a measurement arrives; it passes the measurement on to its subscribers (SPEC
+row Monitor). Upkeep is such a subscriber, as a database is: so everything that is received updates the model (SPEC
+prose, row 5). It must never depend on a connection, nor on anything that could send a command.
 """
 
 from __future__ import annotations
@@ -16,7 +16,9 @@ CAPACITY = 10_000
 
 
 class Upkeep:
-    """`measured` listens to Monitor, `analyzed` to Analyze. `keep_up` lets the model take what they were told, in order."""
+    """Subscribes to Monitor with `measured` and to Analyze with `analyzed`. `keep_up` applies what was received to the
+    model, in order.
+    """
 
     def __init__(self, model: DigitalModel, measured: str, analyzed: str) -> None:
         self.measured: Consumer[DATA] = Consumer(measured, CAPACITY)
@@ -24,7 +26,7 @@ class Upkeep:
         self.digital_model = model
 
     def keep_up(self) -> None:
-        """A value or a payload becomes its variable's; a variable of which Analyze finds that it is stale is bad."""
+        """Write each value or payload to its variable, and mark variables that Analyze finds stale as bad."""
         variables = self.digital_model.variables
         for message in self.measured.drain():
             if isinstance(message, SeenMeasurement):

@@ -1,6 +1,6 @@
-"""What is asked of a prototype before a command is sent: the question, and the one who asks it. Pure.
+"""The question that a twin asks a prototype before it sends a command, and the interface for asking it. Pure.
 
-How a prototype is forked and run ahead is unknown here: a twin is given somebody who can.
+How a prototype is forked and run ahead is implemented elsewhere; a twin is given an object that implements `WhatIf`.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from fieldtwin.gateway.core.values import COMMAND
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """What must hold in a prototype that is given the command and runs `horizon_s` seconds ahead: each of `require` from
-    `settle_s` on all the time, each of `finally_` at the end. Expressions as in scenarios."""
+    """Requirements on a prototype that is given the command and runs `horizon_s` seconds ahead: each of `require` must
+    hold at all times from `settle_s` on, and each of `finally_` at the end. Expressions are written as in scenarios."""
 
     horizon_s: float
     require: tuple[str, ...] = ()
@@ -24,21 +24,23 @@ class Question:
 
 @dataclass(frozen=True, slots=True)
 class PlannedCommand(COMMAND):
-    """A command for which the planner says what is to be asked first: a question of its own, or nothing (None).
+    """A command for which the planner gives the question to ask first: its own question, or None to ask nothing.
 
-    Of a plain COMMAND what is asked is the twin's to say.
+    For a plain COMMAND the twin's default question applies.
     """
 
     question: Question | None = None
 
 
 class WhatIf(Protocol):
-    """Asks a prototype what comes of a command. One question at a time; the answer is looked for, never waited for."""
+    """Asks a prototype about the consequences of a command. One question at a time; the caller polls for the answer."""
 
     def ask(self, command: COMMAND, question: Question) -> None:
-        """Begin to ask."""
+        """Start to ask a question."""
         ...
 
     def answer(self) -> str | None:
-        """None: there is none yet. Empty: nothing speaks against the command. Else why it is not to be sent."""
+        """Return None if there is no answer yet, an empty text if nothing speaks against the command, else the
+        objection.
+        """
         ...

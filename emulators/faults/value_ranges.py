@@ -22,7 +22,7 @@ _MOST_SENTINELS = 64
 
 
 def numbers(tags: Iterable[Tag]) -> list[Tag]:
-    """Return the tags that a fault of values can strike: the readable ones that are numbers."""
+    """Return the tags that a value fault can strike: the readable ones that are numbers."""
     return [tag for tag in tags if tag.readable and not tag.is_text]
 
 

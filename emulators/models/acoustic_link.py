@@ -1,4 +1,6 @@
-"""A modem's end of the water: what its registers hand over is said, what it hears arrives in its mailbox."""
+"""A modem's connection to the acoustic channel: it sends what the registers hand over and puts received packets in the
+mailbox.
+"""
 
 from __future__ import annotations
 
@@ -8,8 +10,8 @@ from fieldtwin.emulators.wires.acoustic import AcousticMedium
 class AcousticLink:
     """Both directions of the modem `name` in `medium` (`packet_link.Outgoing` and `Incoming`).
 
-    `times`: how often each packet is said, `every_ns` apart: a modem that nobody answers. The water loses what it likes, so
-    `resent` counts what was said besides.
+    `times`: how often each packet is sent, `every_ns` apart, for a modem that gets no acknowledgements. The channel may
+    lose any of these copies; `resent` counts the additional ones.
     """
 
     def __init__(self, medium: AcousticMedium, name: str, *, times: int = 1, every_ns: int = 0) -> None:

@@ -1,4 +1,4 @@
-"""Which model stands behind a data sheet: the device profile in the low word of 1000h says it (CiA 301, 7.5.2.1), or the user."""
+"""Selects the model for a data sheet: by the device profile in the low word of 1000h (CiA 301, 7.5.2.1), or by the user."""
 
 from __future__ import annotations
 
@@ -23,12 +23,14 @@ MODELS: dict[int, Callable[[], DeviceModel]] = {
 
 
 NO_MODEL = "none"
-"""What a user may choose, as well as a number of `MODELS`, in place of what 1000h says."""
+"""The user's choice of no model, instead of a number of `MODELS` or the value of 1000h."""
 
 
 def model_for(dictionary: Dictionary, chosen: str | None = None) -> DeviceModel | None:
-    """A new model for the device that the data sheet describes; None for a profile without one. `chosen`: a number of `MODELS`
-    as text, or `NO_MODEL`."""
+    """Return a new model for the device that the data sheet describes; None for a profile without one.
+
+    `chosen`: a number of `MODELS` as text, or `NO_MODEL`.
+    """
     if chosen is not None:
         return None if chosen == NO_MODEL else MODELS[int(chosen)]()
     entry = dictionary.entry(0x1000, 0)

@@ -1,7 +1,7 @@
-"""A made-up CTD cast: a stratified ocean, a probe on a winch, a ship that heaves, and sensors that are not perfect.
+"""A synthetic CTD cast: a stratified ocean, a probe on a winch, a heaving ship, and imperfect sensors.
 
-What the shipped recording `cast.jsonl` is made with. Deterministic: all chance comes from the random generator passed in.
-Knows no files and no registers.
+It generates the shipped recording `cast.jsonl`. Deterministic: the caller passes the random generator. It knows no
+files and no registers.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ SIGNALS = {"pressure": "dbar", "temperature": "degC", "conductivity": "S/m"}
 
 @dataclass(frozen=True, slots=True)
 class Cast:
-    """How the cast is done. Pressures in dbar, speeds in dbar/s, times in seconds."""
+    """Parameters of the cast. Pressures in dbar, speeds in dbar/s, times in seconds."""
 
     soak_pressure: float = 5.0
     soak_s: float = 60.0
@@ -30,7 +30,7 @@ class Cast:
     rate_hz: float = 4.0
 
     def winch_pressure(self, t_s: float) -> float:
-        """Where the winch has the probe: soak, down, bottom, up, and then at the surface."""
+        """Return the pressure at which the winch holds the probe: soak, down, bottom, up, and then at the surface."""
         way = (self.bottom_pressure - self.soak_pressure) / self.speed
         if t_s < self.soak_s:
             return self.soak_pressure
@@ -45,21 +45,22 @@ class Cast:
 
 
 def water_temperature(pressure: float) -> float:
-    """degC (ITS-90): a mixed layer of 24, a thermocline around 55 dbar, and a slow fall below."""
+    """Return the temperature in degC (ITS-90): a mixed layer of 24, a thermocline around 55 dbar, and a slow fall below."""
     return 5.2 + 9.3 * math.exp(-pressure / 260.0) + 9.8 * _above(pressure, 55.0, 14.0)
 
 
 def water_salinity(pressure: float) -> float:
-    """Practical salinity: fresher water on top, a halocline around 35 dbar, a maximum near 120."""
+    """Return the practical salinity: fresher water on top, a halocline around 35 dbar, a maximum near 120."""
     maximum = 0.55 * math.exp(-(((pressure - 120.0) / 60.0) ** 2))
     return 35.05 - 1.3 * _above(pressure, 35.0, 9.0) + maximum
 
 
 def cast_rows(cast: Cast, chance: random.Random) -> Iterator[tuple[float, tuple[float, float, float]]]:
-    """Times in seconds, and pressure, temperature, conductivity as the instrument would give them.
+    """Yield the time in seconds with pressure, temperature and conductivity as the instrument would report them.
 
-    The ship's heave moves the probe; the temperature sensor answers with a delay of 0.25 s, which the conductivity cell
-    sees too (it is pumped through the same duct); each sensor has its noise. Rounded to what the instrument resolves.
+    The ship's heave moves the probe. The temperature sensor responds with a delay of 0.25 s, which also applies to the
+    conductivity cell (it is pumped through the same duct). Each sensor has its noise. Values are rounded to the
+    resolution of the instrument.
     """
     step_s = 1.0 / cast.rate_hz
     lag = 1.0 - math.exp(-step_s / 0.25)
@@ -81,10 +82,13 @@ def cast_rows(cast: Cast, chance: random.Random) -> Iterator[tuple[float, tuple[
 
 
 def _above(pressure: float, middle: float, width: float) -> float:
-    """1 well above `middle`, 0 well below it."""
+    """Return 1 well above `middle`, 0 well below it."""
     return 0.5 * (1.0 - math.tanh((pressure - middle) / width))
 
 
 def _noise(chance: random.Random, deviation: float) -> float:
-    """Near enough normal (twelve uniform numbers), and the same on every machine: sums only, no library functions."""
+    """Return approximately normal noise (the sum of twelve uniform numbers).
+
+    It is the same on every machine, because it uses only sums and no library functions.
+    """
     return deviation * (sum(chance.random() for _ in range(12)) - 6.0)

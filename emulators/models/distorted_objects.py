@@ -1,7 +1,7 @@
-"""Value faults of a CANopen node whose values come from a log, from a model, or from nobody: objects that hold something else.
+"""Value faults of a CANopen node whose values come from a log, from a model, or only from its data sheet and clients.
 
-The object's own value, where nobody plays it, is what it held when the fault began or what a client wrote since; it is there
-again when the fault is over. Pure; it must never know frames nor SDO.
+If no source provides an object, its undistorted value is the one that it held when the fault began, or that a client
+has written since. It is restored when the fault is over. Pure; it must never know frames or SDO.
 """
 
 from __future__ import annotations
@@ -19,8 +19,10 @@ from fieldtwin.gateway.core.profile import Tag
 
 
 class DistortedObjects:
-    """A node's value source around `source`. `data` is the node's, once there is one. Before a model its calls change nothing:
-    the node asks `over` behind the model instead (`NodeContext.distort`)."""
+    """A node's value source around `source`. `data` is set once the node exists.
+
+    With a model, calling it changes nothing: the node calls `over` after the model instead (`NodeContext.distort`).
+    """
 
     def __init__(
         self,
@@ -31,7 +33,7 @@ class DistortedObjects:
         has_model: bool = False,
         named: bool = False,
     ) -> None:
-        """`named`: only what names a tag distorts it, not what is aimed at all tags."""
+        """`named`: only faults that name a tag distort it, not faults that are aimed at all tags."""
         self._named = named
         self.distortions = Distortions()
         self.data: NodeData | None = None
@@ -43,16 +45,16 @@ class DistortedObjects:
             if tag.object is not None and entry is not None and not tag.is_text and codec.is_number(entry.data_type):
                 self._tags[tag.object] = tag, entry.data_type
         self._own: dict[Key, bytes] = {}
-        """What objects that nobody plays hold below their distortion."""
+        """The undistorted values of objects that no source provides."""
         self._given: dict[Key, bytes] = {}
-        """What was made of them at last."""
+        """The last distorted value of each of them."""
 
     def __call__(self, now_ns: int) -> dict[Key, bytes]:
         values = {} if self._source is None else self._source(now_ns)
         return values if self._has_model else self.over(values, now_ns)
 
     def answer(self, key: Key, now_ns: int) -> bytes | None:
-        """As `AnswersReads`."""
+        """Implement `AnswersReads`."""
         raw = self._source.answer(key, now_ns) if isinstance(self._source, AnswersReads) else None
         known = self._tags.get(key)
         if raw is None or known is None or not self.distortions.of(known[0].name, named=self._named):
@@ -60,7 +62,7 @@ class DistortedObjects:
         return self._distorted(*known, raw, now_ns)
 
     def over(self, values: Mapping[Key, bytes], now_ns: int) -> dict[Key, bytes]:
-        """`values` with what is distorted instead, and with what nobody plays."""
+        """Return `values` with distorted objects replaced, and with distorted objects that no source provides added."""
         out = dict(values)
         if not self.distortions and not self._own:
             return out
@@ -68,7 +70,7 @@ class DistortedObjects:
             if not self.distortions.of(known[0].name, named=self._named):
                 self._given.pop(key, None)
                 if (own := self._own.pop(key, None)) is not None and key not in out:
-                    out[key] = own  # it is over
+                    out[key] = own  # the fault is over
                 continue
             played = values.get(key)
             raw = played if played is not None else self._beneath(key)
@@ -79,7 +81,7 @@ class DistortedObjects:
         return out
 
     def _beneath(self, key: Key) -> bytes | None:
-        """The value of an object that nobody plays; one that was written since is the object's own from then on."""
+        """Return the undistorted value of an object that no source provides; a value that was written since replaces it."""
         if self.data is None or not self.data.has(*key):
             return None
         live = self.data.get(*key)

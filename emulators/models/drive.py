@@ -1,9 +1,11 @@
-"""A CiA 402 drive: state machine, profile modes, homing and cyclic synchronous modes, with a motor that follows without error.
+"""A CiA 402 drive: state machine, profile modes, homing and cyclic synchronous modes, with a motor that follows without
+error.
 
-Objects and bits after CiA 402-2 and 402-3 (IEC 61800-7-201, -301), as drive makers' manuals print them. Positions are in
-increments, speeds in increments a second, accelerations in increments a second squared, torques in thousandths of the rated one.
-What the drive cannot know by itself (DC link voltage) comes from a recording; what is recorded is never computed. An error that
-is present in the node, whoever raised it, is the drive's malfunction; the reset of the fault ends it.
+Objects and bits follow CiA 402-2 and 402-3 (IEC 61800-7-201, -301), as printed in drive makers' manuals. Positions are
+in increments, speeds in increments per second, accelerations in increments per second squared, torques in thousandths
+of the rated torque. A value that the drive cannot determine itself (DC link voltage) comes from a recording; a recorded
+object is never computed. Every error that is present in the node puts the drive in the fault state; the fault reset
+clears it.
 """
 
 from __future__ import annotations
@@ -20,22 +22,24 @@ from fieldtwin.emulators.models.motion import Motion, by_torque, to_place, to_sp
 from fieldtwin.gateway.core.clock import NS_PER_S
 
 NEW_SET_POINT, AT_ONCE, RELATIVE, HALT = 1 << 4, 1 << 5, 1 << 6, 1 << 8
-"""Bits of the controlword in profile position mode; halt is every mode's."""
+"""Bits of the controlword in profile position mode; halt exists in every mode."""
 
 VOLTAGE, REMOTE, REACHED, LIMITED, BIT_12, BIT_13 = 1 << 4, 1 << 9, 1 << 10, 1 << 11, 1 << 12, 1 << 13
-"""Bits of the statusword. Bit 12 is set-point acknowledge (profile position), speed is zero (profile velocity), homing attained,
-or that the drive follows the command (cyclic modes). Bit 13 is a homing error, or a following error (cyclic position)."""
+"""Bits of the statusword. Bit 12 is set-point acknowledge (profile position), speed is zero (profile velocity), homing
+attained, or that the drive follows the command (cyclic modes). Bit 13 is a homing error, or a following error (cyclic
+position).
+"""
 
 HEARTBEAT_LOST, BUS_OFF = 0x8130, 0x8140
 _COMMUNICATION = frozenset({HEARTBEAT_LOST, BUS_OFF})
 _REACTIONS = {1: Cause.ERROR, 2: Cause.DISABLE_VOLTAGE, 3: Cause.QUICK_STOP}
-"""Abort connection option code 6007h: what the loss of the connection does."""
+"""Abort connection option code 6007h: the effect of a lost connection."""
 
 _SPAN = 1 << 32
 _USUAL, _UNLIMITED = 10_000.0, 10_000_000.0
-"""Accelerations without an object for them: of a profile, and of a motor that nothing bounds."""
+"""Accelerations if the node has no object for them: of a profile, and of a motor without limits."""
 _FASTEST = 10_000_000.0
-"""A motor that a torque accelerates for ever ends at this speed."""
+"""The final speed of a motor that a torque accelerates without limit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,8 +51,12 @@ class _SetPoint:
 
 
 class Drive(DeviceModel):
-    """One axis. `self_test_s` is how long it is not ready to switch on; `coasting` how an unpowered motor slows down by its
-    friction; `rated` is the acceleration that the rated torque gives without friction; `axis` where the switches are."""
+    """One axis.
+
+    `self_test_s` is the time for which the drive is not ready to switch on; `coasting` is the deceleration of an
+    unpowered motor by its friction; `rated` is the acceleration that the rated torque gives without friction; `axis`
+    holds the positions of the switches.
+    """
 
     def __init__(
         self,
@@ -61,7 +69,7 @@ class Drive(DeviceModel):
         self._rated, self._axis = rated, axis or Axis()
         self._zero = 0.0  # the place where 6064h is 0
         self._exists: dict[Key, Number] = {}
-        """6502h and 60E3h: what of the data sheet's modes and homing methods the model has."""
+        """6502h and 60E3h: the modes and homing methods of the data sheet that the model supports."""
         self._self_test_ns = round(self_test_s * NS_PER_S)
         self._coasting = coasting
         self._motion = Motion()
@@ -81,21 +89,21 @@ class Drive(DeviceModel):
         self._limited = False
         self._homing: Way | None = None
         self._homed = 0  # bits of the statusword in homing mode
-        self._wanted: int | None = None  # the demand of cyclic synchronous position
-        self._torque: float | None = None  # of cyclic synchronous torque, once it was used
+        self._wanted: int | None = None  # the demand value of cyclic synchronous position
+        self._torque: float | None = None  # of cyclic synchronous torque, after its first use
         self._seen: frozenset[int] = frozenset()
 
-    # -- what the mechanics of a twin ask -----------------------------------------------------------------------------
+    # -- interface for the mechanics of a twin ------------------------------------------------------------------------
 
     def position(self, now_ns: int) -> float:
-        """Increments since the first power-on, without the wrap of 6064h's 32 bits."""
+        """Return the position in increments since the first power-on, without the wrap of 6064h's 32 bits."""
         return self._motion.at((now_ns - self._began_ns) / NS_PER_S)[0]
 
     def velocity(self, now_ns: int) -> float:
-        """Increments a second."""
+        """Return the speed in increments per second."""
         return self._motion.at((now_ns - self._began_ns) / NS_PER_S)[1]
 
-    # -- what the node asks -------------------------------------------------------------------------------------------
+    # -- interface for the node ---------------------------------------------------------------------------------------
 
     def power_on(self, situation: Situation) -> None:
         self._ramp(situation.now_ns, 0.0, self._coasting)
@@ -128,7 +136,7 @@ class Drive(DeviceModel):
     # -- state machine ------------------------------------------------------------------------------------------------
 
     def _by_itself(self, now_ns: int, objects: Objects) -> None:
-        """What fell due since it was asked last: the self-test, the end of a ramp."""
+        """Process the events that are due since the last step: the end of the self-test, the end of a ramp."""
         if self._ready_ns is not None and now_ns >= self._ready_ns:
             self._ready_ns = None
             self._go(Cause.INITIALISED, now_ns, objects)
@@ -156,11 +164,11 @@ class Drive(DeviceModel):
                 self._go(cause, situation.now_ns, situation.objects)
 
     def _obey(self, now_ns: int, objects: Objects) -> None:
-        """A controlword came. The same one can take two arrows: switch on and enable operation in one."""
+        """Process a new controlword. One controlword can trigger two transitions: switch on and enable operation."""
         before, self._controlword = self._controlword, objects.whole(od.CONTROLWORD)
         command = command_of(self._controlword, before)
         if command is Cause.FAULT_RESET and self._disconnected(objects):
-            return  # what made it a fault is still there
+            return  # the cause of the fault is still present
         for _ in range(2):
             if command is None or self._go(command, now_ns, objects) is None:
                 break
@@ -177,7 +185,7 @@ class Drive(DeviceModel):
         return bool(self._seen & _COMMUNICATION) and objects.whole(od.ABORT_CONNECTION, default=1) == 1
 
     def _go(self, cause: Cause, now_ns: int, objects: Objects) -> Transition | None:
-        """Take the arrow that `cause` means here, if there is one, with what it does to the motor."""
+        """Take the transition that `cause` triggers in this state, if there is one, with its effect on the motor."""
         option = objects.whole(od.QUICK_STOP_OPTION, default=2)
         taken = transition(self.state, cause, stays_stopped=option >= 5)
         if taken is None:
@@ -209,7 +217,7 @@ class Drive(DeviceModel):
         return self._mode == mode and self.state is DriveState.OPERATION_ENABLED
 
     def _end_ns(self) -> int:
-        """When the present ramps are over."""
+        """Return the time at which the present ramps end."""
         return self._began_ns + round(self._motion.duration_s * NS_PER_S)
 
     def _ramp(self, now_ns: int, speed: float, acceleration: float, deceleration: float = 0.0) -> None:
@@ -217,14 +225,14 @@ class Drive(DeviceModel):
         self._move(Motion(x, v, to_speed(v, speed, acceleration, deceleration or acceleration)), now_ns)
 
     def _move(self, motion: Motion, now_ns: int) -> None:
-        """Move like this from now on. Homing that was under way is interrupted."""
+        """Start this motion now. It interrupts homing."""
         self._motion, self._began_ns, self._homing = motion, now_ns, None
 
     def _slow_down(self, option: int, now_ns: int, objects: Objects) -> None:
-        """Stop the motor by an option code (605Ah to 605Eh).
+        """Stop the motor according to an option code (605Ah to 605Eh).
 
-        0: the motor coasts. 1: the ramp of the profile. 2: the ramp of the quick stop. 3: the current limit, which is the maximum
-        torque. 4: the voltage limit, where the friction helps as well.
+        0: the motor coasts. 1: the ramp of the profile. 2: the ramp of the quick stop. 3: the current limit, which is
+        the maximum torque. 4: the voltage limit, to which the friction adds.
         """
         strongest = self._rated * objects.number(od.MAX_TORQUE, default=1000) / 1000
         rates = {
@@ -237,7 +245,7 @@ class Drive(DeviceModel):
         self._target = self._queue = None
 
     def _take_up(self, now_ns: int, objects: Objects) -> None:
-        """Operation begins or goes on: the mode has the motor."""
+        """Start or resume operation: the mode takes control of the motor."""
         self._target = self._queue = self._wanted = None
         self._acknowledge = self._limited = False
         self._homed = 0
@@ -249,13 +257,13 @@ class Drive(DeviceModel):
     def _change_mode(self, now_ns: int, objects: Objects) -> None:
         mode = objects.whole(od.MODE)
         if not _supported(mode, objects) or mode == self._mode:
-            return  # by RPDO nobody can be refused: the display keeps the mode that is
+            return  # an RPDO cannot be refused: the display keeps the present mode
         self._mode = mode
         if self.state is DriveState.OPERATION_ENABLED:
             self._take_up(now_ns, objects)
 
     def _follow(self, now_ns: int, objects: Objects) -> None:
-        """Go after the target of a mode whose target counts at once."""
+        """Follow the target in a mode whose target takes effect immediately."""
         if self._controlword & HALT:
             return
         most = _fastest(objects)
@@ -273,7 +281,7 @@ class Drive(DeviceModel):
             self._ramp(now_ns, speed, _rate(objects, up, usual), _rate(objects, down, usual))
 
     def _follow_position(self, most: float, now_ns: int, objects: Objects) -> None:
-        """Cyclic synchronous position: be at the target when the interpolation period (60C2h) is over, within the limits."""
+        """Cyclic synchronous position: reach the target at the end of the interpolation period (60C2h), within the limits."""
         place = objects.whole(od.TARGET_POSITION) + objects.whole(od.POSITION_OFFSET)
         inside = _inside(place, objects)
         self._wanted = _wrapped(inside)
@@ -298,7 +306,7 @@ class Drive(DeviceModel):
     # -- homing -------------------------------------------------------------------------------------------------------
 
     def _begin_homing(self, now_ns: int, objects: Objects) -> None:
-        """Bit 4 of the controlword begins homing when it rises, and interrupts it when it falls."""
+        """Start homing when bit 4 of the controlword rises, and interrupt it when the bit falls."""
         method, most = objects.whole(od.HOMING_METHOD), _fastest(objects)
         acceleration = _rate(objects, od.HOMING_ACCELERATION)
         if not self._controlword & NEW_SET_POINT or self._controlword & HALT:
@@ -316,7 +324,7 @@ class Drive(DeviceModel):
         self._homing = way
 
     def _arrive(self, way: Way, objects: Objects) -> None:
-        """The way of homing is over: home has the position that the home offset (607Ch) says."""
+        """Finish homing: the home position gets the value of the home offset (607Ch)."""
         self._homing, self._homed = None, BIT_12 if way.home is not None else BIT_13
         if way.home is not None:
             self._zero = way.home - objects.number(od.HOME_OFFSET)
@@ -332,7 +340,10 @@ class Drive(DeviceModel):
             self._move_to(self._target, now_ns)
 
     def _take_set_point(self, before: int, now_ns: int, objects: Objects) -> None:
-        """Profile position's handshake: bit 4 offers a set-point, bit 12 takes it until bit 4 is gone. One can wait."""
+        """Handle set-points of profile position: bit 4 offers one, bit 12 acknowledges it until bit 4 is cleared.
+
+        One can wait.
+        """
         if not self._controlword & NEW_SET_POINT:
             self._acknowledge = self._queue is not None
             return
@@ -365,11 +376,11 @@ class Drive(DeviceModel):
         self._move(Motion(x, v, ramps), now_ns)
 
     def _distance(self, position: int, x: float) -> float:
-        """From the motor's place `x` to a value of 6064h."""
+        """Return the distance from the motor's place `x` to a value of 6064h."""
         shown = x - self._zero
         return position - (shown if abs(shown) < _SPAN / 2 else _wrapped(shown))
 
-    # -- what the objects hold ----------------------------------------------------------------------------------------
+    # -- values of the objects ----------------------------------------------------------------------------------------
 
     def _outcome(self, situation: Situation, clears: tuple[int, ...]) -> Outcome:
         now_ns, objects = situation.now_ns, situation.objects
@@ -421,7 +432,7 @@ class Drive(DeviceModel):
         return word | (BIT_12 if self.state is DriveState.OPERATION_ENABLED and self._mode in od.FOLLOWED else 0)
 
     def _lags(self, now_ns: int, objects: Objects) -> bool:
-        """Whether the following error is beyond its window (6065h); FFFFFFFFh switches the supervision off."""
+        """Return whether the following error exceeds its window (6065h); FFFFFFFFh switches the supervision off."""
         window = objects.whole(od.FOLLOWING_WINDOW, default=_SPAN - 1)
         if self._wanted is None or window == _SPAN - 1:
             return False
@@ -429,26 +440,26 @@ class Drive(DeviceModel):
 
 
 def _supported(mode: int, objects: Objects) -> bool:
-    """Whether the drive has this mode, as 6502h says. 0 is no mode, which is always accepted."""
+    """Return whether the drive has this mode according to 6502h. Mode 0 ("no mode") is always accepted."""
     return mode == 0 or (mode > 0 and bool(od.mode_bits(objects) >> (mode - 1) & 1))
 
 
 def _rate(objects: Objects, index: int, usual: float = _USUAL) -> float:
-    """An acceleration object, `usual` where the node has none; 0 would never get anywhere, so 1 is the least."""
+    """Return the value of an acceleration object, or `usual` if the node has none; at least 1, because 0 would never end."""
     return max(1.0, float(objects.number(index, default=usual)))
 
 
 def _fastest(objects: Objects) -> float:
-    """The maximum profile velocity (607Fh), which bounds every mode; without it, or at 0, there is no bound."""
+    """Return the maximum profile velocity (607Fh), which limits every mode; there is no limit if it is absent or 0."""
     return float(objects.number(od.MAX_VELOCITY)) or float("inf")
 
 
 def _inside(place: int, objects: Objects) -> int:
-    """A target within the software position limits (607Dh), which hold where the lower one is below the upper one."""
+    """Limit a target to the software position limits (607Dh), which apply if the lower one is below the upper one."""
     low, high = objects.whole(od.POSITION_LIMIT, 1), objects.whole(od.POSITION_LIMIT, 2)
     return min(max(place, low), high) if low < high else place
 
 
 def _wrapped(place: float) -> int:
-    """Within the 32 bits of 6064h, which a drive that turns for ever runs round."""
+    """Wrap a position to the 32 bits of 6064h, which a continuously turning drive exceeds."""
     return (round(place) + _SPAN // 2) % _SPAN - _SPAN // 2

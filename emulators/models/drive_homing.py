@@ -1,8 +1,9 @@
-"""Homing of a CiA 402 drive: the way of each method, and where home is (CiA 402-2, IEC 61800-7-201, homing mode, 6098h).
+"""Homing of a CiA 402 drive: the path of each method and the home position (CiA 402-2, IEC 61800-7-201, 6098h).
 
-Methods 1 to 14 look for a switch and then for an index pulse, 17 to 30 do the same without the index pulse, 33 and 34 take the
-next index pulse, 35 and 37 the present place. The whole way is computed when homing begins, so that the drive stays a function of
-time. A search brakes after the edge of the switch, as a drive does that cannot know where the edge is. No objects are known here.
+Methods 1 to 14 search for a switch and then for an index pulse, 17 to 30 do the same without the index pulse, 33 and 34
+use the next index pulse, 35 and 37 the present position. The whole path is computed when homing begins, so that the
+drive stays a function of time. A search brakes after the edge of the switch, like a real drive, which cannot know where
+the edge is. This module knows no objects.
 """
 
 from __future__ import annotations
@@ -17,24 +18,25 @@ METHODS = (*range(1, 15), *range(17, 31), 33, 34, 35, 37)
 
 _LEFT, _RIGHT = -1, 1
 _LIMIT = {1: _LEFT, 2: _RIGHT}
-"""Methods on a limit switch, by the side of the switch. Home is on the other side of its edge."""
+"""Methods that use a limit switch, by the side of the switch. Home is on the other side of its edge."""
 _POSITIVE_HOME = {3: _LEFT, 4: _RIGHT}
-"""Methods on the lower edge of the home switch, as if it were active from there on; by the side of the index pulse."""
+"""Methods that use the lower edge of the home switch, as if it were active from there on; by the side of the index pulse.
+"""
 _NEGATIVE_HOME = {5: _RIGHT, 6: _LEFT}
-"""The same on the upper edge."""
+"""The same for the upper edge."""
 _BETWEEN = {
     7: (_RIGHT, "lower", _LEFT), 8: (_RIGHT, "lower", _RIGHT), 9: (_RIGHT, "upper", _LEFT), 10: (_RIGHT, "upper", _RIGHT),
     11: (_LEFT, "upper", _RIGHT), 12: (_LEFT, "upper", _LEFT), 13: (_LEFT, "lower", _RIGHT), 14: (_LEFT, "lower", _LEFT),
 }  # fmt: skip
-"""Methods between two limit switches: where the search begins, the edge of the home switch, and the side of the index pulse."""
+"""Methods between two limit switches: side where the search begins, edge of the home switch, side of the index pulse."""
 
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """Where the switches of the axis are, in increments from where the drive was switched on first.
+    """The positions of the switches of the axis, in increments from the position at the first power-on.
 
-    The limit switches are active beyond `negative` and `positive`, the home switch from `home_from` to `home_to`. An index pulse
-    comes at `index`, and each `turn` from there.
+    The limit switches are active beyond `negative` and `positive`, the home switch from `home_from` to `home_to`. Index
+    pulses are at `index` and every `turn` from there.
     """
 
     negative: float = -200_000.0
@@ -45,12 +47,12 @@ class Axis:
     turn: float = 10_000.0
 
     def inputs(self, x: float) -> int:
-        """60FDh, digital inputs: bit 0 negative limit switch, bit 1 positive limit switch, bit 2 home switch."""
-        x = round(x)  # a way ends at an edge but for the last digits
+        """Return 60FDh, digital inputs: bit 0 negative limit switch, bit 1 positive limit switch, bit 2 home switch."""
+        x = round(x)  # a path ends at an edge only up to rounding errors
         return (x <= self.negative) | (x >= self.positive) << 1 | (self.home_from <= x <= self.home_to) << 2
 
     def index_beside(self, x: float, side: int) -> float:
-        """The nearest index pulse that lies on this side of `x`, and not at it."""
+        """Return the nearest index pulse on this side of `x`, not at `x` itself."""
         turns = (x - self.index) / self.turn
         whole = math.ceil(turns) - 1 if side == _LEFT else math.floor(turns) + 1
         return self.index + whole * self.turn
@@ -58,7 +60,9 @@ class Axis:
 
 @dataclass(frozen=True, slots=True)
 class Speeds:
-    """6099h: `search` for the switch and `zero` for the edge or the index pulse, increments a second; 609Ah: `acceleration`."""
+    """6099h: `search` for the switch and `zero` for the edge or the index pulse, in increments per second; 609Ah:
+    `acceleration`.
+    """
 
     search: float
     zero: float
@@ -67,14 +71,14 @@ class Speeds:
 
 @dataclass(frozen=True, slots=True)
 class Way:
-    """How the drive moves, and the place of home; None where the search ended at a limit switch (a homing error)."""
+    """The motion of the drive and the home position; None if the search ended at a limit switch (a homing error)."""
 
     motion: Motion
     home: float | None
 
 
 def plan(method: int, axis: Axis, x: float, v: float, speeds: Speeds) -> Way:
-    """The way of a method from place `x` and speed `v`. `method` is one of `METHODS`."""
+    """Return the path of a method from place `x` and speed `v`. `method` is one of `METHODS`."""
     if method in (35, 37):
         stop = Motion(x, v, to_speed(v, 0.0, speeds.acceleration, speeds.acceleration))
         return Way(stop, stop.at(stop.duration_s)[0])
@@ -92,7 +96,7 @@ def plan(method: int, axis: Axis, x: float, v: float, speeds: Speeds) -> Way:
 
 
 def _search(method: int, axis: Axis, x: float) -> tuple[list[float], float, bool]:
-    """The edges that the search runs over in turn, the place of home, and whether the search finds it."""
+    """Return the edges that the search passes in order, the home position, and whether the search finds it."""
     if method in (33, 34):
         return [], axis.index_beside(x, _LEFT if method == 33 else _RIGHT), True
     with_index = method < 17
@@ -120,7 +124,7 @@ def _search(method: int, axis: Axis, x: float) -> tuple[list[float], float, bool
 
 
 def _until(distance: float, v: float, speeds: Speeds) -> tuple[Ramp, ...]:
-    """Run over an edge at the search speed, and brake to a stand after it. What goes the wrong way brakes first."""
+    """Return ramps that pass an edge at the search speed and then brake to a stop. A motor moving away brakes first."""
     a = speeds.acceleration
     ramps: list[Ramp] = []
     if v * distance < 0:

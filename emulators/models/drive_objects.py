@@ -1,4 +1,5 @@
-"""The objects of a CiA 402 drive that the model reads and writes, its modes of operation, and what of both a data sheet has.
+"""The objects of a CiA 402 drive that the model reads and writes, its modes of operation, and which of them a data
+sheet has.
 
 Indices, bits and codes are those of CiA 402-2 and 402-3 (IEC 61800-7-201, -301).
 """
@@ -41,7 +42,7 @@ NEEDS = {
     CYCLIC_SPEED: (TARGET_VELOCITY,),
     CYCLIC_TORQUE: (TARGET_TORQUE,),
 }
-"""Modes of operation of this model (6060h), and the objects without which there is no such mode."""
+"""Modes of operation of this model (6060h), and the objects that each mode requires."""
 
 FOLLOWED = {
     PROFILE_SPEED: {TARGET_VELOCITY, ACCELERATION, DECELERATION},
@@ -49,7 +50,7 @@ FOLLOWED = {
     CYCLIC_SPEED: {TARGET_VELOCITY, VELOCITY_OFFSET},
     CYCLIC_TORQUE: {TARGET_TORQUE, TORQUE_OFFSET},
 }
-"""Modes whose target the motor follows at once, and the objects that make it."""
+"""Modes whose target the motor follows immediately, and the objects that determine the target."""
 
 OPTIONS = {
     ABORT_CONNECTION: range(4),
@@ -60,13 +61,13 @@ OPTIONS = {
     FAULT_OPTION: range(5),
     HOMING_METHOD: (0, *METHODS),
 }
-"""Codes that the model has; a client that writes another one gets an abort. 0 is no homing method."""
+"""Codes that the model supports; a client that writes a different one gets an abort. 0 means no homing method."""
 
 
 def mode_bits(objects: Objects) -> int:
-    """6502h: the modes that this drive has, by bit (mode - 1): those of the data sheet that the model has as well.
+    """Return 6502h: the modes of this drive, by bit (mode - 1), which are the data sheet's modes that the model supports.
 
-    A data sheet that gives 6502h no value says nothing of modes: then they are those that its objects allow.
+    If the data sheet gives 6502h no value, the modes are those that its objects allow.
     """
     have = sum(1 << mode - 1 for mode, needed in NEEDS.items() if all(objects.has(index) for index in needed))
     said = int(objects.factory(SUPPORTED_MODES))
@@ -74,16 +75,16 @@ def mode_bits(objects: Objects) -> int:
 
 
 def missing_modes(dictionary: Dictionary) -> list[int]:
-    """The modes that a data sheet's 6502h promises and this model lacks, or whose objects the data sheet lacks."""
+    """Return the modes in the data sheet's 6502h that this model lacks, or whose objects the data sheet lacks."""
     entry = dictionary.entry(SUPPORTED_MODES, 0)
     if entry is None or not codec.is_integer(entry.data_type):
         return []
-    said = int(codec.decode(entry.data_type, entry.default)) & 0xFFFF  # the upper half is the maker's
+    said = int(codec.decode(entry.data_type, entry.default)) & 0xFFFF  # the upper half is manufacturer-specific
     modes = [bit + 1 for bit in range(16) if said >> bit & 1]
     return [m for m in modes if m not in NEEDS or any(dictionary.entry(index, 0) is None for index in NEEDS[m])]
 
 
 def methods_of(objects: Objects) -> dict[tuple[int, int], int]:
-    """60E3h: the homing methods of the data sheet; 0 in the place of one that the model lacks."""
+    """Return 60E3h: the homing methods of the data sheet, with 0 in place of a method that the model lacks."""
     said = {sub: int(objects.factory(SUPPORTED_METHODS, sub)) for sub in objects.channels(SUPPORTED_METHODS)}
     return {(SUPPORTED_METHODS, sub): method if method in METHODS else 0 for sub, method in said.items()}

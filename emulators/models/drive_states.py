@@ -1,7 +1,7 @@
 """The state machine of a CiA 402 drive, as a table.
 
-A power drive system goes through these states (CiA 402-2, 7.1; IEC 61800-7-201, figure "FSA"). The controlword 6040h asks,
-the statusword 6041h answers. Fifteen transitions and a sixteenth; whatever else is asked for is ignored, without an answer::
+A power drive system goes through these states (CiA 402-2, 7.1; IEC 61800-7-201, figure "FSA"). The controlword 6040h commands
+a transition, the statusword 6041h reports the state. There are sixteen transitions; all other commands are ignored::
 
     NOT READY --1--> SWITCH ON DISABLED --2--> READY TO SWITCH ON --3--> SWITCHED ON --4--> OPERATION ENABLED
                             ^   ^ <--------7----------/  ^ <------6--------/    ^ <---------5--------/ | |
@@ -12,7 +12,7 @@ the statusword 6041h answers. Fifteen transitions and a sixteenth; whatever else
                             \\--------- QUICK STOP ACTIVE <-------------------------------------------- /  (16: back)
     any --13--> FAULT REACTION ACTIVE --14--> FAULT --15--> SWITCH ON DISABLED
 
-Only that is here: no motion, no objects, no time.
+This module contains only the table: no motion, no objects, no time.
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ class DriveState(Enum):
 
 
 STATE_MASK = 0x6F
-"""Bits 0 to 3, 5 and 6 of the statusword. Bit 5 is no part of the pattern in states where the standard leaves it open."""
+"""Bits 0 to 3, 5 and 6 of the statusword. Bit 5 is not part of the pattern in states where the standard leaves it open."""
 
 
 class Cause(Enum):
-    """What makes the drive leave a state: the commands of the controlword, and what happens inside."""
+    """The causes of a transition: the commands of the controlword, and events inside the drive."""
 
     SHUTDOWN = "shutdown"
     SWITCH_ON = "switch on"  # from OPERATION ENABLED the same bits are "disable operation"
@@ -70,7 +70,10 @@ class Bit(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Transition:
-    """One arrow. `number` is the standard's; 1, 12, 13 and 14 the drive does by itself, 12 a command can do as well."""
+    """One transition, with the standard's `number`.
+
+    The drive takes 1, 12, 13 and 14 by itself; a command can also cause 12.
+    """
 
     number: int
     source: DriveState
@@ -106,9 +109,9 @@ _BY_CAUSE = {(t.source, t.cause): t for t in TRANSITIONS}
 
 
 def transition(state: DriveState, cause: Cause, *, stays_stopped: bool = False) -> Transition | None:
-    """The arrow that `cause` takes from `state`; None where there is none, and nothing happens.
+    """Return the transition that `cause` triggers in `state`; None if there is none, so that nothing happens.
 
-    `stays_stopped`: the quick stop option code is 5 to 8, so that the drive stays in QUICK STOP ACTIVE once it stands.
+    `stays_stopped`: the quick stop option code is 5 to 8, so the drive stays in QUICK STOP ACTIVE after it has stopped.
     """
     found = _BY_CAUSE.get((state, cause))
     if found is not None and found.number == 16 and not stays_stopped:
@@ -119,9 +122,9 @@ def transition(state: DriveState, cause: Cause, *, stays_stopped: bool = False) 
 
 
 def command_of(controlword: int, before: int) -> Cause | None:
-    """The command in a controlword, `before` being the one that it replaces (fault reset is an edge of bit 7).
+    """Return the command in a controlword; `before` is the previous controlword (fault reset is an edge of bit 7).
 
-    While bit 7 is held the word is no other command (CiA 402-2, table "Command coding").
+    While bit 7 is set, the word is no other command (CiA 402-2, table "Command coding").
     """
     if controlword & Bit.FAULT_RESET:
         return None if before & Bit.FAULT_RESET else Cause.FAULT_RESET

@@ -1,6 +1,6 @@
-"""A CANopen device as its profile describes it: data sheet, model, recording and journal put together to one node.
+"""Builds a CANopen node from a profile: data sheet, model, recording and journal.
 
-It must never know buses nor clocks: the player that it is given has its start.
+It must never know buses or clocks: the player that it is given has its own start time.
 """
 
 from __future__ import annotations
@@ -29,8 +29,11 @@ from fieldtwin.gateway.core.profile import DeviceProfile
 
 @dataclass(frozen=True, slots=True)
 class NodeOptions:
-    """What a user may state about a node beyond its files. `model` is a number of `by_profile.MODELS` as text, or `NO_MODEL`;
-    with None, object 1000h decides. Without `parameter_values` the node starts with the DefaultValues of its data sheet."""
+    """Settings of a node that the user may give in addition to its files.
+
+    `model` is a number of `by_profile.MODELS` as text, or `NO_MODEL`; with None, object 1000h decides. Without
+    `parameter_values` the node starts with the DefaultValues of its data sheet.
+    """
 
     model: str | None = None
     parameter_values: bool = True
@@ -38,7 +41,10 @@ class NodeOptions:
 
 @dataclass(frozen=True, slots=True)
 class EmulatedNode:
-    """The node and what it held, by tag. `distortions`: what its objects hold instead. `remarks`: what does not fit."""
+    """The node and the journal of its values, by tag.
+
+    `distortions` are the value faults of its objects. `remarks` list settings that do not fit the node.
+    """
 
     node: CanopenNode
     journal: HeldJournal
@@ -54,12 +60,12 @@ def emulated_node(
     identity: Mapping[str, str] | None = None,
     options: NodeOptions | None = None,
 ) -> EmulatedNode:
-    """The node of a CANopen profile, playing signals or what is in a log of its bus. Without a `recording` it holds what the data
-    sheet says and what its model does.
+    """Return the node of a CANopen profile, which plays signals or a log of its bus.
 
-    `identity` are values by tag that this one device has instead of the data sheet's. Raises `FileInvalid` for a data sheet
-    or log that cannot be read and for a tag whose object the data sheet lacks, `UsageError` for an identity that is no number and
-    for a log without this node.
+    Without a `recording` it holds the values of the data sheet and those of its model. `identity` gives values by tag
+    that this device has instead of the data sheet's. Raises `FileInvalid` for a data sheet or log that cannot be read
+    and for a tag whose object the data sheet lacks, and `UsageError` for an identity that is not a number and for a log
+    without this node.
     """
     if profile.eds_path is None:
         raise UsageError("a node needs a data sheet", where=profile.path, expected="`eds: FILE.eds` in the profile")
@@ -72,7 +78,9 @@ def emulated_node(
     context = NodeContext(model=model, held=held, factory=own)
     if recording is not None and not isinstance(recording, CanLog):
         played = PlayedObjects(tags, dictionary, recording)
-        unfed = [tag for tag in tags if tag.name not in recording.names]  # the others are distorted as they are played
+        unfed = [
+            tag for tag in tags if tag.name not in recording.names
+        ]  # the other tags are distorted when they are played
         distorted = DistortedObjects(unfed, dictionary, played, has_model=model is not None, named=True)
         distorted.distortions = played.distortions
     else:
@@ -84,14 +92,17 @@ def emulated_node(
     context = replace(context, source=distorted, distort=distorted.over if model is not None else None)
     node = CanopenNode(dictionary, node_id, context)
     distorted.data = node.data
-    for tag in tags:  # what nobody plays is held as well: by the data sheet
+    for tag in tags:  # values of the data sheet, for tags that no source provides, are journalled too
         if tag.object is not None and node.data.has(*tag.object):
             held({tag.object: node.data.get(*tag.object)}, now_ns)
     return EmulatedNode(node, held.journal, distortions, node_remarks(dictionary, node_id, model, options))
 
 
 def node_remarks(dictionary: Dictionary, node_id: int, model: DeviceModel | None, options: NodeOptions) -> list[Remark]:
-    """What does not fit this node; a model that the user chose not to have is not missed."""
+    """Return the settings that do not fit this node.
+
+    A model that the user chose to leave out is not reported as missing.
+    """
     found = remarks(dictionary, node_id, has_model=model is not None or options.model == NO_MODEL)
     if isinstance(model, Drive) and (missing := missing_modes(dictionary)):
         listed = ", ".join(map(str, missing))

@@ -1,8 +1,9 @@
 """A CiA 406 absolute rotary encoder: code sequence, scaling, preset, and the speed of the shaft.
 
-Objects after CiA 406 v3.2 for multi-turn encoders, as encoder makers' manuals print them: operating parameters 6000h, measuring
-units 6001h and total range 6002h, preset 6003h, position 6004h, speed 6030h, offset 6509h. The recording plays 6004h as it was
-with the factory's settings: scaling off, clockwise, no preset. That is the shaft's place in steps of 6501h a turn.
+Objects follow CiA 406 v3.2 for multi-turn encoders, as printed in encoder makers' manuals: operating parameters 6000h,
+measuring units 6001h and total range 6002h, preset 6003h, position 6004h, speed 6030h, offset 6509h. The recording
+plays 6004h as recorded with the factory settings (scaling off, clockwise, no preset), which is the position of the
+shaft in steps, 6501h per turn.
 """
 
 from __future__ import annotations
@@ -20,11 +21,11 @@ COUNTER_CLOCKWISE, SCALING = 1 << 0, 1 << 2
 """Bits of 6000h; 6500h shows the same two."""
 
 SPEED_OVER_NS = 20 * NS_PER_MS
-"""Time over which the speed is taken at least."""
+"""The shortest time over which the speed is measured."""
 
 
 class Encoder(DeviceModel):
-    """The shaft's place is the recording's. Speed is in turns a minute, taken over 20 ms or more."""
+    """An encoder whose shaft follows the recording. Its speed is in turns per minute, measured over 20 ms or more."""
 
     def __init__(self) -> None:
         self._offset = 0
@@ -62,18 +63,18 @@ class Encoder(DeviceModel):
     def _take_speed(self, raw: int, situation: Situation) -> None:
         now_ns, whole = situation.now_ns, _range(situation.objects)
         if self._last is None or situation.written:
-            self._last = now_ns, raw  # settings may have moved the scale: nothing to compare with
+            self._last = now_ns, raw  # settings may have changed the scale, so there is nothing to compare with
             return
         then_ns, then = self._last
         if now_ns - then_ns < SPEED_OVER_NS:
             return
-        way = (raw - then + whole // 2) % whole - whole // 2  # the short way round
+        way = (raw - then + whole // 2) % whole - whole // 2  # the shorter way round
         self._speed = way / _units_per_turn(situation.objects) * 60 * NS_PER_S / (now_ns - then_ns)
         self._last = now_ns, raw
 
 
 def _raw_position(shaft: int, objects: Objects) -> int:
-    """The place in the units that are set, before the preset's offset."""
+    """Return the position in the configured units, without the preset's offset."""
     parameters, physical = objects.whole(PARAMETERS), _physical_range(objects)
     shaft %= physical
     if parameters & COUNTER_CLOCKWISE:
@@ -95,7 +96,7 @@ def _physical_range(objects: Objects) -> int:
 
 
 def _range(objects: Objects) -> int:
-    """Positions run from 0 to one less than this."""
+    """Return the range: positions run from 0 to one less than this."""
     if objects.whole(PARAMETERS) & SCALING:
         return max(1, objects.whole(TOTAL_RANGE, default=_physical_range(objects)))
     return _physical_range(objects)

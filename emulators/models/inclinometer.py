@@ -1,8 +1,9 @@
-"""A CiA 410 inclinometer: inversion, and the offsets that make a slope of what the cell measures.
+"""A CiA 410 inclinometer: inversion, and the offsets that turn the measured value into a slope.
 
-Objects after CiA 410 v1.2 as makers' manuals print them: operating parameter 6011h, preset 6012h, offset 6013h, differential
-offset 6014h of the longitudinal slope 6010h, and the same from 6021h for the lateral 6020h. All in units of 6000h. The recording
-plays the slopes as they were with the factory's settings, which is what the cell measures.
+Objects follow CiA 410 v1.2 as printed in makers' manuals: operating parameter 6011h, preset 6012h, offset 6013h,
+differential offset 6014h of the longitudinal slope 6010h, and the same from 6021h for the lateral 6020h. All are in
+units of 6000h. The recording plays the slopes as recorded with the factory settings, which are the values that the cell
+measures.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from fieldtwin.emulators.canopen.dictionary import Key
 
 SLOPES = (0x6010, 0x6020)
 _PARAMETER, _PRESET, _OFFSET, _DIFFERENTIAL = 1, 2, 3, 4
-"""Where a slope's settings stand behind it."""
+"""Index offsets of a slope's settings from the index of the slope."""
 
 _KEYS = tuple((slope, (slope, 0), (slope + _PRESET, 0), (slope + _OFFSET, 0)) for slope in SLOPES)
 
@@ -21,7 +22,7 @@ INVERTED, SCALED = 1, 2
 
 
 class Inclinometer(DeviceModel):
-    """One axis or two, 16 bits."""
+    """An inclinometer with one axis or two, 16 bits."""
 
     def __init__(self) -> None:
         self._offsets: dict[int, int] = {}

@@ -1,7 +1,8 @@
-"""A CiA 401 I/O module: polarity, input masks, interrupts of inputs, and outputs that know what to do when nobody commands them.
+"""A CiA 401 I/O module: polarity, input masks, interrupts of inputs, and output values for errors.
 
-Objects after CiA 401-1 v3, as makers' manuals print them: digital inputs 6000h to 6008h, digital outputs 6200h to 6207h,
-analogue inputs 6401h and 6421h to 6426h, analogue outputs 6411h, 6443h and 6444h. The recording plays 6000h and 6401h.
+Objects follow CiA 401-1 v3, as printed in makers' manuals: digital inputs 6000h to 6008h, digital outputs 6200h to
+6207h, analogue inputs 6401h and 6421h to 6426h, analogue outputs 6411h, 6443h and 6444h. The recording plays 6000h and
+6401h.
 """
 
 from __future__ import annotations
@@ -23,11 +24,11 @@ AT_UPPER, BELOW_LOWER, MOVED, MOVED_DOWN, MOVED_UP = 1, 2, 4, 8, 16
 
 HEARTBEAT_LOST = 0x8130
 SCAN_NS = 10 * NS_PER_MS
-"""How often the module looks at its inputs while it is OPERATIONAL."""
+"""Interval at which the module scans its inputs while it is OPERATIONAL."""
 
 
 class IoModule(DeviceModel):
-    """`digital_outputs` and `analogue_outputs` are what the terminals have, by channel group (subindex)."""
+    """An I/O module. `digital_outputs` and `analogue_outputs` hold the terminal values by channel group (subindex)."""
 
     def __init__(self) -> None:
         self.digital_outputs: dict[int, int] = {}
@@ -49,7 +50,7 @@ class IoModule(DeviceModel):
         return Outcome(states, readings, (), situation.now_ns + SCAN_NS if scanning else None)
 
     def _digital(self, situation: Situation) -> Iterator[tuple[Key, int, bool]]:
-        """Value of each group of eight, and whether the change in it is one that the masks let interrupt."""
+        """Yield each group of eight inputs with its value, and whether the masks let its change cause an interrupt."""
         objects = situation.objects
         enabled = objects.number(INTERRUPT_ENABLE, default=1)
         for sub in objects.channels(DIGITAL_IN):
@@ -75,7 +76,7 @@ class IoModule(DeviceModel):
             yield key, value, event
 
     def _interrupts(self, sub: int, value: int, objects: Objects) -> bool:
-        """Whether the limits hold and the value moved far enough since it was told last."""
+        """Return whether the limit conditions hold and the value has moved far enough since its last interrupt."""
         triggers = objects.whole(TRIGGERS, sub, default=AT_UPPER | BELOW_LOWER | MOVED)
         moved = value - self._told.get(sub, value)
         limits = triggers & (AT_UPPER | BELOW_LOWER)
@@ -94,7 +95,7 @@ class IoModule(DeviceModel):
         return far and bool(at_limit or not limits)
 
     def _set_outputs(self, situation: Situation) -> None:
-        """In OPERATIONAL as commanded; after NMT stop, or with the consumer's heartbeat lost, as 6206h and 6443h say."""
+        """Set the outputs: as commanded in OPERATIONAL; by 6206h and 6443h after NMT stop or a lost consumer heartbeat."""
         objects = situation.objects
         failed = situation.nmt is NmtState.STOPPED or HEARTBEAT_LOST in situation.errors
         for sub in objects.channels(DIGITAL_OUT):

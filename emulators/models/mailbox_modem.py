@@ -1,8 +1,9 @@
 """A pair of modems with mailboxes in holding registers, and the link between them (SPEC ruling 17).
 
-Each modem is a register bank of its own: the plant's on one socket, the far one on another. What one side writes into its outbox
-travels over the link and appears in the other side's inbox when that is free. A sequence that was taken before is taken
-as the same message again and not sent twice. Functions of time: links are advanced when somebody looks.
+Each modem has its own register bank: the plant's on one socket, the remote one on a second. A message that one side
+writes into its outbox travels over the link and appears in the other side's inbox when that is free. A repeated
+sequence number is treated as the same message and not sent twice. Functions of time: a link is advanced when it is read
+or written.
 """
 
 from __future__ import annotations
@@ -21,14 +22,17 @@ from fieldtwin.gateway.core.profile import Box, DeviceProfile, RegisterRange, Ta
 
 LAST_SEQUENCE = 0xFFFF
 RECEIVED = 64
-"""Messages that wait for a free inbox; the link waits beyond that."""
+"""Messages that wait for a free inbox; beyond that number the link waits."""
 
 
 _LINK = "link_state", "link_sent", "link_received", "link_resent"
 
 
 class MailboxModem(RegisterBank):
-    """One modem. `outgoing` carries what it sends, `incoming` what it receives; `identity` is what others of its tags hold."""
+    """One modem.
+
+    `outgoing` carries what it sends, `incoming` what it receives; `identity` gives the values of its other tags.
+    """
 
     def __init__(
         self, profile: DeviceProfile, outgoing: Outgoing, incoming: Incoming, identity: Mapping[str, str] | None = None
@@ -41,23 +45,23 @@ class MailboxModem(RegisterBank):
         self._tags = profile.tags
         self._cells = MapBank(_spans(profile), self._on_write)
         self._told = (-1, -1, -1, -1)
-        """The counters of the link as its registers show them (`_LINK`); as made, none."""
+        """The link's counters as last written to its registers (`_LINK`); none at first."""
         self._received: deque[bytes] = deque(maxlen=RECEIVED)
         self._sequence = 0
         self._accepted = 0
         self._pending: bytes | None = None
         for name, text in (identity or {}).items():
             self._state(name, text)
-        for tag in self._tags.values():  # what no identity states is empty or 0, and is read as such
+        for tag in self._tags.values():  # tags without an identity are empty or 0, and are read as such
             if tag.readable and tag.name not in (identity or {}):
                 self._note(tag, 0)
 
     def _note(self, tag: Tag, now_ns: int) -> None:
-        """Journal what the registers of `tag` hold now."""
+        """Journal the present value of the registers of `tag`."""
         self.journal.note(tag.name, bytes_of(tag, cells_held(tag, self._cells.peek)), now_ns)
 
     def _state(self, name: str, text: str) -> None:
-        """A tag that never changes."""
+        """Set a tag that never changes."""
         tag = self._tags[name]
         try:
             words = encode(text if tag.is_text else float(text), tag.type, tag.order, registers=tag.registers.count)
@@ -74,7 +78,7 @@ class MailboxModem(RegisterBank):
         self._cells.check_read(table, address, count, now_ns)
 
     def peek(self, table: Table, address: int) -> int:
-        """What a cell holds, without anything that happens at a read."""
+        """Return the value of a cell without the side effects of a read."""
         return self._cells.peek(table, address)
 
     def write(self, table: Table, address: int, values: Sequence[int], now_ns: int) -> None:
@@ -85,7 +89,7 @@ class MailboxModem(RegisterBank):
         self.advance(now_ns)
 
     def advance(self, now_ns: int) -> None:
-        """Hand a pending message to the link, take what arrived, fill a free inbox, refresh the counters."""
+        """Hand a pending message to the link, take received messages, fill a free inbox, refresh the counters."""
         if self._pending is not None and self._outgoing.submit(self._pending, now_ns):
             self._pending = None
             self._poke(self._outbox.ack, self._accepted)
@@ -98,7 +102,7 @@ class MailboxModem(RegisterBank):
             self._tell(counters, now_ns)
 
     def _tell(self, counters: tuple[int, int, int, int], now_ns: int) -> None:
-        """The link's counters, which changed, into the registers that show them."""
+        """Write the link's changed counters into their registers."""
         before, self._told = self._told, counters
         for name, number, told in zip(_LINK, counters, before, strict=True):
             tag = self._tags.get(name)
@@ -108,7 +112,7 @@ class MailboxModem(RegisterBank):
                 self.journal.note(name, bytes_of(tag, words), now_ns)
 
     def _on_write(self, table: Table, address: int, values: tuple[int, ...], now_ns: int) -> None:
-        """Sequence, length and payload come in one write, from the outbox's first register."""
+        """Check that sequence, length and payload come in one write, from the outbox's first register."""
         box = self._outbox.at
         if table != box.table or not (address < box.end and address + len(values) > box.address):
             return
@@ -125,7 +129,7 @@ class MailboxModem(RegisterBank):
         at = self._outbox.at
         sequence, length = self._cells.peek("holding", at.address), self._cells.peek("holding", at.address + 1)
         if sequence == self._accepted:
-            return  # the same message again: its writer did not see our reply
+            return  # the same message again: its sender did not receive the reply
         first = at.address + 2
         words = [self._cells.peek("holding", a) for a in range(first, first + (length + 1) // 2)]
         self._accepted = sequence
@@ -164,7 +168,11 @@ class ModemPair:
 
 
 def _spans(profile: DeviceProfile) -> list[Span]:
-    """The mailboxes' cells and the tags': the inbox is the device's, its acknowledge register and the outbox the master's."""
+    """Return the cells of the mailboxes and of the tags.
+
+    The device writes the inbox and the outbox's acknowledge register; the client writes the outbox and the inbox's
+    acknowledge register.
+    """
 
     def box(b: Box, message: str, ack: str) -> list[Span]:
         return [

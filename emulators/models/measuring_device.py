@@ -1,8 +1,8 @@
-"""A CiA 404 measuring device: a field value, the line through two points that makes a process value of it, and taring.
+"""A CiA 404 measuring device: a field value, its linear conversion to a process value through two points, and taring.
 
-Objects after CiA 404 (2002, v1.2), analogue input block, as sensor makers' manuals print them. The field value 6100h is what
-the cell gives, the process value 6130h is in the unit of 6131h, 7130h and 9130h are the same as integers with 6132h digits
-behind the point. The recording plays one of the three as it was with the factory's scaling.
+Objects follow CiA 404 (2002, v1.2), analogue input block, as printed in sensor makers' manuals. The field value 6100h
+is the output of the cell, the process value 6130h is in the unit of 6131h, and 7130h and 9130h are the same value as
+integers with 6132h decimal digits. The recording plays one of the three as recorded with the factory scaling.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ SPAN_START, SPAN_END, STATUS = 0x6148, 0x6149, 0x6150
 PROCESS_INTEGER_16, PROCESS_INTEGER_32 = 0x7130, 0x9130
 
 ZERO = int.from_bytes(b"zero", "little")
-"""What has to be written to 6125h: the four letters, so that no accident tares a scale."""
+"""The value that must be written to 6125h: the four letters, so that a scale is not tared by accident."""
 
 OFF, NORMAL = 0, 1
 NOT_VALID, ABOVE_SPAN, BELOW_SPAN = 1, 2, 4
@@ -30,7 +30,7 @@ NOT_VALID, ABOVE_SPAN, BELOW_SPAN = 1, 2, 4
 
 
 class MeasuringDevice(DeviceModel):
-    """As many channels as 6130h has."""
+    """A measuring device with as many channels as 6130h has."""
 
     def __init__(self) -> None:
         self._offsets: dict[int, float] = {}
@@ -44,7 +44,7 @@ class MeasuringDevice(DeviceModel):
             return Abort.NOT_STORED
         points = {POINT_1_FIELD: POINT_2_FIELD, POINT_2_FIELD: POINT_1_FIELD}
         if index in points and value == objects.number(points[index], sub):
-            return Abort.INCOMPATIBLE  # two points above one another are no line
+            return Abort.INCOMPATIBLE  # two points with the same field value do not define a line
         return None
 
     def step(self, situation: Situation) -> Outcome:
@@ -80,7 +80,7 @@ class MeasuringDevice(DeviceModel):
 
 
 def _played(sub: int, situation: Situation) -> float:
-    """The recorded process value: as a number, or as one of the integers with the factory's digits."""
+    """Return the recorded process value, from a number or from one of the integers with the factory's digits."""
     if (PROCESS_VALUE, sub) in situation.played:
         return float(situation.played[PROCESS_VALUE, sub])
     for index in (PROCESS_INTEGER_32, PROCESS_INTEGER_16):
@@ -90,7 +90,7 @@ def _played(sub: int, situation: Situation) -> float:
 
 
 def _field_value(process: float, sub: int, objects: Objects) -> float:
-    """What the cell gave when the device, as it left the factory, showed `process`."""
+    """Return the field value for which the device with its factory settings showed `process`."""
     f1, p1, f2, p2 = _line(sub, objects.factory)
     return process if p1 == p2 else f1 + (process - p1) * (f2 - f1) / (p2 - p1)
 
@@ -101,14 +101,14 @@ def _process_value(field: float, sub: int, objects: Objects) -> float:
 
 
 def _line(sub: int, number: Callable[[int, int, Number], Number]) -> tuple[float, float, float, float]:
-    """The two points; without such objects, field value and process value are the same."""
+    """Return the two points. Without such objects, field value and process value are the same."""
     first = float(number(POINT_1_FIELD, sub, 0.0)), float(number(POINT_1_PROCESS, sub, 0.0))
     second = float(number(POINT_2_FIELD, sub, 1.0)), float(number(POINT_2_PROCESS, sub, 1.0))
     return *first, *second
 
 
 def _status(process: float, sub: int, objects: Objects) -> int:
-    """6150h: nothing to show, or outside the measuring span, where there is one."""
+    """Return 6150h: no valid value, or a value outside the measuring span if there is one."""
     if not math.isfinite(process):
         return NOT_VALID
     low, high = float(objects.number(SPAN_START, sub)), float(objects.number(SPAN_END, sub))

@@ -1,7 +1,7 @@
-"""A point that moves with piecewise constant acceleration: where it is, and the ramps that bring it to a speed or a place.
+"""A point that moves with piecewise constant acceleration: its place, and the ramps that bring it to a speed or a place.
 
-Closed forms, so that it can be asked at any time and never drifts. Units are the caller's, time is in seconds. It knows no
-drive and no clock.
+Closed forms, which can be evaluated at any time and never drift. Units are the caller's, time is in seconds. It knows
+no drive and no clock.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ Ramp = tuple[float, float]
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """From place `x` with speed `v` through `ramps`; then on with the speed that is reached."""
+    """A motion from place `x` with speed `v` through `ramps`, which then continues with the final speed."""
 
     x: float = 0.0
     v: float = 0.0
@@ -24,11 +24,11 @@ class Motion:
 
     @property
     def duration_s(self) -> float:
-        """How long the ramps take."""
+        """The total duration of the ramps in seconds."""
         return sum(duration for duration, _ in self.ramps)
 
     def at(self, t_s: float) -> tuple[float, float]:
-        """Place and speed `t_s` after the start."""
+        """Return place and speed `t_s` seconds after the start."""
         x, v = self.x, self.v
         for duration, a in self.ramps:
             t = min(t_s, duration)
@@ -40,7 +40,7 @@ class Motion:
 
 
 def to_speed(v: float, target: float, acceleration: float, deceleration: float) -> tuple[Ramp, ...]:
-    """From speed `v` to `target`. Through zero it brakes first. Accelerations are above 0."""
+    """Return ramps from speed `v` to `target`. A change of direction brakes first. Accelerations are above 0."""
     ramps: list[Ramp] = []
     if v * target < 0:
         ramps.append((abs(v) / deceleration, -math.copysign(deceleration, v)))
@@ -52,9 +52,9 @@ def to_speed(v: float, target: float, acceleration: float, deceleration: float) 
 
 
 def to_place(distance: float, v: float, cruise: float, acceleration: float, deceleration: float) -> tuple[Ramp, ...]:
-    """Over `distance` from speed `v` to a stand, no faster than `cruise`. All three rates are above 0.
+    """Return ramps that cover `distance` from speed `v` to a stop, no faster than `cruise`. All three rates are above 0.
 
-    What goes the wrong way, or too fast to stop in time, brakes to a stand first and comes back.
+    A point that moves in the wrong direction, or too fast to stop in time, brakes to a stop first and returns.
     """
     ramps: list[Ramp] = []
     braking = v * abs(v) / (2 * deceleration)
@@ -69,7 +69,7 @@ def to_place(distance: float, v: float, cruise: float, acceleration: float, dece
         ramps.append(((speed - cruise) / deceleration, -sign * deceleration))
         way -= (speed * speed - cruise * cruise) / (2 * deceleration)
         speed = cruise
-    # Up to the peak speed and down again: what is under the two ramps is the way.
+    # Up to the peak speed and down again: the area under the two ramps is the distance.
     peak_squared = (2 * acceleration * deceleration * way + deceleration * speed * speed) / (
         acceleration + deceleration
     )
@@ -88,9 +88,10 @@ def _positive(ramps: Sequence[Ramp]) -> list[Ramp]:
 
 
 def by_torque(v: float, acceleration: float, friction: float, fastest: float) -> tuple[Ramp, ...]:
-    """From speed `v` under a torque that alone gives `acceleration`, against dry `friction`, both in units a second squared.
+    """Return ramps from speed `v` under a torque that alone gives `acceleration`, against dry `friction`.
 
-    A torque that the friction outweighs moves nothing that stands. The speed stays within `fastest`, which is above 0.
+    Both are in units per second squared. A torque that is weaker than the friction does not move a motor at rest. The
+    speed stays within `fastest`, which is above 0.
     """
     ramps: list[Ramp] = []
     if abs(v) > fastest:

@@ -1,8 +1,9 @@
-"""A slow, lossy link that delivers every packet once and in order: the sound between two modems.
+"""A slow, lossy link between two modems that delivers every packet once and in order.
 
-Packets go one after the other at `bytes_per_s`, arrive `latency_s` after their last byte, and are lost with probability
-`loss`, which the sender learns from a missing acknowledgement and sends again. So nothing is lost, only late; unless the modems
-are told to be worse than that (`Untamed`). Seeded, and a function of time: when a packet arrives is known when it is sent.
+Packets are sent one after the other at `bytes_per_s`, arrive `latency_s` after their last byte, and are lost with
+probability `loss`. The sender detects a loss by the missing acknowledgement and resends. Packets are therefore late but
+never lost, unless the link is configured to be worse (`Untamed`). Seeded, and a function of time: the arrival of a
+packet is known when it is sent.
 """
 
 from __future__ import annotations
@@ -15,39 +16,40 @@ from typing import Protocol
 from fieldtwin.gateway.core.clock import NS_PER_S
 
 OVERHEAD_BYTES = 8
-"""Preamble, address and check sum of a packet."""
+"""Preamble, address and checksum of a packet."""
 MAX_RESENDS = 50
 
 
 class Outgoing(Protocol):
-    """What takes a modem's packets away."""
+    """The interface that takes packets from a modem."""
 
     sent: int
     resent: int
 
     def submit(self, payload: bytes, now_ns: int) -> bool:
-        """Send `payload`; False when there is no room."""
+        """Send `payload`; return False if there is no room."""
         ...
 
 
 class Incoming(Protocol):
-    """What brings a modem its packets."""
+    """The interface that delivers packets to a modem."""
 
     delivered: int
 
     def arrived(self, now_ns: int) -> bytes | None:
-        """The next packet that has arrived by `now_ns`, or None. Taking it removes it."""
+        """Return the next packet that has arrived by `now_ns` and remove it, or return None."""
         ...
 
 
 class ModemEnd(Outgoing, Incoming, Protocol):
-    """Both, for one modem."""
+    """Both directions, for one modem."""
 
 
 @dataclass(frozen=True, slots=True)
 class Untamed:
-    """What the modems do not make up for, as probabilities of each packet: it never arrives, arrives twice, arrives before the
-    one that was sent before it."""
+    """Losses that the modems do not repair, as probabilities per packet: it never arrives, it arrives twice, or it
+    arrives before its predecessor.
+    """
 
     lost: float = 0.0
     repeated: float = 0.0
@@ -84,7 +86,7 @@ class PacketLink:
         return len(self._under_way) >= self._capacity
 
     def submit(self, payload: bytes, now_ns: int) -> bool:
-        """Send `payload`; False when the link has no room."""
+        """Send `payload`; return False if the link has no room."""
         if self.full:
             return False
         airtime_ns = round((len(payload) + OVERHEAD_BYTES) / self._bytes_per_s * NS_PER_S)
@@ -115,7 +117,7 @@ class PacketLink:
         return probability > 0 and self._random.random() < probability
 
     def arrived(self, now_ns: int) -> bytes | None:
-        """The next packet that has arrived by `now_ns`, or None. Taking it removes it."""
+        """Return the next packet that has arrived by `now_ns` and remove it, or return None."""
         if self._under_way and self._under_way[0][0] <= now_ns:
             self.delivered += 1
             return self._under_way.popleft()[1]
@@ -123,5 +125,5 @@ class PacketLink:
 
     @property
     def waiting(self) -> bool:
-        """True while something is under way or arrived and not taken."""
+        """True while a packet is under way, or has arrived and not been taken."""
         return bool(self._under_way)

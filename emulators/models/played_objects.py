@@ -1,4 +1,4 @@
-"""Recorded signals as CANopen objects: what a node's TPDOs and SDO uploads read at the emulator's clock."""
+"""Recorded signals as CANopen objects, read by a node's TPDOs and SDO uploads at the emulator's clock."""
 
 from __future__ import annotations
 
@@ -18,17 +18,20 @@ Key = tuple[int, int]
 
 
 class PlayedObjects:
-    """A node's value source: called with the time, returns raw values by (index, subindex).
+    """A node's value source: called with the time, it returns raw values by (index, subindex).
 
-    Signals are in engineering units under the tags' names; scale and offset of the profile and the data type of the EDS make
-    object values of them. Raises `FileInvalid` for a tag whose object the EDS does not have, and where no signal has a tag.
+    Signals are in engineering units under the names of the tags; scale and offset of the profile and the data type of
+    the EDS convert them to object values. Raises `FileInvalid` for a tag whose object the EDS does not have, and if no
+    signal has the name of a tag.
     """
 
     def __init__(self, tags: Iterable[Tag], dictionary: Dictionary, player: Signals) -> None:
         self.distortions = Distortions()
         self._player = player
         self._objects: list[tuple[str, Key, float, float, bool, Callable[[int | float], bytes]]] = []
-        """The tag's name, its object, scale and offset, whether it can say "no value", and what makes the object's bytes."""
+        """Tag name, object, scale and offset, whether the type can express "no value", and the encoder of the object's
+        bytes.
+        """
         for tag in tags:
             if tag.object is None or tag.name not in player.names:
                 continue
@@ -59,13 +62,13 @@ class PlayedObjects:
                 value = self.distortions.apply(name, value, now_ns)
             number = (value - offset) / scale
             if not is_float and isnan(number):
-                continue  # no integer says "no value": the object keeps what it has
+                continue  # an integer cannot express "no value": the object keeps its value
             out[key] = encoded(number)
         return out
 
 
 def whole(number: float, data_type: int) -> int:
-    """The nearest number that the type holds: a device's converters saturate."""
+    """Return the nearest number that the type holds: a device's converters saturate."""
     bounds = integer_range(data_type)
     if bounds is None:
         return round(number)
@@ -77,7 +80,7 @@ def _encode_whole(data_type: int, number: float) -> bytes:
 
 
 class HeldObjects:
-    """What a node's objects held, by the profile's tags: `NodeContext.held` of a node whose prototype run has an oracle."""
+    """Journals the values of a node's objects by the profile's tags: `NodeContext.held` of a node in a prototype run."""
 
     def __init__(self, tags: Iterable[Tag]) -> None:
         self.journal = HeldJournal()

@@ -1,8 +1,8 @@
-"""A Modbus device of which nothing is recorded: its registers and functions are those of its profile.
+"""A Modbus device without a recording: its profile defines its registers and functions.
 
-The cells are those of the tags; between them there is nothing (exception 02). They hold what the prototype says, 0 otherwise, and
-what a master writes. Effects, functions of its own, identification, files and queues are as the profile states them. A
-function of time only through what is asked: nothing here waits.
+The cells are those of the tags; addresses between them do not exist (exception 02). They hold the values of the
+prototype, 0 by default, and what a client writes. Effects, device-specific functions, identification, files and queues
+are as the profile states. The device changes only with requests: nothing here waits.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _WHOLE = re.compile(r"[1-9][0-9]{0,18}|0|0x[0-9a-fA-F]{1,16}")
 
 
 class StatedRegisters(RegisterBank):
-    """The registers of a device by its profile. `values`: tag -> what it holds at first, in engineering units, or text."""
+    """The registers of a device by its profile. `values`: tag -> initial value, in engineering units, or text."""
 
     def __init__(self, profile: DeviceProfile, values: Mapping[str, float | str], now_ns: int) -> None:
         for name in values:
@@ -58,14 +58,14 @@ class StatedRegisters(RegisterBank):
         self.set(self._effects.of(table, addresses, values), now_ns)
 
     def set(self, sets: Sequence[tuple[Tag, float]], now_ns: int) -> None:
-        """The device changes its own tags, one after the other."""
+        """Change tags from the device's side, one after the other."""
         for tag, value in sets:
             self._put(tag, value)
             at = tag.registers
             self._note_all(at.table, range(at.address, at.end), now_ns)
 
     def peek(self, table: Table, address: int) -> int:
-        """What a cell holds, without the effects of a read."""
+        """Return the value of a cell without the effects of a read."""
         return self._cells.peek(table, address)
 
     def _put(self, tag: Tag, value: float | str) -> None:
@@ -87,7 +87,10 @@ class StatedRegisters(RegisterBank):
 
 
 def add_own_functions(unit: ModbusUnit, bank: StatedRegisters, profile: DeviceProfile) -> None:
-    """Let `unit` answer every function of the profile's own: the one request that is documented, 03 to any other."""
+    """Let `unit` answer every device-specific function of the profile.
+
+    It answers the one documented request, and gives exception 03 to all others.
+    """
     for function in profile.own_functions.values():
         unit.register(function.code, _handler(bank, function), request_length=1 + len(function.request))
 
@@ -103,18 +106,18 @@ def _handler(bank: StatedRegisters, function: OwnFunction) -> Handler:
 
 
 def _exponent(tag: Tag, values: Mapping[str, float | str]) -> int:
-    """What the scale-factor register of `tag` holds at first; 0 where it has none."""
+    """Return the initial value of the scale-factor register of `tag`; 0 if it has none."""
     held = values.get(tag.scale_by, 0) if tag.scale_by is not None else 0
     return 0 if isinstance(held, str) else int(held)
 
 
 def _number(tag: Tag, text: float | str) -> float:
-    """A value that the prototype gives by the profile's word for it."""
+    """Return the number for a value that the prototype gives as one of the profile's words."""
     for number, word in tag.values:
         if word == text:
             return number * tag.scale + tag.offset
     if isinstance(text, str) and not tag.is_text and _WHOLE.fullmatch(text):
-        return float(int(text, 0))  # an identity is text, whatever the register holds
+        return float(int(text, 0))  # an identity is text, whatever the type of the register
     words = ", ".join(word for _, word in tag.values)
     expected = (
         "text" if tag.type == "string" else "none: bytes cannot be stated" if tag.is_text else words or "a number"

@@ -1,9 +1,9 @@
-"""A sensor that samples: registers that follow from a profile, values that follow from recorded signals.
+"""A sensor that takes samples: its registers come from a profile, its values from recorded signals.
 
-Write a period into the tag that the profile names, and from then on a sample is taken every so many seconds, the first at
-once; 0 is standby, a negative period is off. A sample is read from the recording at the emulator's clock, all signals at one
-instant, which stands in the `instrument_time` register in milliseconds where the profile has one. A function of time:
-nothing here waits, samples that fell due are taken when somebody looks.
+After a period in seconds is written into the tag that the profile names, a sample is taken every period, the first
+immediately; 0 is standby, a negative period is off. A sample is read from the recording at the emulator's clock, with
+all signals at one instant, which the `instrument_time` register holds in milliseconds if the profile has one. A
+function of time: nothing here waits, and samples that are due are taken at the next access.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from fieldtwin.gateway.core.profile import DeviceProfile, Tag
 
 STANDBY, SAMPLING, OFF = 0, 1, 2
 MAX_CATCH_UP = 3600
-"""Samples taken at once after nobody looked for long; older ones are skipped, their count is not."""
+"""Most samples taken at one access after a long time without one; older samples are skipped, but counted."""
 
 OWN = ("status", "instrument_time")
 """Tags that the model fills itself, besides the sample counter and the period."""
@@ -37,7 +37,7 @@ class SampledSensor(RegisterBank):
             raise FileInvalid("the profile says nothing about sampling", path=profile.path, expected="`sampled:`")
         self.journal = HeldJournal()
         self.distortions = Distortions()
-        """Of its signals: what the next samples are instead."""
+        """Value faults of its signals, which apply to the next samples."""
         self.samples = 0
         self._player = player
         self._tags = profile.tags
@@ -46,7 +46,7 @@ class SampledSensor(RegisterBank):
         own = {*OWN, profile.sampled.period, profile.sampled.count, *identity}
         self._signals = [t for t in profile.tags.values() if t.name not in own and not t.is_text]
         for tag in self._signals:
-            player.at(player.start_ns, tag.name)  # a recording without a signal that the device has is refused now
+            player.at(player.start_ns, tag.name)  # refuse a recording that lacks a signal of the device
         self._cells = MapBank(_spans(profile), self._on_write)
         self._period_s = 0
         self._next_ns = 0
@@ -56,7 +56,7 @@ class SampledSensor(RegisterBank):
             self._put(tag, 0, player.start_ns)
         for name, text in identity.items():
             self._put(self._tag(name, profile), text, player.start_ns)
-        for tag in profile.tags.values():  # a text that no identity states is empty, and is read as such
+        for tag in profile.tags.values():  # a text without an identity is empty, and is read as such
             if tag.is_text and tag.readable and tag.name not in identity:
                 self._note(tag, player.start_ns)
 
@@ -79,12 +79,12 @@ class SampledSensor(RegisterBank):
         return self._cells.read(table, address, count, now_ns)
 
     def peek(self, table: Table, address: int) -> int:
-        """Return a cell as it is, without taking samples that fell due."""
+        """Return the value of a cell, without taking samples that are due."""
         return self._cells.peek(table, address)
 
     @property
     def own_tags(self) -> list[Tag]:
-        """The numbers that the model fills itself. They are no signals, so a distortion of them is not sampled."""
+        """The numeric tags that the model fills itself. They are not signals, so their distortions are not sampled."""
         signals = {tag.name for tag in self._signals}
         return [tag for tag in self._tags.values() if tag.name not in signals and not tag.is_text]
 
@@ -104,7 +104,7 @@ class SampledSensor(RegisterBank):
         return int(decode(words, self._period_tag.type, self._period_tag.order))
 
     def _on_write(self, table: Table, address: int, values: tuple[int, ...], now_ns: int) -> None:
-        """A write that covers only part of the period would leave half a value: refused as a whole."""
+        """Refuse a write that covers only part of the period, because it would leave half a value."""
         at = self._period_tag.registers
         if table == at.table and address < at.end and address + len(values) > at.address:
             whole = address <= at.address and address + len(values) >= at.end
@@ -120,7 +120,7 @@ class SampledSensor(RegisterBank):
         self._take_due(now_ns)
 
     def _take_due(self, now_ns: int) -> None:
-        """Take every sample that fell due up to `now_ns`, at its own time."""
+        """Take every sample that is due up to `now_ns`, each at its own time."""
         if self._period_s <= 0 or now_ns < self._next_ns:
             return
         step_ns = self._period_s * NS_PER_S
@@ -133,7 +133,7 @@ class SampledSensor(RegisterBank):
             self._next_ns += step_ns
 
     def _sample(self, t_ns: int) -> None:
-        """One sample: the signals at the instrument's time, which is the recording's, to the millisecond."""
+        """Take one sample: the signals at the instrument's time, which is the recording's time in whole milliseconds."""
         time_ms = round(self._player.position_s(t_ns) * 1000)
         values = self._player.values_at(time_ms / 1000)
         self.samples += 1
@@ -147,25 +147,25 @@ class SampledSensor(RegisterBank):
         self._put(self._count_tag, self.samples & 0xFFFFFFFF, t_ns)
 
     def _put(self, tag: Tag, value: float | int | str, now_ns: int) -> None:
-        """The device sets one of its own tags."""
+        """Set one of the device's own tags."""
         at = tag.registers
         words = encode(value, tag.type, tag.order, registers=at.count)
         self._cells.poke(at.table, at.address, *words)
         self.journal.note(tag.name, bytes_of(tag, words), now_ns)
 
     def _note_tags(self, table: Table, address: int, count: int, now_ns: int) -> None:
-        """Journal what a master's write made of the tags that it touched."""
+        """Journal the new values of the tags that a client's write touched."""
         for tag in self._tags.values():
             if touches(tag, table, range(address, address + count)):
                 self._note(tag, now_ns)
 
     def _note(self, tag: Tag, now_ns: int) -> None:
-        """Journal what the registers of `tag` hold now."""
+        """Journal the present value of the registers of `tag`."""
         self.journal.note(tag.name, bytes_of(tag, cells_held(tag, self._cells.peek)), now_ns)
 
 
 def _spans(profile: DeviceProfile) -> list[Span]:
-    """The cells that exist: those of the tags, each cell once."""
+    """Return the cells that exist: those of the tags, each cell once."""
     spans: dict[tuple[str, int], Span] = {}
     for tag in profile.tags.values():
         at = tag.registers

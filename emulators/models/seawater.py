@@ -12,7 +12,7 @@ import math
 from fieldtwin.gateway.core.errors import Bug
 
 C_35_15_0 = 4.2914
-"""Conductivity in S/m of seawater of salinity 35 at 15 degC (IPTS-68) and no pressure."""
+"""Conductivity in S/m of seawater of salinity 35 at 15 degC (IPTS-68) and zero pressure."""
 
 T68_PER_T90 = 1.00024
 
@@ -27,7 +27,7 @@ _MAX_STEPS = 20
 
 
 def salinity(conductivity: float, temperature: float, pressure: float) -> float:
-    """Practical salinity from S/m, degC (ITS-90) and dbar."""
+    """Return the practical salinity from S/m, degC (ITS-90) and dbar."""
     t68 = temperature * T68_PER_T90
     ratio = conductivity / C_35_15_0
     numerator, fixed, slope = _pressure_terms(t68, pressure)
@@ -36,7 +36,7 @@ def salinity(conductivity: float, temperature: float, pressure: float) -> float:
 
 
 def conductivity(salinity_psu: float, temperature: float, pressure: float) -> float:
-    """Conductivity in S/m from practical salinity, degC (ITS-90) and dbar."""
+    """Return the conductivity in S/m from practical salinity, degC (ITS-90) and dbar."""
     t68 = temperature * T68_PER_T90
     root = _root_of(salinity_psu, t68)
     at_surface = root * root * _polynomial(_RT35, t68)
@@ -48,20 +48,20 @@ def conductivity(salinity_psu: float, temperature: float, pressure: float) -> fl
 
 
 def _pressure_terms(t68: float, pressure: float) -> tuple[float, float, float]:
-    """Numerator, and constant and slope (in the ratio) of the denominator, of the pressure correction."""
+    """Return the numerator, and the constant and slope (in the ratio) of the denominator, of the pressure correction."""
     d1, d2, d3, d4 = _D
     numerator = pressure * _polynomial(_E, pressure)
     return numerator, 1.0 + d1 * t68 + d2 * t68 * t68, d3 + d4 * t68
 
 
 def _salinity_of(root: float, t68: float) -> float:
-    """Salinity from the square root of the conductivity ratio at the surface."""
+    """Return the salinity from the square root of the conductivity ratio at the surface."""
     warmer = t68 - 15.0
     return _polynomial(_A, root) + warmer / (1.0 + _K * warmer) * _polynomial(_B, root)
 
 
 def _root_of(wanted: float, t68: float) -> float:
-    """The inverse of `_salinity_of`, by Newton's method with the exact derivative."""
+    """Return the inverse of `_salinity_of`, by Newton's method with the exact derivative."""
     if not 2.0 <= wanted <= 42.0:
         raise Bug("outside the practical salinity scale", expected="2 to 42", got=str(wanted))
     warmer = t68 - 15.0

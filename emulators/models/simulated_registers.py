@@ -1,4 +1,4 @@
-"""A Modbus device of which some registers follow from a simulation; the others are as its profile states them."""
+"""A Modbus device with some registers that follow a simulation; the others are as its profile states."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ from fieldtwin.gateway.core.profile import DeviceProfile
 
 
 class SimulatedRegisters(StatedRegisters):
-    """`signals` has the values of its tags in engineering units; what a master writes there lasts until the next read.
+    """The registers of the device. `signals` gives the values of its tags in engineering units.
 
-    Raises `FileInvalid` for a signal that is none of the device's tags, or text.
+    A value that a client writes to one of these tags lasts until the next read. Raises `FileInvalid` for a signal that
+    is not a tag of the device, or that is text.
     """
 
     def __init__(
@@ -36,7 +37,7 @@ class SimulatedRegisters(StatedRegisters):
 
     def write(self, table: Table, address: int, values: Sequence[int], now_ns: int) -> None:
         super().write(table, address, values, now_ns)
-        self._held.clear()  # what was overwritten is set again when it is asked for
+        self._held.clear()  # overwritten values are set again at the next read
 
     def _simulate(self, now_ns: int) -> None:
         values = self._signals.values(now_ns)

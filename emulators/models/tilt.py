@@ -1,7 +1,7 @@
-"""A made-up inclinometer on a moored buoy: the mooring's steady tilt, and swell that comes round exactly every minute.
+"""A synthetic inclinometer on a moored buoy: the mooring's steady tilt, and swell that repeats exactly every minute.
 
-What the shipped recording `incl.jsonl` is made with. Every wave fits a whole number of times into the recording, and its
-last row is its first again, so that playing it in a loop has no jump. Knows no files and no objects.
+It generates the shipped recording `incl.jsonl`. Every wave fits a whole number of times into the recording, and its
+last row equals its first, so that it can be played in a loop without a jump. It knows no files and no objects.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from dataclasses import dataclass
 SIGNALS = {"slope_long": "deg", "slope_lateral": "deg"}
 
 Wave = tuple[int, float, float]
-"""Times in the recording, amplitude in degrees, phase in radians."""
+"""Number of periods in the recording, amplitude in degrees, phase in radians."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +30,7 @@ class Tilt:
 
 
 def tilt_rows(tilt: Tilt, chance: random.Random) -> Iterator[tuple[float, tuple[float, float]]]:
-    """Times in seconds and the two slopes, rounded to a thousandth of a degree; the last row equals the first."""
+    """Yield times in seconds and the two slopes, rounded to a thousandth of a degree; the last row equals the first."""
     count = round(tilt.duration_s * tilt.rate_hz)
     first: tuple[float, float] | None = None
     for i in range(count):

@@ -1,5 +1,5 @@
-"""Modbus, the master's side: requests, framings, one transaction at a time, and the client around them.
+"""The Modbus client: requests, framings, one transaction at a time, and the client around them.
 
-Knows bytes and a clock that it is given; never which device, bus or process it serves. pymodbus is imported in `pdus`
-and nowhere else.
+This package knows bytes and a clock that it is given, but not which device, bus or process it serves. Only `pdus`
+imports pymodbus.
 """

@@ -1,7 +1,7 @@
 """Modbus ASCII (SL 2.5.2): ``:``, the frame in hexadecimal, LRC, CR LF.
 
-A colon begins a frame wherever it stands and LF ends it, so nothing has to be told by length; a pause over a second
-inside a frame ends it too (case MB-070). Like RTU, a reply does not say which request it answers. Nothing here knows
+Every colon begins a frame and LF ends it, so frames are not recognised by length. A pause of more than a second inside
+a frame also ends it (case MB-070). As in RTU, a reply does not say which request it answers. This module knows no
 ports.
 """
 
@@ -15,25 +15,25 @@ from fieldtwin.gateway.protocols.modbus.framing import Framer
 from fieldtwin.gateway.protocols.modbus.request import MAX_PDU, Request, short_hex
 
 CHARACTER_GAP_NS = NS_PER_S
-"""The longest pause between two characters of a frame (SL 2.5.2.1)."""
+"""The longest permitted pause between two characters of a frame (SL 2.5.2.1)."""
 
 MAX_FRAME = 1 + 2 * (1 + MAX_PDU + 1) + 2
 """Characters of the longest frame: 513 (SL 2.5.2.1)."""
 
 MOST_DAMAGED = 256
-"""Damaged frames that an exchange is searched through for its reply; more is a line that babbles, or no line."""
+"""The number of damaged frames after which an exchange stops looking for its reply: the line carries continuous noise."""
 
-_REST_NS = 20 * NS_PER_MS  # what a USB adapter may still hold back of a damaged frame
+_REST_NS = 20 * NS_PER_MS  # the delay with which a USB adapter may deliver the rest of a damaged frame
 _START, _END = b":", b"\n"
 
 
 def lrc(data: bytes | bytearray) -> int:
-    """The check sum of ASCII frames (SL 6.2.1): with it, the bytes of a frame sum up to 0 modulo 256."""
+    """Return the check sum of an ASCII frame (SL 6.2.1), with which the bytes of the frame add up to 0 modulo 256."""
     return -sum(data) & 0xFF
 
 
 class AsciiFramer(Framer):
-    """ASCII framing of one line. `echo` as in `RtuFramer`."""
+    """ASCII framing of one serial line. `echo` as in `RtuFramer`."""
 
     has_broadcast = True
     gap_ns = CHARACTER_GAP_NS
@@ -51,7 +51,7 @@ class AsciiFramer(Framer):
         self._damaged = 0
         self._seen = ""
         self._late = bytearray()
-        """What came while no reply was awaited, up to one frame."""
+        """Bytes that arrived while no reply was awaited, up to one frame."""
 
     def wire_length(self, pdu_length: int) -> int:
         return 1 + 2 * (1 + pdu_length + 1) + 2
@@ -114,12 +114,12 @@ class AsciiFramer(Framer):
     # -- reading from the front ----------------------------------------------------------------------------------
 
     def _next_frame(self) -> bytes | None:
-        """Cut the next frame off the buffer, from its colon to its LF; what is no frame is noise."""
+        """Cut the next frame off the buffer, from its colon to its LF. Everything outside a frame is noise."""
         buffer = self._buffer
         start = buffer.find(_START)
         self._skip(start if start >= 0 else len(buffer))
         end = buffer.find(_END)
-        # The last colon counts: at a second one the first frame was cut off.
+        # The last colon counts: a second colon means that the first frame was cut off.
         self._skip(max(0, buffer.rfind(_START, 0, end if end >= 0 else len(buffer))))
         if end < 0:
             if len(buffer) > MAX_FRAME:
@@ -131,7 +131,7 @@ class AsciiFramer(Framer):
         return text
 
     def _judge(self, text: bytes, request: Request[Any]) -> bytes | None:
-        """The PDU of a frame of our unit and function; None for a frame that is not ours. Raises as `feed`."""
+        """Return the PDU of a frame with the requested unit ID and function, or None for any other frame. Raises as `feed`."""
         frame = _decoded(text)
         ours = f":{self._unit:02X}{request.function:02X}".encode()
         if frame is None:
@@ -158,7 +158,7 @@ class AsciiFramer(Framer):
         return pdu
 
     def _strip_echo(self) -> bool:
-        """Remove our own request from the front; False while it is incomplete."""
+        """Remove the echo of the request from the front; False while it is incomplete."""
         start = self._buffer.find(_START)
         self._skip(len(self._buffer) if start < 0 else start)
         size = min(len(self._buffer), len(self._sent))
@@ -185,7 +185,7 @@ class AsciiFramer(Framer):
         del self._buffer[:count]
 
     def _end(self) -> None:
-        """The exchange is over; what follows its frame is nobody's."""
+        """End the exchange. Bytes after its frame belong to no request."""
         self.late_bytes += len(self._buffer)
         self._buffer.clear()
         self._request = None
@@ -197,15 +197,16 @@ class AsciiFramer(Framer):
 
 
 def _decoded(text: bytes) -> bytes | None:
-    """Unit and PDU of the frame ``:...CR LF``; None where a character is no digit, or the LRC is wrong.
+    """Return unit ID and PDU of the frame ``:...CR LF``, or None if a character is not a hexadecimal digit or the LRC
+    is wrong.
 
-    Small letters are taken, though SL 2.5.2 has capitals only: some devices send them.
+    Lower-case digits are accepted because some devices send them, although SL 2.5.2 has capitals only.
     """
     digits = text[1:-2]
     if not text.endswith(b"\r\n") or len(digits) < 6 or len(digits) % 2 or not digits.isalnum():
         return None
     try:
         frame = bytes.fromhex(digits.decode("ascii"))
-    except ValueError:  # UnicodeDecodeError is one
+    except ValueError:  # includes UnicodeDecodeError
         return None
     return frame[:-1] if sum(frame) & 0xFF == 0 else None

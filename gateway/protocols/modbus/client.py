@@ -1,7 +1,7 @@
 """The Modbus client: one connection, one exchange at a time, one attempt each.
 
-Thin: it moves bytes between a `ByteConnection` and a pure `Transaction`, keeps the line's silences and counts. It never
-retries, reconnects or scales: that is the runtime's and the drivers' business. It opens nothing.
+It moves bytes between a `ByteConnection` and a pure `Transaction`, keeps the silences of the line, and counts. It never
+retries, reconnects or scales: the runtime and the drivers do that. It opens nothing.
 """
 
 from __future__ import annotations
@@ -49,13 +49,17 @@ from fieldtwin.gateway.protocols.modbus.transaction import Transaction
 R = TypeVar("R", bound=Reply)
 
 _read_registers = lru_cache(maxsize=1024)(ReadRegisters)
-"""Polls ask the same again and again; a request is a value, checked when it is made."""
+"""Polls repeat the same requests, so these are cached. A request is an immutable value, checked when it is made."""
 
 
 @dataclass(frozen=True, slots=True)
 class UnitPace:
-    """What one unit is granted, whoever asks it: how long it may take to answer (None: as every unit) and the pause from
-    the end of an exchange with it to the next request for it, both in seconds. Others may have the line meanwhile."""
+    """The timing of one unit, which applies to all its clients: how long it may take to answer, and the pause that it
+    needs.
+
+    `timeout_s` None means the same timeout as for every unit. The pause is the time from the end of an exchange with
+    the unit to the next request for it; other units may use the line meanwhile. Both are in seconds.
+    """
 
     timeout_s: float | None = None
     spacing_s: float = 0.0
@@ -67,7 +71,10 @@ class UnitPace:
 
 
 class Hold(NamedTuple):
-    """A unit that did not answer within a shortened timeout. Its reply may come until `until_ns`; asked at `sent_ns`."""
+    """A unit that did not answer within a shortened timeout.
+
+    The request was sent at `sent_ns`; its reply may arrive until `until_ns`.
+    """
 
     sent_ns: int
     until_ns: int
@@ -75,12 +82,13 @@ class Hold(NamedTuple):
 
 @dataclass(slots=True)
 class ClientCounters:
-    """What happened on this connection since it was opened.
+    """Counters of this connection since it was opened.
 
-    Every request sent ends in exactly one of the others: requests = broadcasts + replies + exceptions + timeouts +
-    crc_errors + desyncs + verify_failures + abandoned, plus the one under way. `replies` are normal replies only;
-    `broadcasts` all that nobody answers; `abandoned` were cancelled or lost with the connection. Bytes: `late_bytes`
-    answered no request that was waiting (late, duplicate), `noise_bytes` were no part of our replies.
+    Every request sent is counted in `requests` and, when it ends, in exactly one other counter: requests = broadcasts +
+    replies + exceptions + timeouts + crc_errors + desyncs + verify_failures + abandoned, plus the one in progress.
+    `replies` counts normal replies only; `broadcasts` all requests that are not answered; `abandoned` those that were
+    cancelled or lost with the connection. Of the bytes, `late_bytes` belong to late or duplicate replies, and
+    `noise_bytes` to no reply at all.
     """
 
     requests: int = 0
@@ -98,13 +106,13 @@ class ClientCounters:
 
 
 class ModbusClient:
-    """A Modbus client (master) on `connection`, which it owns from now on.
+    """A Modbus client on `connection`, which the client owns from now on.
 
-    `serial` gives a line its character time: silences, and deadlines that leave out the time on the wire. Without it
-    (RTU inside TCP) frames need no silence. `timeout_s` is how long a unit may take to answer, `turnaround_s` what all
-    units get to execute a broadcast, `spacing_s` a pause behind every exchange, `silence_s` the silence before a request where it
-    is not the one of SL 2.5.1.1. `echo` and `strict` are as in `RtuFramer`,
-    `accepts_zero_id` as in `MbapFramer`; where the framing has no such thing, `UsageError`.
+    `serial` gives the character time of a serial line. It is used for silences, and for deadlines that exclude the time
+    of transmission. Without it (RTU inside TCP) frames need no silence. `timeout_s` is the time in which a unit has to
+    answer, `turnaround_s` the time that all units get to execute a broadcast, `spacing_s` a pause after every exchange,
+    and `silence_s` the silence before a request if it is not the one of SL 2.5.1.1. `echo` and `strict` are as in
+    `RtuFramer`, `accepts_zero_id` as in `MbapFramer`. A setting that the framing does not have raises `UsageError`.
     """
 
     def __init__(
@@ -145,21 +153,21 @@ class ModbusClient:
         self._spaced_ns: dict[int, int] = {}
         self._timeout_s = _checked_timeout(timeout_s)
         self._timeouts_ns: dict[int, int] = {}
-        """By unit, until something else is stated."""
+        """Timeouts by unit ID, in ns; kept until the timing is changed."""
         self._hurried_ns: dict[int, int] = {}
         self._held: dict[int, Hold] = {}
         self.late_ns: dict[int, int] = {}
-        """By unit: how long a reply took that came after its shortened timeout, in ns. Whoever hurries units takes them out."""
+        """By unit ID: the time in ns until a reply arrived after its shortened timeout. The code that shortens timeouts
+        removes the entries.
+        """
         self.hurried_timeouts = 0
-        """How many of the `timeouts` were of hurried units."""
+        """The number of `timeouts` that were of units with a shortened timeout."""
         self.not_waited = 0.0
-        """The sum of what those were shorter by than the units' own timeouts, each as a part of the unit's own timeout."""
+        """The sum of the time saved by shortened timeouts, each as a fraction of the unit's normal timeout."""
         self._turn = Turn()
         self._closed = False
         self.counters = ClientCounters()
-        self.latency = (
-            Latencies()
-        )  # of what was answered, exceptions too; whoever keeps it over connections puts in its own
+        self.latency = Latencies()  # of replies and exceptions; a caller that keeps it across connections sets its own
 
     @classmethod
     def at(
@@ -175,7 +183,7 @@ class ModbusClient:
         turnaround_s: float = TURNAROUND_S,
         spacing_s: float = 0.0,
     ) -> Self:
-        """A client with the framing and the character time that `endpoint`, which `connection` was opened for, says."""
+        """Return a client with the framing and the character time of `endpoint`, for which `connection` was opened."""
         return cls(
             connection,
             clock,
@@ -191,7 +199,7 @@ class ModbusClient:
         )
 
     def restate(self, *, timeout_s: float, turnaround_s: float, spacing_s: float) -> None:
-        """From the next request on, another pace of the whole connection; as in the constructor."""
+        """Change the timing of the whole connection from the next request on; parameters as in the constructor."""
         self._timeout_s = _checked_timeout(timeout_s)
         self._timeouts_ns.clear()
         self._line.restate(
@@ -200,31 +208,31 @@ class ModbusClient:
         )
 
     def set_pace(self, unit: int, pace: UnitPace) -> None:
-        """From now on `unit` (0 to 255) is asked at this pace."""
+        """Use this timing for `unit` (0 to 255) from now on."""
         self._paces[unit] = pace
         self._timeouts_ns.clear()
         self._spaces = self._spaces or bool(pace.spacing_s)
 
     def hurry(self, unit: int, timeout_s: float) -> None:
-        """Wait for `unit` no longer than `timeout_s`, and leave the line to the other units when it does not answer.
+        """Shorten the timeout of `unit` to `timeout_s`, and let other units use the line when it does not answer.
 
-        This ends with its first reply, or with `relax`. Without a reply, `unit` is not asked again before its own timeout
-        is over as well, because a late reply does not say which request it answers (case MB-013).
+        This ends with the first reply of `unit`, or with `relax`. Without a reply, the next request to `unit` waits
+        until its normal timeout is also over, because a late reply does not say which request it answers (case MB-013).
         """
         self._hurried_ns[unit] = round(_checked_timeout(timeout_s) * NS_PER_S)
 
     def relax(self, unit: int) -> None:
-        """Wait for `unit` as long as its pace says."""
+        """Restore the normal timeout of `unit`."""
         self._hurried_ns.pop(unit, None)
 
     def hurried(self, unit: int) -> bool:
-        """Whether `unit` is hurried, and has not answered since."""
+        """Return whether the timeout of `unit` is shortened and it has not answered since."""
         return unit in self._hurried_ns
 
     def spaced_ns(self, unit: int) -> int:
-        """The time from which `unit` may be asked: after its pause, and after a late reply can no longer come.
+        """Return the time from which `unit` may be asked: after its pause, and after a late reply can no longer arrive.
 
-        A broadcast (unit 0) waits for the pauses of all units. 0 if there is nothing to wait for.
+        A broadcast (unit 0) waits for the pauses of all units. The result is 0 if no wait is needed.
         """
         if unit == 0 and self._framer.has_broadcast:
             return max(self._spaced_ns.values(), default=0)
@@ -233,16 +241,16 @@ class ModbusClient:
 
     @property
     def clear_ns(self) -> int:
-        """When the line can be used again if nothing arrives: now, or later behind an exchange that ended badly."""
+        """Return when the line can be used again if nothing arrives: now, or later after an exchange that ended badly."""
         return self._line.clear_ns(self._clock.monotonic_ns())
 
     @property
     def closed(self) -> bool:
-        """Whether no request can be sent any more: closed on this side, or lost."""
+        """Return whether the client can send no more requests, because it was closed or the connection was lost."""
         return self._closed or self._connection.lost is not None
 
     async def aclose(self) -> None:
-        """Close the connection; an exchange under way ends with `ConnectionLost`. Closing twice does nothing."""
+        """Close the connection; an exchange in progress ends with `ConnectionLost`. Closing twice does nothing."""
         self._closed = True
         await self._connection.aclose()
 
@@ -302,8 +310,10 @@ class ModbusClient:
     async def read_identification(
         self, unit: int, read_code: int = 1, timeout_s: float | None = None
     ) -> dict[int, bytes]:
-        """All objects of a category (1 basic, 2 regular, 3 extended) by their id, over as many exchanges of 2Bh/0Eh as
-        that takes; the ids go up, so it ends. Errors as `execute`."""
+        """Return all objects of a category (1 basic, 2 regular, 3 extended) by their ID.
+
+        It takes as many exchanges of 2Bh/0Eh as needed; the IDs increase, so it ends. Errors as `execute`.
+        """
         objects: dict[int, bytes] = {}
         request = ReadDeviceIdentification(read_code)
         while True:
@@ -314,12 +324,12 @@ class ModbusClient:
             request = ReadDeviceIdentification(read_code, reply.next_object_id)
 
     async def execute(self, unit: int, request: Request[R], timeout_s: float | None = None) -> R:
-        """Send `request` once and return its reply. Waits for its turn and for the line to be silent before.
+        """Send `request` once and return its reply, after waiting for other requests and for silence on the line.
 
-        `timeout_s` counts from the end of transmission; the reply's own time on the wire comes on top. Raises
+        `timeout_s` counts from the end of transmission; the reply's own transmission time is added. Raises
         `ReplyTimeout`, `CrcError`, `Desync`, `ModbusExceptionReply` or `VerifyFailed`; `UsageError` before anything is
-        sent; `ConnectionLost` when the client has become useless. Cancelling it is safe: its reply is never taken for
-        another's.
+        sent; `ConnectionLost` when the client can no longer be used. Cancelling is safe: the reply is never taken for
+        the reply to a different request.
         """
         if timeout_s is not None:
             timeout_ns = round(_checked_timeout(timeout_s) * NS_PER_S)
@@ -333,7 +343,7 @@ class ModbusClient:
             timeout_ns = min(timeout_ns, hurried_ns)
         unanswered = not request.expects_reply or (unit == 0 and self._framer.has_broadcast)
         if unanswered:
-            request.unanswered(0)  # refuses what cannot be broadcast
+            request.unanswered(0)  # refuses a request that cannot be broadcast
         if not self._turn.take():
             await self._turn.wait()
         try:
@@ -385,7 +395,7 @@ class ModbusClient:
             raise
         except CrcError as e:
             counters.crc_errors += 1
-            # Told before the deadline, it was our reply, whole and damaged; at the deadline it was garbage.
+            # An error before the deadline means that our reply was complete but damaged; at the deadline it means noise.
             settled = self._clock.monotonic_ns() < transaction.deadline_ns
             line.damaged(self._clock.monotonic_ns())
             self._place(e)
@@ -419,7 +429,7 @@ class ModbusClient:
             data = await (self._read_pending() if arrived else self._read_until(transaction.wake_ns))
             now_ns = clock.monotonic_ns()
             reply = transaction.feed(data, now_ns) if data else None
-            if reply is None and (not data or now_ns >= transaction.deadline_ns):  # a flood does not prolong it
+            if reply is None and (not data or now_ns >= transaction.deadline_ns):  # noise does not prolong it
                 reply = transaction.poll(now_ns)
             if reply is not None:
                 return reply
@@ -440,14 +450,14 @@ class ModbusClient:
     # -- the line between exchanges ------------------------------------------------------------------------------
 
     def _is_silent(self) -> bool:
-        """Whether a request may go at once: as a rule. Otherwise `_await_silence` sees to it."""
+        """Return whether a request may be sent immediately, which is the usual case. Otherwise call `_await_silence`."""
         connection = self._connection
         if connection.inbound.data_stream or connection.lost is not None:
             return False
         return self._line.may_go(self._clock.monotonic_ns())
 
     async def _await_spacing(self, unit: int) -> None:
-        """Give `unit` its pause. What arrives meanwhile is nobody's."""
+        """Wait for the pause of `unit`. Bytes that arrive meanwhile belong to no request."""
         while (until_ns := self.spaced_ns(unit)) > self._clock.monotonic_ns() and self._connection.lost is None:
             data = await self._read_until(until_ns)
             self._drain(data, self._clock.monotonic_ns(), live=True)
@@ -461,9 +471,9 @@ class ModbusClient:
                 self._spaced_ns[one] = now_ns + round(pace.spacing_s * NS_PER_S)
 
     async def _await_silence(self) -> None:
-        """Return when a request may be sent; what arrives before that is nobody's and is drained.
+        """Return when a request may be sent. Bytes that arrive before that belong to no request and are drained.
 
-        Raises `Desync` when the line does not become silent, `ConnectionLost` when it is gone.
+        Raises `Desync` if the line does not become silent, `ConnectionLost` if it is gone.
         """
         now_ns = self._clock.monotonic_ns()
         babble_ns = self._line.babble_ns(now_ns)
@@ -482,18 +492,18 @@ class ModbusClient:
         self._line.may_go(now_ns)
 
     def _pass_over(self, unit: int, sent_ns: int, timeout_ns: int) -> None:
-        """Hold a hurried unit that did not answer within `timeout_ns`, instead of the line."""
+        """Delay only the next request to a unit that did not answer within its shortened `timeout_ns`; the line stays usable."""
         now_ns = self._clock.monotonic_ns()
         own_ns = round(self._timeout_of(unit) * NS_PER_S)
         self.hurried_timeouts += 1
         self.not_waited += max(0.0, 1.0 - timeout_ns / own_ns)
-        # As long as the quarantine of a line after a whole timeout: a late reply must not answer the next request (MB-013).
+        # As long as the quarantine of a line after a normal timeout: a late reply must not answer the next request (MB-013).
         until_ns = max(now_ns, sent_ns + own_ns) + max(own_ns, self._line.longest_latency_ns)
         self._held[unit] = Hold(sent_ns, until_ns)
         self._line.passed_over(now_ns)
 
     def _note_strays(self) -> None:
-        """Late replies of units that were hurried: the unit is there, and its reply is no longer under way."""
+        """Note late replies of units with a shortened timeout: the unit answers, and no reply is outstanding any more."""
         now_ns = self._clock.monotonic_ns()
         for unit, t_ns in self._framer.strays.items():
             hold = self._held.pop(unit, None)
@@ -512,12 +522,14 @@ class ModbusClient:
                 self._note_strays()
 
     def _read_until(self, deadline_ns: int) -> Coroutine[Any, Any, bytes]:
-        """What arrives next, or nothing at `deadline_ns`."""
+        """Return the bytes that arrive next, or none at `deadline_ns`."""
         left_s = (deadline_ns - self._clock.monotonic_ns()) / NS_PER_S
         return self._connection.read_within(left_s if left_s > 0.0 else 0.0)
 
     async def _read_pending(self) -> bytes:
-        """What arrived already, possibly nothing; of datagrams only the first, so that none is joined to another."""
+        """Return the bytes that have already arrived, possibly none; only the first datagram, so that datagrams are
+        never joined.
+        """
         connection = self._connection
         if not self._framer.datagrams:
             return connection.read_pending()

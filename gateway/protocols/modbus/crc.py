@@ -1,6 +1,6 @@
 """The check sum of Modbus RTU (SL 6.2.2): CRC-16, polynomial A001h reflected, start FFFFh, sent low byte first.
 
-Two bytes at a time: a table of 65536 entries halves the time of what is the dearest part of an RTU exchange here.
+It is calculated two bytes at a time: a table of 65536 entries halves the time of the slowest part of an RTU exchange.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import struct
 from functools import lru_cache
 
 KEPT = 256
-"""Frames whose check sums are kept."""
+"""The number of frames whose check sums are cached."""
 
 
 def _of_byte(byte: int) -> int:
@@ -20,16 +20,16 @@ def _of_byte(byte: int) -> int:
 
 _BYTE = [_of_byte(byte) for byte in range(256)]
 
-# The check sum is linear, so the entry of a word is that of its low byte, gone through twice, and of its high byte.
+# The check sum is linear, so a word's entry is that of its low byte, processed twice, combined with that of its high byte.
 _LOW = [(entry >> 8) ^ _BYTE[entry & 0xFF] for entry in _BYTE]
 _WORD = [high ^ low for high in _BYTE for low in _LOW]
 
-_MOST_WORDS = 128  # those of the longest frame
+_MOST_WORDS = 128  # words of the longest frame
 _WORDS = [struct.Struct(f"<{count}H").unpack_from for count in range(_MOST_WORDS + 1)]
 
 
 def crc16(data: bytes | bytearray) -> int:
-    """The check sum of `data`. Over a whole frame, its own two check bytes included, it is 0."""
+    """Return the check sum of `data`. Over a whole frame, including its two check bytes, it is 0."""
     count = len(data) >> 1
     words = _WORDS[count] if count <= _MOST_WORDS else struct.Struct(f"<{count}H").unpack_from
     crc = 0xFFFF
@@ -40,11 +40,11 @@ def crc16(data: bytes | bytearray) -> int:
 
 @lru_cache(maxsize=KEPT)
 def with_crc(data: bytes) -> bytes:
-    """`data` and its check sum, as on the wire. Kept: the same is asked again and again, and values seldom change."""
+    """Return `data` with its check sum, as sent. Cached, because the same requests are repeated and values seldom change."""
     return data + crc16(data).to_bytes(2, "little")
 
 
 @lru_cache(maxsize=KEPT)
 def is_whole(frame: bytes) -> bool:
-    """Whether a frame's check sum is right. Kept as `with_crc`'s."""
+    """Return whether a frame's check sum is right. Cached like `with_crc`."""
     return crc16(frame) == 0

@@ -1,7 +1,7 @@
 """Diagnostics of a serial line: 08h, 0Bh and 0Ch (AP 6.8 to 6.10).
 
-Encoded here and not by pymodbus, which has a class per sub-function, all of one shape, and cannot read the replies to
-0Ch. What a counter means is the reader's business.
+The requests are encoded here because pymodbus has a class per sub-function, all of one shape, and cannot read the
+replies to 0Ch. The caller interprets the counters.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _LOOPBACK = 0x00
 _FORCE_LISTEN_ONLY = 0x04
 
 _ECHOED = frozenset({_LOOPBACK, 0x01, 0x03, 0x0A, 0x14})
-"""Loopback, restart, change delimiter, clear counters, clear overrun: answered by the request itself (AP 6.8.1)."""
+"""Loopback, restart, change delimiter, clear counters, clear overrun: the reply repeats the request (AP 6.8.1)."""
 
 _LOG_HEAD = 6  # status, event count and message count precede the events of a log
 _MOST_EVENTS = 64
@@ -34,7 +34,7 @@ _MOST_EVENTS = 64
 class Diagnostics(Request[DiagnosticsReply]):
     """Function 08h with one data word: loopback (sub-function 0), restart (1) and the counters (0Bh to 12h).
 
-    A unit in listen-only mode restarts without a reply, so 08h/1 may end in a `ReplyTimeout` and have worked.
+    A unit in listen-only mode restarts without a reply, so 08h/1 may raise `ReplyTimeout` although it worked.
     """
 
     sub_function: int
@@ -66,7 +66,7 @@ class Diagnostics(Request[DiagnosticsReply]):
 
 @dataclass(frozen=True, slots=True)
 class Loopback(Request[DiagnosticsReply]):
-    """Function 08h/00h with as much data as is wanted: 2 to 250 bytes, in words (AP 6.8.1); it must come back unchanged.
+    """Function 08h/00h with 2 to 250 bytes of data, in words (AP 6.8.1); the reply must return it unchanged.
 
     The reply's `value` is the first word.
     """
@@ -98,7 +98,7 @@ class Loopback(Request[DiagnosticsReply]):
 
 @dataclass(frozen=True, slots=True)
 class ForceListenOnly(Request[WriteReply]):
-    """Function 08h/04h: the unit answers nothing any more until 08h/1 or a power cycle. Itself, it is not answered."""
+    """Function 08h/04h: the unit stops answering until 08h/1 or a power cycle. This request is not answered either."""
 
     expects_reply: ClassVar[bool] = False
 
@@ -121,7 +121,7 @@ class ForceListenOnly(Request[WriteReply]):
 
 @dataclass(frozen=True, slots=True)
 class GetCommEventCounter(Request[CommEventCounterReply]):
-    """Function 0Bh, serial line only: how many requests the unit has completed."""
+    """Function 0Bh, serial line only: the number of requests that the unit has completed."""
 
     @property
     def function(self) -> int:
@@ -175,7 +175,7 @@ def _check_echo(sub_function: int, sent: bytes, pdu: bytes) -> None:
 
 
 def _busy(status: bytes) -> bool:
-    """The status word: FFFFh while a program command is being executed, else 0000h (AP 6.9)."""
+    """Return whether a program command is being executed: the status word is then FFFFh, else 0000h (AP 6.9)."""
     if status not in (b"\x00\x00", b"\xff\xff"):
         raise Desync("the status word of an event counter", expected="0000h or FFFFh", got=status.hex() + "h")
     return status == b"\xff\xff"

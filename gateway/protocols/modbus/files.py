@@ -1,7 +1,7 @@
 """File records and FIFO queues: 14h, 15h and 18h (AP 6.14, 6.15, 6.18).
 
-Encoded here: pymodbus's classes for these check nothing and its replies to 18h cannot be framed (LIBRARIES). A file is
-a number and up to 10,000 records of one word; what it holds is the device's own.
+The requests are encoded here because pymodbus's classes for them check nothing and its replies to 18h cannot be framed
+(LIBRARIES). A file has a number and up to 10,000 records of one word; the device defines their meaning.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class FileSpan:
         check_range("last record", self.record + self.count - 1, 0, _LAST_RECORD)
 
     def encode(self) -> bytes:
-        """The group of a sub-request: reference type, file, record, count."""
+        """Return the group of a sub-request: reference type, file, record, count."""
         words = (self.file, self.record, self.count)
         return bytes([_REFERENCE_TYPE]) + b"".join(word.to_bytes(2, "big") for word in words)
 
@@ -83,7 +83,7 @@ class ReadFileRecords(Request[FileRecordsReply]):
 
 @dataclass(frozen=True, slots=True)
 class WriteFileRecords(Request[WriteReply]):
-    """Function 15h: (file, first record, values) groups; the reply repeats all of it, and all of it is verified."""
+    """Function 15h: (file, first record, values) groups. The reply repeats all of them, and all of it is verified."""
 
     groups: tuple[tuple[int, int, tuple[int, ...]], ...]
 
@@ -91,7 +91,7 @@ class WriteFileRecords(Request[WriteReply]):
         if not self.groups:
             raise UsageError("no file records to write", expected="at least one group")
         for file, record, values in self.groups:
-            FileSpan(file, record, len(values))  # its checks
+            FileSpan(file, record, len(values))  # for its checks
             for value in values:
                 check_range("record value", value, 0, 0xFFFF)
         check_range("bytes of the request", len(self.encode()) - 2, 1, _MOST_WRITE_BYTES)
@@ -129,9 +129,9 @@ class WriteFileRecords(Request[WriteReply]):
 
 @dataclass(frozen=True, slots=True)
 class ReadFifoQueue(Request[RegistersReply]):
-    """Function 18h: the up to 31 words of the queue whose count register is at `address`; the queue is not changed.
+    """Function 18h: the words (at most 31) of the queue whose count register is at `address`. The queue is not changed.
 
-    The only function whose byte count has two bytes (case MB-044).
+    It is the only function whose byte count has two bytes (case MB-044).
     """
 
     address: int

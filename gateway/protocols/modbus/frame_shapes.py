@@ -1,7 +1,8 @@
-"""How long RTU frames of anybody can be: what it takes to step over a frame that is not ours.
+"""The possible lengths of any RTU frame, which are needed to skip a frame that is not ours.
 
-On a serial line every frame of every unit arrives, requests of another master included, and nothing but function code
-and byte count tells where one ends (AP 6). Pure arithmetic on a frame's first bytes; no check sums here.
+On a serial line every frame of every unit arrives, including requests of another client, and only the function code and
+the byte count tell where a frame ends (AP 6). This module calculates with a frame's first bytes; it does not use check
+sums.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ MAX_FRAME = 256
 """Bytes of the longest RTU frame (SL 2.5.1)."""
 
 MIN_FRAME = 4
-"""Unit, function, check sum."""
+"""Bytes of the shortest frame: unit ID, function and check sum."""
 
 _FIXED: dict[int, tuple[int, ...]] = {
     0x01: (8,),
@@ -30,7 +31,7 @@ _FIXED: dict[int, tuple[int, ...]] = {
     0x18: (6,),
     0x2B: (7,),
 }
-"""Requests and replies whose length the function alone tells."""
+"""Requests and replies whose length follows from the function alone."""
 
 _COUNTED: dict[int, tuple[tuple[int, int], ...]] = {
     0x01: ((2, 5),),
@@ -48,7 +49,7 @@ _COUNTED: dict[int, tuple[tuple[int, int], ...]] = {
 """Position of a byte count, and the frame's length without the bytes counted."""
 
 KNOWN_FUNCTIONS = frozenset(_FIXED.keys() | _COUNTED.keys())
-"""Functions whose frames tell their length."""
+"""Functions whose frames have a known length."""
 
 _EVEN = frozenset({0x03, 0x04, 0x10, 0x17})
 
@@ -58,9 +59,9 @@ _DEVICE_IDENTIFICATION = 0x0E
 
 
 def frame_lengths(head: bytes | bytearray) -> tuple[list[int], bool]:
-    """Lengths that a frame beginning with `head` can have, ascending, and whether more bytes could add one.
+    """Return the possible lengths of a frame that begins with `head`, ascending, and whether more bytes could add one.
 
-    `head` holds at least two bytes (unit, function). ([], False): no frame that we know begins like this.
+    `head` holds at least two bytes (unit ID, function). ([], False) means that no known frame begins like this.
     """
     function = head[1]
     if function & 0x80:
@@ -80,7 +81,7 @@ def frame_lengths(head: bytes | bytearray) -> tuple[list[int], bool]:
 
 
 def _fifo_reply(head: bytes | bytearray) -> tuple[list[int], bool]:
-    """AP 6.18: the byte count has two bytes."""
+    """Return the lengths of a FIFO reply, whose byte count has two bytes (AP 6.18)."""
     if len(head) < 4:
         return [], True
     length = 6 + int.from_bytes(head[2:4], "big")
@@ -88,7 +89,11 @@ def _fifo_reply(head: bytes | bytearray) -> tuple[list[int], bool]:
 
 
 def _identification_reply(head: bytes | bytearray) -> tuple[list[int], bool]:
-    """AP 6.21: eight bytes, then as many objects as the eighth says, each with a length of its own."""
+    """Return the lengths of an identification reply (AP 6.21): eight bytes, then as many objects as the eighth byte
+    says.
+
+    Each object has its own length.
+    """
     if len(head) > 2 and head[2] != _DEVICE_IDENTIFICATION:
         return [], False
     if len(head) < 8:

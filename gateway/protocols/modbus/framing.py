@@ -1,8 +1,8 @@
-"""What a framing is: request PDU in, frame out; bytes in, the one awaited reply PDU out.
+"""The interface of a framing: it turns a request PDU into a frame, and received bytes into the PDU of the awaited
+reply.
 
-Modules rtu, ascii and mbap (TCP, TLS and UDP) implement it. A framing decides
-which bytes are the reply, and whether they arrived whole; what the reply says is the request's to judge. No clock here:
-`now_ns` is passed.
+Modules rtu, ascii and mbap (TCP, TLS and UDP) implement it. A framing decides which bytes are the reply, and whether
+they arrived whole; the request checks the reply's content. A framing has no clock: `now_ns` is passed.
 """
 
 from __future__ import annotations
@@ -15,62 +15,66 @@ from fieldtwin.gateway.protocols.modbus.request import Request
 
 
 class Framer(ABC):
-    """One wire's framing. One request at a time: `begin`, then `feed` until it returns, raises, or time is up.
+    """The framing of one link. One request at a time: `begin`, then `feed` until it returns, raises, or time is up.
 
-    `late_bytes` counts what belonged to an earlier exchange or came twice, `noise_bytes` what belonged to none and
-    `foreign_frames` the whole frames of somebody else. All three only grow.
+    `late_bytes` counts bytes of earlier exchanges and duplicates, `noise_bytes` those that belong to no frame, and
+    `foreign_frames` whole frames of other devices. All three only increase.
     """
 
     confirms_transmission: bool = False
-    """Whether a reply names its request, so that a late one needs no quarantine."""
+    """Whether a reply identifies its request, so that a late reply needs no quarantine."""
 
     has_broadcast: bool = False
-    """Whether unit 0 addresses everybody and nobody answers (SL 2.1); else it is a unit like any other (TG 4.4.1.2)."""
+    """Whether unit 0 addresses all units and none answers (SL 2.1); otherwise it is an ordinary unit (TG 4.4.1.2)."""
 
     datagrams: bool = False
-    """Whether the wire keeps the borders of what is sent: then each `feed` gets one datagram, no more and no less."""
+    """Whether the link preserves message boundaries: then each `feed` gets exactly one datagram."""
 
     gap_ns: int = 0
-    """How long the wire must be silent before `settle` is called; 0: never."""
+    """How long the link must be silent before `settle` is called; 0 means never."""
 
     t35_ns: int = 0
-    """The silence that must precede a frame; 0: none."""
+    """The silence that must precede a frame; 0 means none."""
 
     rest_ns: int = 0
-    """How late the rest of a damaged frame may come."""
+    """The longest delay with which the rest of a damaged frame may arrive."""
 
     def __init__(self) -> None:
         self.late_bytes = 0
         self.noise_bytes = 0
         self.foreign_frames = 0
         self.strays: dict[int, int] = {}
-        """Units whose reply came while another one was awaited or none at all, and when that was, in ns; 0: just now."""
+        """Unit IDs whose reply came while no reply, or that of another unit, was awaited, and its time in ns; 0 means
+        just now.
+        """
 
     def _stray(self, unit: int, pdu: bytes | bytearray, now_ns: int) -> None:
-        """Note a frame of `unit` that nothing awaited. A gateway's 0A or 0B is no sign of life of the unit itself."""
+        """Note a frame of `unit` that no request awaited. A gateway's exception 0A or 0B does not show that the unit is alive."""
         if not (len(pdu) >= 2 and pdu[0] & 0x80 and pdu[1] in (0x0A, 0x0B)):
             self.strays[unit] = now_ns
 
     @abstractmethod
     def wire_length(self, pdu_length: int) -> int:
-        """Characters on the wire of a frame whose PDU has `pdu_length` bytes."""
+        """Return the number of characters of a frame whose PDU has `pdu_length` bytes."""
 
     @abstractmethod
     def begin(self, unit: int, request: Request[Any]) -> bytes:
-        """The frame of `request`; from now on its reply is awaited. Forgets the exchange before."""
+        """Return the frame of `request` and await its reply from now on. The previous exchange is forgotten."""
 
     @abstractmethod
     def feed(self, data: bytes, now_ns: int) -> bytes | None:
-        """Take what arrived; the reply PDU as soon as it is complete. Raises `CrcError` or `Desync`."""
+        """Take the bytes that arrived; return the reply PDU when it is complete. Raises `CrcError` or `Desync`."""
 
     def settle(self) -> bytes | None:
-        """The wire has been silent for `gap_ns`: stop waiting for the rest of what is not our reply. As `feed`."""
+        """Stop waiting for the rest of a frame that is not our reply, because the link has been silent for `gap_ns`. As
+        `feed`.
+        """
         return None
 
     @abstractmethod
     def overdue(self, waited_s: float) -> WireError:
-        """Time is up: the error that describes what came instead of a reply. `ReplyTimeout` where nothing did."""
+        """Return the error for a reply that did not arrive in time: `ReplyTimeout`, or one that describes what came instead."""
 
     @abstractmethod
     def drained(self, data: bytes) -> None:
-        """Bytes that arrived while no reply was awaited: count them, and keep step with the stream."""
+        """Count bytes that arrived while no reply was awaited, and stay synchronised with the stream."""

@@ -1,4 +1,4 @@
-"""Which framing a wire speaks, and the framer for it. Knows endpoints by their text only; opens nothing."""
+"""Select the framing of an endpoint, and make the framer for it. This module reads an endpoint's text only; it opens nothing."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ _OF_SCHEME: dict[str, Framing] = {
 
 
 def framing_of(endpoint: Endpoint) -> Framing:
-    """The framing that the scheme of `endpoint` stands for. Raises `UsageError` where Modbus is not spoken."""
+    """Return the framing for the scheme of `endpoint`. Raises `UsageError` if the scheme is not one of Modbus."""
     if endpoint.scheme not in _OF_SCHEME:
         raise UsageError("Modbus is not spoken there", expected=", ".join(_OF_SCHEME), got=str(endpoint))
     return _OF_SCHEME[endpoint.scheme]
 
 
 def make_framer(framing: str, *, char_time_ns: int, echo: bool, strict: bool, accepts_zero_id: bool) -> Framer:
-    """A framer for one connection. Raises `UsageError` for a setting that the framing does not have."""
+    """Return a framer for one connection. Raises `UsageError` for a setting that the framing does not have."""
     serial = framing in ("rtu", "ascii")
     if framing not in _OF_SCHEME.values():
         raise UsageError(f"unknown Modbus framing {framing!r}", expected="rtu, ascii, mbap or udp")

@@ -1,4 +1,4 @@
-"""The requests that ask a device about itself: 07h, 11h and 2Bh/0Eh (AP 6.7, 6.13, 6.21)."""
+"""The requests for information about a device: 07h, 11h and 2Bh/0Eh (AP 6.7, 6.13, 6.21)."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class ReportServerId(Request[ServerIdReply]):
 
 @dataclass(frozen=True, slots=True)
 class ReadDeviceIdentification(Request[DeviceIdentificationReply]):
-    """Function 2Bh/0Eh, one answer of a series. `read_code`: 1 basic, 2 regular, 3 extended, 4 the one `object_id`."""
+    """Function 2Bh/0Eh, one reply of a series. `read_code`: 1 basic, 2 regular, 3 extended, 4 only `object_id`."""
 
     read_code: int = 1
     object_id: int = 0

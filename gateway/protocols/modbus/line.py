@@ -1,8 +1,8 @@
-"""The line between two exchanges: silence before a request, and quarantine after an exchange that ended badly.
+"""The serial line between two exchanges: silence before a request, and quarantine after an exchange that ended badly.
 
-On a serial line a reply does not say which request it answers. So after a timeout, or when an exchange was given up, the
-line is held until nothing has come for as long as the slowest reply ever took (case MB-013); only then may the next
-request go. Pure: told what arrived and when, it says until when to wait. Times are monotonic nanoseconds.
+On a serial line a reply does not say which request it answers. So after a timeout, or when an exchange was given up, no
+request is sent until nothing has arrived for as long as the slowest reply so far took (case MB-013). Pure: it is told
+what arrived and when, and says until when to wait. Times are monotonic nanoseconds.
 """
 
 from __future__ import annotations
@@ -10,20 +10,22 @@ from __future__ import annotations
 from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
 
 TURNAROUND_S = 0.1
-"""What units get to execute a broadcast (SL 2.4.1: 100 to 200 ms)."""
+"""The time that units get to execute a broadcast (SL 2.4.1: 100 to 200 ms)."""
 
 _LONGEST_LATENCY_NS = 60 * NS_PER_S
-"""No quarantine is longer, whatever once came late."""
+"""The longest quarantine, however late a reply once came."""
 
 _BABBLE_FACTOR = 3
 _BABBLE_GRACE_NS = 500 * NS_PER_MS
-"""A line that is not silent within this many of the silences required, and a little more, is reported."""
+"""The time beyond `_BABBLE_FACTOR` required silences after which a line that is still not silent is reported."""
 
 
 class LineSilence:
-    """`t35_ns`: the silence between frames (SL 2.5.1.1), 0 where there is none. `settle_ns`: how late the rest of a
-    damaged frame may come. `quarantines`: whether replies cannot be told apart. `turnaround_ns`: the pause behind a
-    request that nobody answers. `spacing_ns`: the pause behind every other exchange, for devices that need one.
+    """The times at which requests may be sent on a line.
+
+    `t35_ns` is the silence between frames (SL 2.5.1.1), 0 for none. `settle_ns` is the longest delay of the rest of a
+    damaged frame. `quarantines` is true if replies cannot be told apart. `turnaround_ns` is the pause after a request
+    that is not answered, and `spacing_ns` the pause after every other exchange, for devices that need one.
     """
 
     def __init__(
@@ -49,11 +51,11 @@ class LineSilence:
         self._before_quarantine = (0, 0)
 
     def restate(self, *, turnaround_ns: int, spacing_ns: int) -> None:
-        """Other pauses from the next exchange on."""
+        """Use these pauses from the next exchange on."""
         self._turnaround_ns, self._spacing_ns = turnaround_ns, spacing_ns
 
     def may_go(self, now_ns: int) -> bool:
-        """Whether a request may go now, if nothing arrived since; the quarantine, if there was one, is over then."""
+        """Return whether a request may be sent now, if nothing has arrived since. If there was a quarantine, this ends it."""
         if self._not_before_ns > now_ns or (
             self._active_ns is not None and self._active_ns + self._required_ns > now_ns
         ):
@@ -63,39 +65,43 @@ class LineSilence:
         return True
 
     def clear_ns(self, now_ns: int) -> int:
-        """When a request may go if nothing arrives any more."""
+        """Return when a request may be sent if nothing more arrives."""
         silent_ns = now_ns if self._active_ns is None else self._active_ns + self._required_ns
         return max(silent_ns, self._not_before_ns)
 
     def babble_ns(self, since_ns: int) -> int:
-        """From when on, if silence was awaited since `since_ns`, bytes mean that the line will not become silent."""
+        """Return the time from which bytes mean that the line will not become silent, if silence was awaited since `since_ns`."""
         return max(since_ns, self._not_before_ns) + _BABBLE_FACTOR * self._required_ns + _BABBLE_GRACE_NS
 
     def babbled(self) -> None:
-        """What was heard was no late reply: unlearn the latency, or every quarantine would be longer than the last."""
+        """Discard the learned latency, because the bytes were no late reply; otherwise every quarantine would be longer
+        than the last.
+        """
         if self._in_quarantine:
             self.longest_latency_ns, self._required_ns = self._before_quarantine
 
     def heard(self, now_ns: int, *, live: bool) -> None:
-        """Bytes arrived between exchanges. `live`: they arrived just now, so they tell how late a reply can be."""
+        """Note bytes that arrived between exchanges. `live` means that they arrived just now, so they show how late a
+        reply can be.
+        """
         self._active_ns = now_ns
         if live and self._in_quarantine:
             self._note_latency(now_ns)
             self._required_ns = max(self._required_ns, self.longest_latency_ns)
 
     def answered(self, now_ns: int, sent_ns: int) -> None:
-        """A reply came, complete at `now_ns`, to the request that had left at `sent_ns`."""
+        """Note a reply, complete at `now_ns`, to the request that was sent at `sent_ns`."""
         self._sent_ns = sent_ns
         if now_ns - sent_ns > self.longest_latency_ns:
             self._note_latency(now_ns)
         self._end(now_ns, self._t35_ns)
 
     def damaged(self, now_ns: int) -> None:
-        """The reply came and its check sum was wrong: there is no other one, but its rest may follow."""
+        """Note a reply with a wrong check sum: no other reply will come, but the rest of this one may follow."""
         self._end(now_ns, max(self._t35_ns, self._settle_ns))
 
     def given_up(self, now_ns: int, sent_ns: int, timeout_ns: int) -> None:
-        """Timed out, cancelled, or answered by the wrong frame: the reply may still come."""
+        """Note an exchange that timed out, was cancelled, or was answered by a wrong frame: the reply may still arrive."""
         self._sent_ns = sent_ns
         if self._quarantines:
             self._in_quarantine = True
@@ -103,11 +109,13 @@ class LineSilence:
             self._before_quarantine = self.longest_latency_ns, self._required_ns
 
     def passed_over(self, now_ns: int) -> None:
-        """Nothing came from a unit that is not asked again before its reply can no longer come: others may use the line."""
+        """Note that a unit did not answer and is not asked again before its reply can no longer arrive: others may use
+        the line.
+        """
         self._end(now_ns, self._t35_ns)
 
     def broadcast(self, sent_ns: int) -> None:
-        """Nobody answers; the units get time to execute."""
+        """Note a broadcast. No unit answers; the units get time to execute it."""
         self._end(sent_ns, self._t35_ns)
         self._not_before_ns = sent_ns + max(self._turnaround_ns, self._spacing_ns)
 

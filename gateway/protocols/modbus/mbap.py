@@ -1,8 +1,8 @@
 """Modbus over TCP, TLS and UDP: the MBAP header (TG 3.1.3).
 
-A reply is told by its transaction id, so a late one is recognised and thrown away. In a stream chunk borders mean
-nothing; a header that cannot be right (its length out of bounds) or an ADU that never ends leaves no border to count
-from, and then the stream is searched for the header of the reply awaited. Nothing here knows sockets.
+A reply is identified by its transaction ID, so a late reply is recognised and discarded. In a stream, chunk boundaries
+mean nothing. After an invalid header (its length is out of bounds) or an ADU that never ends, the boundaries of ADUs
+are unknown; the stream is then searched for the header of the awaited reply. This module knows no sockets.
 """
 
 from __future__ import annotations
@@ -21,10 +21,12 @@ _MAX_LENGTH = MAX_PDU + 1
 
 
 class MbapFramer(Framer):
-    """MBAP framing of one stream. Replies must carry our transaction id, protocol id 0 and our unit id.
+    """MBAP framing of one stream. A reply must carry the request's transaction ID, protocol ID 0 and the request's unit
+    ID.
 
-    `accepts_zero_id`: a reply with transaction id 0 is ours too, for servers that always send 0 (case MB-056). It is a
-    quirk to be asked for, because then a late reply cannot be told any more: such a wire is quarantined like a line.
+    `accepts_zero_id` also accepts a reply with transaction ID 0, for servers that always send 0 (case MB-056). It has
+    to be enabled because a late reply can then no longer be recognised: such a connection is quarantined like a serial
+    line.
     """
 
     confirms_transmission = True
@@ -44,18 +46,18 @@ class MbapFramer(Framer):
         return _HEADER.size + pdu_length
 
     def begin(self, unit: int, request: Request[Any]) -> bytes:
-        self._transaction = self._transaction % 0xFFFF + 1  # 0 is what broken servers always answer (case MB-056)
+        self._transaction = self._transaction % 0xFFFF + 1  # broken servers always answer with 0 (case MB-056)
         self._unit = unit
         self._awaiting = True
         self._seen = ""
-        # The rest of an ADU that has been incomplete for a whole exchange may never come; search instead of counting.
+        # The rest of an ADU that has been incomplete for a whole exchange may never arrive; search instead of counting.
         self._lost = self._lost or bool(self._buffer)
         pdu = request.encode()
         return _HEADER.pack(self._transaction, 0, len(pdu) + 1, unit) + pdu
 
     def feed(self, data: bytes, now_ns: int) -> bytes | None:
         if self._awaiting and not self._buffer and not self._lost and data[: _HEADER.size] == self._header_for(data):
-            self._awaiting = False  # as a rule: the reply, whole and alone
+            self._awaiting = False  # the usual case: the reply, whole and alone
             return data[_HEADER.size :]
         self._buffer += data
         while (adu := self._next_adu()) is not None:
@@ -82,7 +84,7 @@ class MbapFramer(Framer):
         )
 
     def _header_for(self, adu: bytes) -> bytes | None:
-        """The header that `adu` has if it is the reply awaited and nothing follows it."""
+        """Return the header that `adu` has if it is the awaited reply and nothing follows it."""
         length = len(adu) - _BEFORE_LENGTH_COUNTS
         if not _MIN_LENGTH <= length <= _MAX_LENGTH:
             return None
@@ -92,7 +94,7 @@ class MbapFramer(Framer):
         return transaction == self._transaction or (self._accepts_zero_id and transaction == 0)
 
     def _next_adu(self) -> bytearray | None:
-        """Cut the next whole ADU off the buffer, whoever's it is."""
+        """Cut the next whole ADU off the buffer, whether or not it is the awaited one."""
         while True:
             if self._lost and not self._search():
                 return None
@@ -112,18 +114,18 @@ class MbapFramer(Framer):
             return adu
 
     def _search(self) -> bool:
-        """Throw away all before a header of the awaited reply; False while there is none."""
+        """Discard everything before a header of the awaited reply; False while no such header has arrived."""
         ids = (self._transaction, 0) if self._accepts_zero_id else (self._transaction,)
         found = [at for at in (self._find_header(struct.pack(">HH", number, 0)) for number in ids) if at >= 0]
         if not found:
-            self._skip(max(0, len(self._buffer) - 3))  # the first bytes of both ids may have come already
+            self._skip(max(0, len(self._buffer) - 3))  # the first bytes of both IDs may have arrived already
             return False
         self._skip(min(found))
         self._lost = len(self._buffer) < _HEADER.size
         return not self._lost
 
     def _find_header(self, ids: bytes) -> int:
-        """Where the first header stands that begins with `ids` and can be the reply's, complete or not yet; else -1."""
+        """Return the position of the first header that begins with `ids` and can be the reply's, complete or not; else -1."""
         at = 0
         while (at := self._buffer.find(ids, at)) >= 0:
             head = self._buffer[at : at + _HEADER.size]
@@ -138,12 +140,14 @@ class MbapFramer(Framer):
         del self._buffer[:count]
 
     def _drop_rest(self) -> None:
-        """What follows the reply is nobody's answer (one request at a time), but its borders still count."""
+        """Discard the bytes after the reply, which answer no request (one request at a time), but keep track of their
+        boundaries.
+        """
         self.feed(b"", 0)
 
 
 class UdpFramer(MbapFramer):
-    """MBAP in datagrams: each holds whole ADUs. What a datagram leaves over belongs to no other and is dropped."""
+    """MBAP in datagrams: each holds whole ADUs. The rest of a datagram does not continue in the next one and is dropped."""
 
     datagrams = True
 
@@ -156,4 +160,4 @@ class UdpFramer(MbapFramer):
         return reply
 
     def _search(self) -> bool:
-        return False  # behind a header that cannot be right, nothing in a datagram can be trusted
+        return False  # after an invalid header, nothing in a datagram can be trusted

@@ -1,8 +1,8 @@
-"""Protocol data units to bytes and back; the border to pymodbus, whose PDU classes encode the requests.
+"""Encode and decode protocol data units. pymodbus's PDU classes encode the requests.
 
-The only file that imports pymodbus. Its decoders are not used: they accept too much (any byte count, any echo,
-padding) and take longer than all the rest of an exchange (docs/decisions). What its encoders raise is translated here.
-Requests are polled again and again, so their bytes are kept; the bound is on the number kept.
+This is the only file that imports pymodbus. Its decoders are not used: they accept too much (any byte count, any echo,
+padding) and take longer than the rest of an exchange (docs/decisions). Errors of its encoders are translated here.
+Requests are polled repeatedly, so their bytes are cached, up to a limited number.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _READ_REQUESTS: dict[int, type[ModbusPDU]] = {
 }
 
 _KEPT = 4096
-"""Encoded reads kept: as many different ones as the poll groups of a few hundred devices have."""
+"""The number of encoded reads that are cached: the different reads in the poll groups of a few hundred devices."""
 
 _MOST_WORDS = 126
 _WORDS = tuple(struct.Struct(f">{count}H") for count in range(_MOST_WORDS + 1))
@@ -60,37 +60,37 @@ def _encode(make: Callable[[], ModbusPDU]) -> bytes:
 
 @lru_cache(maxsize=_KEPT)
 def encode_read(function: int, address: int, count: int) -> bytes:
-    """Functions 01h to 04h (AP 6.1 to 6.4)."""
+    """Encode functions 01h to 04h (AP 6.1 to 6.4)."""
     return _encode(lambda: _READ_REQUESTS[function](address=address, count=count))
 
 
 def encode_write_coil(address: int, value: bool) -> bytes:
-    """Function 05h (AP 6.5)."""
+    """Encode function 05h (AP 6.5)."""
     return _encode(lambda: WriteSingleCoilRequest(address=address, bits=[value]))
 
 
 def encode_write_register(address: int, value: int) -> bytes:
-    """Function 06h (AP 6.6)."""
+    """Encode function 06h (AP 6.6)."""
     return _encode(lambda: WriteSingleRegisterRequest(address=address, registers=[value]))
 
 
 def encode_write_coils(address: int, values: Sequence[bool]) -> bytes:
-    """Function 0Fh (AP 6.11)."""
+    """Encode function 0Fh (AP 6.11)."""
     return _encode(lambda: WriteMultipleCoilsRequest(address=address, bits=list(values)))
 
 
 def encode_write_registers(address: int, values: Sequence[int]) -> bytes:
-    """Function 10h (AP 6.12)."""
+    """Encode function 10h (AP 6.12)."""
     return _encode(lambda: WriteMultipleRegistersRequest(address=address, registers=list(values)))
 
 
 def encode_mask_write(address: int, and_mask: int, or_mask: int) -> bytes:
-    """Function 16h (AP 6.16)."""
+    """Encode function 16h (AP 6.16)."""
     return _encode(lambda: MaskWriteRegisterRequest(address=address, and_mask=and_mask, or_mask=or_mask))
 
 
 def encode_read_write(read_address: int, read_count: int, write_address: int, values: Sequence[int]) -> bytes:
-    """Function 17h (AP 6.17)."""
+    """Encode function 17h (AP 6.17)."""
     return _encode(
         lambda: ReadWriteMultipleRegistersRequest(
             read_address=read_address,
@@ -102,30 +102,30 @@ def encode_read_write(read_address: int, read_count: int, write_address: int, va
 
 
 def encode_exception_status() -> bytes:
-    """Function 07h (AP 6.7)."""
+    """Encode function 07h (AP 6.7)."""
     return _encode(ReadExceptionStatusRequest)
 
 
 def encode_report_server_id() -> bytes:
-    """Function 11h (AP 6.13)."""
+    """Encode function 11h (AP 6.13)."""
     return _encode(ReportDeviceIdRequest)
 
 
 def encode_device_identification(read_code: int, object_id: int) -> bytes:
-    """Function 2Bh with MEI type 0Eh (AP 6.21)."""
+    """Encode function 2Bh with MEI type 0Eh (AP 6.21)."""
     return _encode(lambda: ReadDeviceInformationRequest(read_code=read_code, object_id=object_id))
 
 
 def words_of(data: bytes) -> tuple[int, ...]:
-    """The unsigned words of at most 252 bytes, an even number of them, high byte first (AP 4.2)."""
+    """Return the unsigned words of `data`, high byte first (AP 4.2): an even number of bytes, at most 252."""
     return _WORDS[len(data) // 2].unpack(data)
 
 
 def words_to_bytes(words: Sequence[int]) -> bytes:
-    """`words`, each 0 to 65535, high byte first; at most 126 of them."""
+    """Return the bytes of at most 126 `words`, each 0 to 65535, high byte first."""
     return _WORDS[len(words)].pack(*words)
 
 
 def bits_of(data: bytes) -> tuple[bool, ...]:
-    """The bits of `data`, padding included: the lowest bit of the first byte is the first (AP 6.1)."""
+    """Return the bits of `data`, padding included: the lowest bit of the first byte is the first (AP 6.1)."""
     return tuple(chain.from_iterable(map(_BITS.__getitem__, data)))

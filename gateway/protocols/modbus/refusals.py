@@ -1,6 +1,6 @@
-"""Exception replies that mean something else than no: a type for each that a caller acts on differently.
+"""Exception replies that are not a simple refusal: one type for each that a caller handles differently.
 
-What to do is the caller's business; here stands only what the code says (TG 4.4.2.5, AP 7). Every other code, vendor
+The types state only what the code means (TG 4.4.2.5, AP 7); the caller decides what to do. Every other code, vendor
 codes included, is a plain `ModbusExceptionReply`.
 """
 
@@ -10,11 +10,11 @@ from fieldtwin.gateway.core.errors import ModbusExceptionReply
 
 
 class Acknowledged(ModbusExceptionReply):
-    """Code 05: the request was accepted and takes long. Nothing failed: poll on, and do not send a write again."""
+    """Code 05: the request was accepted and takes long. This is not a failure: keep polling, and do not send a write again."""
 
 
 class ServerBusy(ModbusExceptionReply):
-    """Code 06: the request was not accepted because of other work. Back off, then repeat it; there is no value."""
+    """Code 06: the request was not accepted because the server is busy. Back off, then repeat it; there is no value."""
 
 
 class IllegalAddress(ModbusExceptionReply):
@@ -38,5 +38,5 @@ _TYPES: dict[int, type[ModbusExceptionReply]] = {
 
 
 def refusal(function: int, code: int) -> ModbusExceptionReply:
-    """The error for exception `code` to a request of `function`."""
+    """Return the error for exception `code` to a request of `function`."""
     return _TYPES.get(code, ModbusExceptionReply)(function, code)

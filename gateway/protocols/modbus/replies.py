@@ -1,6 +1,6 @@
-"""What a Modbus server answered, decoded: plain frozen values.
+"""Decoded replies of a Modbus server: plain frozen values.
 
-Knows nothing of framing, requests or scaling: a register here is the unsigned 16-bit word of the wire.
+This module knows nothing of framing, requests or scaling: a register is the unsigned 16-bit word as sent.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import msgspec
 
 
 class Reply:
-    """What every reply has: `raw`, the payload as on the wire, and `t_ns`, the monotonic time when it was complete."""
+    """The common part of all replies: `raw`, the payload as received, and `t_ns`, the monotonic time when it was complete."""
 
     __slots__ = ()
     raw: bytes
@@ -23,7 +23,7 @@ class Reply:
 class WriteReply(Reply):
     """A write that was acknowledged and verified against the request; `raw` is the echoed data field.
 
-    A broadcast is acknowledged by nobody: then `acknowledged` is False, `raw` empty and `t_ns` the end of transmission.
+    A broadcast is not acknowledged: then `acknowledged` is False, `raw` empty and `t_ns` the end of transmission.
     """
 
     raw: bytes
@@ -39,13 +39,13 @@ class RegistersReply(Reply, msgspec.Struct, frozen=True, gc=False):
 
     @property
     def registers(self) -> tuple[int, ...]:
-        """0 to 65535 each, in the order of their addresses."""
+        """Return the registers, 0 to 65535 each, in the order of their addresses."""
         return struct.unpack(f">{len(self.raw) // 2}H", self.raw)
 
 
 @dataclass(frozen=True, slots=True)
 class BitsReply(Reply):
-    """Exactly as many bits as asked for, in the order of their addresses; `raw` with its padding bits (AP 6.1)."""
+    """Exactly as many bits as requested, in the order of their addresses; `raw` with its padding bits (AP 6.1)."""
 
     bits: tuple[bool, ...]
     raw: bytes
@@ -54,7 +54,7 @@ class BitsReply(Reply):
 
 @dataclass(frozen=True, slots=True)
 class ExceptionStatusReply(Reply):
-    """The eight exception status outputs as one byte (AP 6.7); what they mean is the device's own."""
+    """The eight exception status outputs as one byte (AP 6.7). The device defines their meaning."""
 
     status: int
     raw: bytes
@@ -63,7 +63,7 @@ class ExceptionStatusReply(Reply):
 
 @dataclass(frozen=True, slots=True)
 class DiagnosticsReply(Reply):
-    """The data field of a diagnostics reply (AP 6.8) as one word: the echo, or the counter asked for."""
+    """The data field of a diagnostics reply (AP 6.8) as one word: the echo, or the requested counter."""
 
     value: int
     raw: bytes
@@ -72,9 +72,9 @@ class DiagnosticsReply(Reply):
 
 @dataclass(frozen=True, slots=True)
 class ServerIdReply(Reply):
-    """What function 11h reports (AP 6.13): everything after the byte count.
+    """The content of a reply to function 11h (AP 6.13): everything after the byte count.
 
-    How it divides into id, run indicator and additional data is the device's own, so it stays whole.
+    The device defines how it divides into ID, run indicator and additional data, so it is not divided here.
     """
 
     raw: bytes
@@ -83,7 +83,7 @@ class ServerIdReply(Reply):
 
 @dataclass(frozen=True, slots=True)
 class DeviceIdentificationReply(Reply):
-    """One answer of function 2Bh/0Eh (AP 6.21): (id, value) pairs, and the id to go on with when `more_follows`."""
+    """One reply of function 2Bh/0Eh (AP 6.21): (ID, value) pairs, and the ID at which to continue if `more_follows`."""
 
     objects: tuple[tuple[int, bytes], ...]
     conformity: int
@@ -105,7 +105,9 @@ class CommEventCounterReply(Reply):
 
 @dataclass(frozen=True, slots=True)
 class CommEventLogReply(Reply):
-    """Function 0Ch (AP 6.10): as 0Bh, the messages on the line, and the events as bytes, the latest first."""
+    """Function 0Ch (AP 6.10): the fields of 0Bh, the number of messages on the line, and the events as bytes, the
+    latest first.
+    """
 
     busy: bool
     event_count: int
@@ -117,7 +119,7 @@ class CommEventLogReply(Reply):
 
 @dataclass(frozen=True, slots=True)
 class FileRecordsReply(Reply):
-    """Function 14h (AP 6.14): the words of each span, in the order in which the spans were asked for."""
+    """Function 14h (AP 6.14): the words of each span, in the order of the requested spans."""
 
     records: tuple[tuple[int, ...], ...]
     raw: bytes

@@ -1,9 +1,9 @@
-"""What a Modbus request is to framings, transactions and the client.
+"""The interface of a Modbus request for framings, transactions and the client.
 
-The concrete ones are in `requests`, `files`, `diagnostics`, `identity` and `user`.
+The concrete requests are in `requests`, `files`, `diagnostics`, `identity` and `user`.
 
-A request knows its own bytes, how long its reply has to be, and whether a reply is its answer. It knows neither unit
-id, framing nor time.
+A request knows its own bytes, how long its reply has to be, and whether a reply answers it. It knows neither unit ID,
+framing nor time.
 """
 
 from __future__ import annotations
@@ -22,62 +22,62 @@ MAX_PDU = 253
 """Bytes of the longest protocol data unit, function code included (AP 4.1)."""
 
 NEED_MORE = 0
-"""`Request.reply_length`: the head is too short to tell."""
+"""Result of `Request.reply_length`: the head is too short to decide."""
 
 IMPOSSIBLE = -1
-"""`Request.reply_length`: no reply to this request starts like this."""
+"""Result of `Request.reply_length`: no reply to this request starts like this."""
 
 
 class Request(ABC, Generic[R_co]):
-    """One request PDU and everything needed to judge its reply.
+    """One request PDU and everything needed to check its reply.
 
-    Ranges are checked when a request is made (`UsageError`), so whatever exists can be sent.
+    Ranges are checked when a request is made (`UsageError`), so every request that exists can be sent.
     """
 
     __slots__ = ()
 
     expects_reply: ClassVar[bool] = True
-    """Whether a unit that executes it answers; the few that are answered by nobody end with `unanswered`."""
+    """Whether a unit that executes the request answers. The few requests without a reply end with `unanswered`."""
 
     @property
     @abstractmethod
     def function(self) -> int:
-        """The function code, 1 to 127."""
+        """Return the function code, 1 to 127."""
 
     @abstractmethod
     def encode(self) -> bytes:
-        """The request PDU, function code first."""
+        """Return the request PDU, function code first."""
 
     @abstractmethod
     def reply_length(self, head: bytes) -> int:
-        """Bytes of the normal reply PDU that begins with `head` (whose first byte is `function`).
+        """Return the number of bytes of the normal reply PDU that begins with `head` (whose first byte is `function`).
 
-        `NEED_MORE` or `IMPOSSIBLE` where `head` does not tell a length.
+        The result is `NEED_MORE` or `IMPOSSIBLE` if `head` does not determine a length.
         """
 
     @abstractmethod
     def decode(self, pdu: bytes, t_ns: int) -> R_co:
-        """The reply in a normal reply PDU, complete at `t_ns`. Raises `Desync`, or `VerifyFailed` for a write."""
+        """Decode a normal reply PDU, complete at `t_ns`. Raises `Desync`, or `VerifyFailed` for a write."""
 
     def nominal_length(self) -> int:
-        """Bytes of the reply PDU where the request alone tells, else `NEED_MORE`."""
+        """Return the number of bytes of the reply PDU if it follows from the request alone, else `NEED_MORE`."""
         return NEED_MORE
 
     def heard_out(self) -> None:
-        """A line has been silent since the last byte: a reply whose length nothing tells ends here (SL 2.5.1.1)."""
+        """Note that the line has been silent since the last byte: a reply of unknown length ends here (SL 2.5.1.1)."""
 
     def unanswered(self, t_ns: int) -> R_co:
-        """What a broadcast of this request returns; raises `UsageError` where it asks for data (SL 2.1)."""
+        """Return the result of a broadcast of this request. Raises `UsageError` if the request reads data (SL 2.1)."""
         raise UsageError(
             f"function {self.function:02X}h cannot be broadcast: nobody answers", expected="a write, or a unit from 1"
         )
 
 
 def parse_reply(request: Request[R], pdu: bytes, t_ns: int) -> R:
-    """Judge a whole reply PDU against its request.
+    """Check a whole reply PDU against its request, and return the decoded reply.
 
-    Raises `ModbusExceptionReply` (any code, raw; types in `refusals`), `Desync` for what is no answer to this request,
-    `VerifyFailed`.
+    Raises `ModbusExceptionReply` (any code, raw; types in `refusals`), `Desync` for a reply that does not answer this
+    request, or `VerifyFailed`.
     """
     function = request.function
     if not pdu:
@@ -100,7 +100,7 @@ def parse_reply(request: Request[R], pdu: bytes, t_ns: int) -> R:
 
 
 def counted_bytes(pdu: bytes) -> int:
-    """The byte count of a read reply PDU whose length agrees with it (AP 6.1 to 6.4), else 0."""
+    """Return the byte count of a read reply PDU if its length agrees with it (AP 6.1 to 6.4), else 0."""
     return pdu[1] if len(pdu) >= 2 and 1 <= pdu[0] <= 4 and len(pdu) == 2 + pdu[1] else 0
 
 
@@ -110,6 +110,6 @@ def describe_length(request: Request[Reply]) -> str:
 
 
 def short_hex(data: bytes | bytearray, most: int = 16) -> str:
-    """`data` for an error message: its size and first bytes."""
+    """Return size and first bytes of `data`, for an error message."""
     dots = " ..." if len(data) > most else ""
     return f"{len(data)} bytes: {bytes(data[:most]).hex(' ')}{dots}"

@@ -1,6 +1,7 @@
 """The data requests: coils, discrete inputs and registers (AP 6.1 to 6.6, 6.11, 6.12, 6.16, 6.17).
 
-Addresses are those on the wire, 0 to 65535 (not 40001). Limits are the standard's; a device's own stand in its profile.
+Addresses are those of the PDU, 0 to 65535 (not 40001). Limits are those of the standard; a device's own are in its
+profile.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ def _check_table(table: str, known: dict[str, int]) -> None:
 
 
 def _counted(head: bytes, byte_count: int) -> int:
-    """Length of a reply whose second byte must be `byte_count`."""
+    """Return the length of a reply whose second byte must be `byte_count`."""
     if len(head) < 2:
         return NEED_MORE
     return 2 + byte_count if head[1] == byte_count else IMPOSSIBLE
@@ -57,7 +58,7 @@ class ReadRegisters(Request[RegistersReply]):
     table: RegisterTable
     address: int
     count: int
-    function: int = field(init=False, repr=False, compare=False)  # asked for with every reply
+    function: int = field(init=False, repr=False, compare=False)  # used with every reply
     _reply_bytes: int = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -112,7 +113,7 @@ class ReadBits(Request[BitsReply]):
 
 
 class _Write(Request[WriteReply]):
-    """A write: its reply repeats the beginning of the request, all of which is verified (case MB-019)."""
+    """A write. Its reply repeats the beginning of the request, and all of that is verified (case MB-019)."""
 
     __slots__ = ()
     _ECHOED = 5

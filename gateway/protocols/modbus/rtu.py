@@ -1,11 +1,11 @@
-"""Modbus RTU: a reply is found by its expected length and its check sum, never by silence alone.
+"""Modbus RTU: a reply is recognised by its expected length and its check sum, never by silence alone.
 
-What arrives is read from the front. Our reply is taken. A whole frame of somebody else is stepped over *as a whole*, so
-that nothing inside it can pass for a reply; one of our unit that answers another request is an error. What is neither
-is noise, dropped byte by byte. A foreign frame that is still incomplete is waited for, until the line has been silent
-for `gap_ns`: silence only ends what length and check sum cannot.
+Received bytes are read from the front. The awaited reply is taken. A frame of another device is skipped *as a whole*,
+so that nothing inside it can be mistaken for a reply; a frame of the requested unit that answers a different request is
+an error. Any other byte is noise and dropped. A foreign frame that is incomplete is waited for until the line has been
+silent for `gap_ns`: silence decides only where length and check sum cannot.
 
-Nothing here knows ports. `char_time_ns` is only for the two silences of SL 2.5.1.1.
+This module knows no ports. `char_time_ns` is only for the two silences of SL 2.5.1.1.
 """
 
 from __future__ import annotations
@@ -20,24 +20,25 @@ from fieldtwin.gateway.protocols.modbus.framing import Framer
 from fieldtwin.gateway.protocols.modbus.request import IMPOSSIBLE, NEED_MORE, Request, counted_bytes, short_hex
 
 USB_LATENCY_NS = 20 * NS_PER_MS
-"""USB adapters hold bytes back for up to 16 ms (case MB-006): a shorter pause says nothing about the line."""
+"""USB adapters delay bytes by up to 16 ms (case MB-006), so a shorter pause says nothing about the line."""
 
 _IDLE_NOISE = (0x00, 0xFF)
-"""What a line that is switched on, idle or not biased is read as (case MB-008)."""
+"""Bytes that are received from a line that is being switched on, idle or not biased (case MB-008)."""
 
 MOST_HUNTED = 8192
-"""Bytes of noise an exchange is searched through for its reply, one by one; more is a line that babbles, or no line."""
+"""Bytes of noise after which an exchange stops looking for its reply: the line carries continuous noise."""
 
 _EXCEPTION_FRAME = 5
 _LAST_UNIT = 247
 
 
 class RtuFramer(Framer):
-    """RTU framing of one line.
+    """RTU framing of one serial line.
 
-    `echo`: what is sent comes back first (two-wire adapters) and is stripped; a damaged echo is a collision, `Desync`.
-    `strict`: a pause over 1.5 characters discards what came before it, and what follows a foreign frame in less than
-    3.5 is discarded too (SL 2.5.1.1); only for wires whose time stamps are true. Else such frames are accepted.
+    `echo` says that sent bytes are received first (two-wire adapters); they are removed, and a damaged echo is a
+    collision, `Desync`. `strict` discards the bytes before a pause of more than 1.5 characters, and a frame that
+    follows a foreign frame after less than 3.5 characters (SL 2.5.1.1). Use it only if the time stamps of received
+    bytes are accurate. Without `strict`, such frames are accepted.
     """
 
     has_broadcast = True
@@ -63,7 +64,7 @@ class RtuFramer(Framer):
         self._wrong_header = ""
         self._seen = ""
         self._late = bytearray()
-        """What came while no reply was awaited, up to one frame."""
+        """Bytes that arrived while no reply was awaited, up to one frame."""
 
     def wire_length(self, pdu_length: int) -> int:
         return 1 + pdu_length + 2
@@ -125,7 +126,7 @@ class RtuFramer(Framer):
     # -- reading from the front ----------------------------------------------------------------------------------
 
     def _is_our_reply(self, data: bytes) -> bool:
-        """As a rule a chunk is the reply, whole and alone; whatever else it is, `_scan` finds out."""
+        """Return whether a chunk is exactly the reply, which is the usual case; `_scan` handles all others."""
         request = self._request
         if request is None or self._echo_due or len(data) < _EXCEPTION_FRAME or data[0] != self._unit:
             return False
@@ -145,7 +146,7 @@ class RtuFramer(Framer):
         return None
 
     def _starts_our_reply(self, request: Request[Any]) -> bool:
-        """Unit and function are ours and, for a normal reply, what follows can still be one."""
+        """Return whether unit ID and function are as requested and, for a normal reply, the following bytes can belong to one."""
         buffer = self._buffer
         if buffer[0] != self._unit:
             return False
@@ -156,12 +157,12 @@ class RtuFramer(Framer):
         return buffer[1] == request.function and request.reply_length(bytes(buffer[1:])) != IMPOSSIBLE
 
     def _take_reply(self, request: Request[Any]) -> bytes | None:
-        """The reply PDU from the front, None while it is incomplete; raises when it is damaged."""
+        """Take the reply PDU from the front; None while it is incomplete. Raises if it is damaged."""
         buffer = self._buffer
         if len(buffer) < 2:
             return None
         if buffer[1] == request.function | 0x80:
-            size = _EXCEPTION_FRAME  # known at once: no wait for the length of a normal reply (case MB-021)
+            size = _EXCEPTION_FRAME  # known immediately: no wait for the length of a normal reply (case MB-021)
         else:
             length = request.reply_length(bytes(buffer[1:]))
             if length == NEED_MORE:
@@ -182,7 +183,7 @@ class RtuFramer(Framer):
         return frame[1:-2]
 
     def _step_over(self, request: Request[Any], settled: bool) -> bool:
-        """Drop a foreign frame or a byte of noise from the front; False while that has to wait for more bytes."""
+        """Drop a foreign frame or a byte of noise from the front; False if that has to wait for more bytes."""
         buffer = self._buffer
         if len(buffer) >= 2:
             lengths, more = self._candidates(request)
@@ -206,7 +207,9 @@ class RtuFramer(Framer):
         return True
 
     def _candidates(self, request: Request[Any]) -> tuple[list[int], bool]:
-        """Lengths that the frame at the front may have; if it is of our unit and function, also the awaited one."""
+        """Return the lengths that the frame at the front may have, including the awaited one if unit ID and function
+        are as requested.
+        """
         lengths, more = frame_lengths(self._buffer)
         nominal = request.nominal_length()
         if nominal and (self._buffer[0], self._buffer[1]) == (self._unit, request.function):
@@ -214,14 +217,14 @@ class RtuFramer(Framer):
         return lengths, more
 
     def _whole_frame(self, lengths: list[int]) -> int:
-        """The first of `lengths` that is there and has a right check sum, else 0."""
+        """Return the first of `lengths` whose bytes have arrived with a right check sum, else 0."""
         for size in lengths:
             if MIN_FRAME <= size <= min(len(self._buffer), MAX_FRAME) and crc16(self._buffer[:size]) == 0:
                 return size
         return 0
 
     def _refuse_other_frame(self, request: Request[Any]) -> None:
-        """Raise `Desync` if a whole frame of our unit is at the front that is no answer to the request."""
+        """Raise `Desync` if the front is a whole frame of the requested unit that does not answer the request."""
         size = self._whole_frame(self._candidates(request)[0])
         if not size:
             return
@@ -235,7 +238,7 @@ class RtuFramer(Framer):
         raise Desync(other, expected=expected, got=short_hex(frame), hint=hint)
 
     def _strip_echo(self) -> bool:
-        """Remove our own request from the front; False while it is incomplete."""
+        """Remove the echo of the request from the front; False while it is incomplete."""
         while self._buffer and self._buffer[0] in _IDLE_NOISE and not self._sent.startswith(self._buffer[:1]):
             self._skip(1)
         size = min(len(self._buffer), len(self._sent))
@@ -277,7 +280,7 @@ class RtuFramer(Framer):
         del self._buffer[:count]
 
     def _end(self, size: int) -> None:
-        """The exchange is over: behind its frame of `size` is a tail of zeros (case MB-009) or a reply twice (MB-014)."""
+        """End the exchange. Its frame of `size` may be followed by a tail of zeros (case MB-009) or a repeated reply (MB-014)."""
         if self._buffer:
             del self._buffer[:size]
             rest = len(self._buffer.rstrip(b"\x00"))

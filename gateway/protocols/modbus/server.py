@@ -1,8 +1,8 @@
-"""What a request asks for, as the gateway's own servers see it: function, addresses, and whether it changes anything.
+"""Analyse requests for the gateway's own servers: function, addresses, and whether the request changes anything.
 
-Pure arithmetic on a request PDU (AP 6). Quantities are judged before addresses, 03 before 02 (case MB-038), so whatever
-passes can be sent to a unit, held against an allow-list, or answered. It must never know who asks, and holds no
-registers. Nothing is shared with the emulators' slave.
+Pure arithmetic on a request PDU (AP 6). Quantities are checked before addresses, 03 before 02 (case MB-038), so a valid
+request can be sent to a unit, checked against an allow-list, or answered. This module must not know who sent the
+request, and holds no registers. It shares nothing with the emulators' server.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ NO_PATH = 0x0A
 NO_RESPONSE = 0x0B
 
 READ_FUNCTIONS = frozenset({0x01, 0x02, 0x03, 0x04, 0x07, 0x0B, 0x0C, 0x11, 0x14, 0x18, 0x2B})
-"""Functions that leave a unit as it is. Of 2Bh only the device identification (0Eh) does: see `Asked.changes`."""
+"""Functions that do not change a unit. Of 2Bh only the device identification (0Eh) is one: see `Asked.changes`."""
 
 WRITE_FUNCTIONS = frozenset({0x05, 0x06, 0x0F, 0x10, 0x15, 0x16, 0x17})
 
 BROADCAST_FUNCTIONS = frozenset({0x05, 0x06, 0x0F, 0x10, 0x15, 0x16})
-"""What may be sent to every unit at once: writes that ask for no data (SL 2.1)."""
+"""Functions that may be broadcast: writes that ask for no data (SL 2.1)."""
 
 _HARMLESS_DIAGNOSTICS = frozenset({0x00, 0x02, *range(0x0B, 0x13)})
-"""Sub-functions of 08h that only tell: echo, the diagnostic register, and the counters (AP 6.8)."""
+"""Sub-functions of 08h that only report: echo, the diagnostic register, and the counters (AP 6.8)."""
 
 _IDENTIFICATION = 0x0E
 
@@ -50,10 +50,11 @@ class Access:
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """A well-formed request. `reply_bytes` is the size of its normal reply PDU, 0 where the request does not tell.
+    """A well-formed request. `reply_bytes` is the size of its normal reply PDU, 0 if it does not follow from the
+    request.
 
-    `changes`: whether it may change the unit; so for every function that is not known here. `accesses` come in the order
-    in which the unit carries them out.
+    `changes` says whether it may change the unit; it is true for every unknown function. `accesses` are in the order in
+    which the unit performs them.
     """
 
     function: int
@@ -63,12 +64,12 @@ class Asked:
 
 
 def exception_pdu(error: ModbusExceptionReply) -> bytes:
-    """The exception response that says what `error` says (AP 7)."""
+    """Return the exception response for `error` (AP 7)."""
     return bytes([error.function & 0x7F | 0x80, error.code])
 
 
 def examine(pdu: bytes) -> Asked:
-    """Read a request PDU. Raises `ModbusExceptionReply` with what the server has to answer: 01, 02 or 03.
+    """Read a request PDU. Raises `ModbusExceptionReply` with the code that the server has to answer: 01, 02 or 03.
 
     A function code of 0, or from 80h on, is refused with 01 (case MB-035: one fixed choice).
     """
@@ -79,7 +80,7 @@ def examine(pdu: bytes) -> Asked:
 
 
 def word(pdu: bytes, at: int) -> int:
-    """The unsigned word at byte `at`, high byte first (AP 4.2)."""
+    """Return the unsigned word at byte `at`, high byte first (AP 4.2)."""
     return pdu[at] << 8 | pdu[at + 1]
 
 
@@ -94,7 +95,7 @@ def _access(pdu: bytes, table: ServedTable, address: int, count: int, most: int,
 
 
 def _addressed(pdu: bytes, *accesses: Access) -> tuple[Access, ...]:
-    """The accesses, none of which leaves the address space (case MB-037)."""
+    """Return the accesses if none of them leaves the address space (case MB-037)."""
     if any(a.address + a.count > 0x10000 for a in accesses):
         raise refusal(pdu[0], ILLEGAL_ADDRESS)
     return accesses
@@ -168,7 +169,7 @@ def _file_records(pdu: bytes) -> Asked:
 
 def _encapsulated(pdu: bytes) -> Asked:
     _require(pdu, len(pdu) >= 2)
-    if pdu[1] != _IDENTIFICATION:  # CANopen and others in a Modbus frame: who knows what they do
+    if pdu[1] != _IDENTIFICATION:  # CANopen and others in a Modbus frame may change the unit
         return Asked(pdu[0], True)
     _require(pdu, len(pdu) == 4)
     return Asked(pdu[0], False)

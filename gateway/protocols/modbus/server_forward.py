@@ -1,7 +1,7 @@
-"""A request that is passed on: somebody else's PDU as a `Request` of the client, its reply handed back byte for byte.
+"""A forwarded request: the PDU of a gateway's client as a `Request`, its reply returned byte for byte.
 
-What a reply has to look like follows from the request, so a late or foreign reply is refused here as it is for requests of
-our own. It must never know who asked, nor a transaction id.
+The request determines the form of the reply, so a late or foreign reply is refused here as it is for the gateway's own
+requests. This module must not know who sent the request, nor a transaction ID.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from fieldtwin.gateway.protocols.modbus.request import IMPOSSIBLE, MAX_PDU, NEED
 from fieldtwin.gateway.protocols.modbus.server import BROADCAST_FUNCTIONS, Asked
 
 _COUNTED = frozenset({0x0C, 0x11, 0x14})
-"""Functions whose reply tells its length in its second byte."""
+"""Functions whose reply has its length in the second byte."""
 
 _ECHOED = {0x05: 5, 0x06: 5, 0x0F: 5, 0x10: 5, 0x16: 7}
-"""Writes: how much of the request their reply repeats. 15h repeats all of it."""
+"""Writes: the number of bytes of the request that their reply repeats. 15h repeats all of it."""
 
 _FIXED_BYTE_COUNT = frozenset({0x01, 0x02, 0x03, 0x04, 0x17})
 
@@ -32,11 +32,11 @@ class ForwardedReply(Reply):
 
 
 class Forwarded(Request[ForwardedReply]):
-    """`pdu`, which `asked` was read from, for `unit`. Made for one exchange.
+    """The request `pdu` for `unit`, where `asked` is the analysis of `pdu`. Made for one exchange.
 
-    `on_line`: the wire is RTU. The reply to a function that nobody knows then ends where the line is silent, its check sum being
-    right; elsewhere the framing says where. By the check sum alone a reply would be cut short once in 256 times: one that
-    ends in 00 looks like a shorter one and a 00.
+    `on_line` says that the link is RTU. The reply to an unknown function then ends where the line becomes silent and
+    the check sum is right; otherwise the framing determines the end. The check sum alone would cut one reply in 256
+    short: a reply that ends in 00 looks like a shorter one followed by 00.
     """
 
     __slots__ = ("_asked", "_heard_out", "_length", "_on_line", "_pdu", "_unit")
@@ -62,7 +62,7 @@ class Forwarded(Request[ForwardedReply]):
     def reply_length(self, head: bytes) -> int:
         function = self.function
         if function in _FIXED_BYTE_COUNT and len(head) > 1 and head[1] != (self._length - 2) & 0xFF:
-            return IMPOSSIBLE  # the byte count has to be what was asked for: MB-017
+            return IMPOSSIBLE  # the byte count has to be the one requested: MB-017
         if self._length:
             return self._length
         if function in _COUNTED:
@@ -92,7 +92,7 @@ class Forwarded(Request[ForwardedReply]):
         self._heard_out = True
 
     def _open_length(self, head: bytes) -> int:
-        """A function of the user's: on RTU all that came before a silence is the reply, if the check sum behind it is right."""
+        """Return the length for a user-defined function: on RTU, all bytes before a silence, if their check sum is right."""
         if not self._on_line:
             return len(head)
         if not self._heard_out or len(head) < 3 or crc16(bytes([self._unit]) + head) != 0:
@@ -102,7 +102,7 @@ class Forwarded(Request[ForwardedReply]):
 
 
 def _fifo_length(head: bytes) -> int:
-    """AP 6.18: a byte count of two bytes."""
+    """Return the length of a FIFO reply, whose byte count has two bytes (AP 6.18)."""
     if len(head) < 3:
         return NEED_MORE
     length = 3 + int.from_bytes(head[1:3], "big")
@@ -110,7 +110,11 @@ def _fifo_length(head: bytes) -> int:
 
 
 def _identification_length(head: bytes) -> int:
-    """AP 6.21: seven bytes, then as many objects as the seventh says, each with an id and a length of its own."""
+    """Return the length of an identification reply (AP 6.21): seven bytes, then as many objects as the seventh byte
+    says.
+
+    Each object has an ID and its own length.
+    """
     if len(head) > 1 and head[1] != 0x0E:
         return IMPOSSIBLE
     if len(head) < 7:

@@ -1,8 +1,8 @@
-"""Modbus RTU requests, heard by a slave on a line that it may share: bytes and times in, requests out.
+"""Modbus RTU requests, received by a server on a line that it may share: bytes and times in, requests out.
 
-A frame is told by length and check sum; other slaves' requests and replies are stepped over as wholes. What is neither is
-dropped byte by byte, at the latest when the line has been silent for `gap_ns` (cases MB-004, MB-030, MB-034). In a flood of
-garbage, only requests to the units of interest are looked for. Nothing here knows ports.
+A frame is recognised by length and check sum; requests to and replies of other servers are skipped as a whole. Any
+other byte is dropped, at the latest when the line has been silent for `gap_ns` (cases MB-004, MB-030, MB-034). In
+continuous noise, only requests to the units of interest are looked for. This module knows no ports.
 """
 
 from __future__ import annotations
@@ -17,27 +17,31 @@ from fieldtwin.gateway.protocols.modbus.frame_shapes import KNOWN_FUNCTIONS, MAX
 
 _LAST_UNIT = 247
 LOST_AFTER = 4 * MAX_FRAME
-"""Bytes of noise in a row after which only requests to the units of interest are looked for, of functions that tell their
-length, until there is one or the line is silent. So a flood is cleared several times faster than it could be parsed."""
-_USB_LATENCY_NS = 20 * NS_PER_MS  # adapters hold bytes back for up to 16 ms (case MB-006)
+"""Bytes of noise in a row after which only requests to the units of interest, with functions of a known length, are
+looked for.
+
+This lasts until such a request is found or the line is silent. Noise is then dropped several times faster than it could
+be parsed.
+"""
+_USB_LATENCY_NS = 20 * NS_PER_MS  # adapters delay bytes by up to 16 ms (case MB-006)
 
 
 @dataclass(frozen=True, slots=True)
 class LineRequest:
-    """A frame with a right check sum: a request, or the reply of another slave, which looks the same."""
+    """A frame with a right check sum: a request, or the reply of another server, which looks the same."""
 
     unit: int
     pdu: bytes
 
     def reply(self, pdu: bytes) -> bytes:
-        """The frame that answers with `pdu`."""
+        """Return the frame that answers with `pdu`."""
         return with_crc(bytes([self.unit]) + pdu)
 
 
 class RtuRequests:
     """The frames on a line whose characters take `char_time_ns`. Never keeps more than `MAX_FRAME` bytes for long.
 
-    `units`: those whose requests are of interest. All frames are returned all the same, except in a flood.
+    `units` are the unit IDs whose requests are of interest. Other frames are also returned, except in continuous noise.
     """
 
     def __init__(self, char_time_ns: int, units: Collection[int] = range(_LAST_UNIT + 1)) -> None:
@@ -48,7 +52,7 @@ class RtuRequests:
         self.noise_bytes = 0
         self._buffer = bytearray()
         self._noise_run = 0
-        self._since_pause = bytearray()  # what was dropped since the last frame or silence, MAX_FRAME bytes at most
+        self._since_pause = bytearray()  # bytes dropped since the last frame or silence, at most MAX_FRAME
         self._units = frozenset(units)
         heads = b"".join(re.escape(bytes([unit])) for unit in sorted(units))
         functions = b"".join(re.escape(bytes([function])) for function in sorted(KNOWN_FUNCTIONS))
@@ -56,19 +60,19 @@ class RtuRequests:
 
     @property
     def pending(self) -> bool:
-        """Whether an unfinished frame waits for more bytes, or for a silence of `gap_ns`."""
+        """Return whether an unfinished frame waits for more bytes, or for a silence of `gap_ns`."""
         return bool(self._buffer) or bool(self._since_pause)
 
     def feed(self, data: bytes) -> list[LineRequest]:
-        """Take what arrived; the whole frames in it, in order."""
+        """Take the bytes that arrived; return the whole frames in them, in order."""
         self._buffer += data
         return self._scan(silent=False)
 
     def silence(self) -> list[LineRequest]:
-        """The line was silent for `gap_ns`: what is incomplete stays so. As `feed`.
+        """Note that the line was silent for `gap_ns`: an incomplete frame will not be completed. Returns as `feed`.
 
-        All bytes since the last frame or silence are one request of a wrong length if they are addressed to one of `units` and
-        their check sum is right: the device that is asked refuses it (AP 7, exception 03).
+        All bytes since the last frame or silence are returned as one request of a wrong length if they are addressed to
+        one of `units` and their check sum is right: the addressed device refuses it (AP 7, exception 03).
         """
         whole = bytes(self._since_pause + self._buffer)
         found = self._scan(silent=True)
@@ -106,12 +110,12 @@ class RtuRequests:
         return found
 
     def _find_ours(self, silent: bool) -> bool:
-        """Drop what precedes the next place where a request of interest may begin; False where there is none."""
+        """Drop the bytes before the next place where a request of interest may begin; False if there is no such place."""
         match = self._ours.search(self._buffer) if self._ours is not None else None
         if match is not None:
             self._drop(match.start())
             return True
-        self._drop(len(self._buffer) - (not silent))  # the last byte may be a unit id
+        self._drop(len(self._buffer) - (not silent))  # the last byte may be a unit ID
         return False
 
     def _drop(self, count: int) -> None:
@@ -127,7 +131,7 @@ class RtuRequests:
         return 0
 
     def _unknown(self, lengths: list[int], more: bool, silent: bool) -> int:
-        """A function that nobody knows has no length: at a silence, or at the longest that a frame can be, it is all there."""
+        """Return the length of a frame of an unknown function: it is complete at a silence, or at the maximum frame length."""
         size = len(self._buffer)
         if lengths or more or not MIN_FRAME <= size <= MAX_FRAME or not (silent or size == MAX_FRAME):
             return 0

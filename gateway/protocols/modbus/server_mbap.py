@@ -1,7 +1,8 @@
 """Modbus TCP requests, the server's side of the MBAP header (TG 3.1.3): bytes in, requests out; replies to bytes.
 
-One object a client. An ADU of another protocol is dropped alone; a length that cannot be right leaves no border to go on
-from, so the stream is given up (`desync`) and its owner closes it. Nothing here knows sockets, units or registers.
+There is one object per client. An ADU of another protocol is dropped, and the stream continues. After an invalid length
+the boundaries of ADUs are unknown, so the stream is given up (`desync`) and its owner closes it. This module knows no
+sockets, units or registers.
 """
 
 from __future__ import annotations
@@ -19,14 +20,14 @@ _MAX_LENGTH = MAX_PDU + 1
 
 @dataclass(frozen=True, slots=True)
 class TcpRequest:
-    """One request ADU; a reply carries the same transaction id and unit."""
+    """One request ADU; a reply carries the same transaction ID and unit ID."""
 
     transaction: int
     unit: int
     pdu: bytes
 
     def reply(self, pdu: bytes) -> bytes:
-        """The ADU that answers with `pdu`."""
+        """Return the ADU that answers with `pdu`."""
         return _HEADER.pack(self.transaction, 0, len(pdu) + 1, self.unit) + pdu
 
 
@@ -38,15 +39,15 @@ class MbapRequests:
         self.foreign = 0
         """ADUs dropped because their protocol id is not Modbus's (case MB-054)."""
         self.desync = ""
-        """Why the stream makes no sense any more; empty while it does."""
+        """Why the stream can no longer be read; empty while it is valid."""
 
     @property
     def unfinished(self) -> bool:
-        """Whether a request has begun and is not complete."""
+        """Return whether a request has begun and is not complete."""
         return bool(self._buffer)
 
     def feed(self, data: bytes) -> list[TcpRequest]:
-        """Take what arrived; the whole requests in it, in order."""
+        """Take the bytes that arrived; return the whole requests in them, in order."""
         if self.desync:
             return []
         buffer = self._buffer

@@ -1,7 +1,7 @@
 """One request that awaits its reply: bytes and `now` in, the reply or a typed error out.
 
-A Modbus client has at most one transaction on a wire. It ends exactly once: by its reply, by an error, or by its
-deadline. Nothing here waits, retries or knows a connection.
+A Modbus client has at most one transaction on a link. It ends exactly once: by its reply, by an error, or by its
+deadline. A transaction does not wait or retry, and knows no connection.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ R = TypeVar("R", bound=Reply)
 
 
 class Transaction(Generic[R]):
-    """`request` to `unit` over `framer`; the reply is due `timeout_ns` after the last character has left.
+    """`request` to `unit` over `framer`; the reply is due `timeout_ns` after the last character was sent.
 
-    `char_time_ns` is what one character takes on the wire, 0 where that is no matter (TCP). The characters of the reply
-    take their time too: where the request tells how many there are, that time is granted on top.
+    `char_time_ns` is the transmission time of one character, 0 if it does not matter (TCP). If the number of characters
+    of the reply follows from the request, their transmission time is added to the timeout.
     """
 
     def __init__(
@@ -39,20 +39,20 @@ class Transaction(Generic[R]):
         if char_time_ns and (nominal := request.nominal_length()):
             self._granted_ns += framer.wire_length(nominal) * char_time_ns
         self.sent_ns = 0
-        """When the last character has left."""
+        """The time at which the last character was sent."""
         self.deadline_ns = self._granted_ns
-        """When the reply has to be complete."""
+        """The time at which the reply has to be complete."""
         self.done = False
 
     @property
     def wake_ns(self) -> int:
-        """When `poll` wants to be called if nothing arrives before."""
+        """Return when `poll` has to be called if nothing arrives before."""
         if self._settled or not self._framer.gap_ns:
             return self.deadline_ns
         return min(self.deadline_ns, self._heard_ns + self._framer.gap_ns)
 
     def start(self, now_ns: int) -> bytes:
-        """The frame to send, now."""
+        """Return the frame to send now."""
         if self._frame:
             raise Bug("a Modbus transaction was started twice")
         self._frame = self._framer.begin(self._unit, self._request)
@@ -60,14 +60,14 @@ class Transaction(Generic[R]):
         return self._frame
 
     def handed_over(self, now_ns: int) -> None:
-        """The frame was handed to the wire at `now_ns`, later than `start` where a buffer was full."""
+        """Note that the frame was passed to the link at `now_ns`, which is later than `start` if a buffer was full."""
         self.sent_ns = now_ns + len(self._frame) * self._char_time_ns
         self.deadline_ns = self.sent_ns + self._granted_ns
 
     def feed(self, data: bytes, now_ns: int) -> R | None:
-        """Bytes arrived. The reply if it is complete, else None.
+        """Take the bytes that arrived. Return the reply if it is complete, else None.
 
-        Raises `CrcError`, `Desync`, `ModbusExceptionReply` or `VerifyFailed`; then the transaction is over.
+        Raises `CrcError`, `Desync`, `ModbusExceptionReply` or `VerifyFailed`; the transaction is then over.
         """
         if self.done or not self._frame:
             raise _not_under_way()
@@ -81,7 +81,9 @@ class Transaction(Generic[R]):
             raise
 
     def poll(self, now_ns: int) -> R | None:
-        """Time passed. As `feed`; at the deadline raises what `Framer.overdue` says, `ReplyTimeout` as a rule."""
+        """Handle the passing of time. Returns as `feed`; at the deadline raises the error of `Framer.overdue`, usually
+        `ReplyTimeout`.
+        """
         if self.done or not self._frame:
             raise _not_under_way()
         overdue = now_ns >= self.deadline_ns

@@ -1,7 +1,7 @@
 """User-defined functions (AP 5: 41h to 48h and 64h to 6Eh; devices use others too, such as 78h), with a stated reply.
 
-Nothing on a serial line but the length tells where a reply ends, so whoever sends such a request says how long its reply
-is: a fixed number of bytes, or where the byte count stands.
+On a serial line only the length tells where a reply ends, so the caller has to state the length of the reply: a fixed
+number of bytes, or the position of its byte count.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from fieldtwin.gateway.protocols.modbus.requests import check_range
 
 @dataclass(frozen=True, slots=True)
 class FixedShape:
-    """A reply of `length` data bytes behind its function code."""
+    """A reply with `length` data bytes after its function code."""
 
     length: int
 
@@ -28,8 +28,10 @@ class FixedShape:
 
 @dataclass(frozen=True, slots=True)
 class CountedShape:
-    """A reply with a byte count: `at` data bytes before it, `size` bytes of count (high byte first), and `after` bytes
-    that it does not count behind those that it does."""
+    """A reply with a byte count: `at` data bytes before it, and `size` bytes of count (high byte first).
+
+    `after` is the number of bytes that follow the counted bytes and are not counted.
+    """
 
     at: int = 0
     size: int = 1
@@ -51,9 +53,9 @@ class CountedShape:
 
 @dataclass(frozen=True, slots=True)
 class UserFunction(Request[UserReply]):
-    """Function `code` (1 to 127) with `data` as it goes on the wire; the reply's `raw` is its data, not judged.
+    """Function `code` (1 to 127) with `data` as it is sent; the reply's `raw` is its data, which is not checked.
 
-    `broadcastable`: whether it is a write that unit 0 may be sent.
+    `broadcastable` says whether it is a write that may be sent to unit 0.
     """
 
     code: int
@@ -83,6 +85,6 @@ class UserFunction(Request[UserReply]):
 
     def unanswered(self, t_ns: int) -> UserReply:
         if not self.broadcastable:
-            # Explicit: super() is not bound in a class that dataclass has made anew for its slots.
+            # Explicit: super() is not bound in a class that dataclass has recreated for its slots.
             return Request.unanswered(self, t_ns)
         return UserReply(b"", t_ns, acknowledged=False)

@@ -1,7 +1,7 @@
-"""What a person names on a command line, as tags: ``holding:100``, ``40101``, ``6040h:00``, or a tag of a profile.
+"""Parse the addresses and names of a command line into tags: ``holding:100``, ``40101``, ``6040h:00``, or a tag of a profile.
 
-Pure text handling. A raw address becomes a tag of its own, named as it was asked for, so that everything after this knows tags
-only and decodes them with the gateway's codec.
+Pure text handling. A raw address becomes a tag named as the user wrote it, so that all later steps handle only tags and
+decode them with the gateway's codec.
 """
 
 from __future__ import annotations
@@ -78,10 +78,11 @@ def tags_of(
 ) -> list[Tag]:
     """Return the tags that `items` name, in their order and each once.
 
-    Without items: every readable tag of the profile, or else every readable object of the EDS except DOMAIN objects (files).
+    Without items: every readable tag of the profile, or else every readable object of the EDS except DOMAIN objects
+    (files).
 
-    A name is looked for in the profile first (a shell pattern takes all that it fits: ``voltage_*``), then in the EDS; the rest
-    are raw addresses. Raises `UsageError` that names what was meant.
+    A name is looked up in the profile first (a shell pattern selects all matching tags: ``voltage_*``), then in the
+    EDS; the rest are raw addresses. Raises `UsageError` that names the item and similar names.
     """
     form = form or RawForm()
     if not items:
@@ -132,7 +133,7 @@ def _by_name(item: str, tags: Mapping[str, Tag]) -> list[Tag]:
 
 
 def with_care(tag: Tag, profile: DeviceProfile | None) -> Tag:
-    """A raw address, with the danger and the wear of whatever the profile says stands there: an address is no way round."""
+    """Give a raw address the danger and the wear of the profile's tags there, so that an address does not bypass them."""
     if profile is None or tag.name in profile.tags or tag.at is None:
         return tag
     at = tag.at

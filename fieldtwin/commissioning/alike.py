@@ -1,7 +1,7 @@
-"""Many unit ids, one device? A device on TCP often answers whatever unit it is asked as. Pure.
+"""Detect one device behind many unit IDs: a device on TCP often answers any unit ID. Pure.
 
-Alike are units that answer the same question with the same bytes. That says little of a few (new meters all read 0) and
-everything of all: nobody has 32 devices at 32 ids spread over all that exist.
+Units are alike if they answer the same question with the same bytes. For a few units that proves little (new meters all
+read 0), for all of them it is conclusive: no installation has 32 devices at 32 IDs spread over the whole range.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from fieldtwin.commissioning.sweep import UnitAnswer
 
 SPREAD = 32
-"""So many ids spread over all must answer before they are taken for one device."""
+"""Number of IDs, spread over the whole range, that must answer alike before they are taken for one device."""
 
 
 @dataclass(frozen=True, slots=True)

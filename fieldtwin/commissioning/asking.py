@@ -1,6 +1,7 @@
-"""One question to a device and what came of it, with the patience that a sweep needs: busy is not no, and silence may be noise.
+"""Send one question to a device and classify the result, with the patience that a sweep needs.
 
-It must never ask anything that changes the device.
+A busy reply is not a refusal, and silence may be caused by noise. This module must never send a request that changes
+the device.
 """
 
 from __future__ import annotations
@@ -43,12 +44,16 @@ PROBES: tuple[tuple[int, Request[Any]], ...] = (
     (0x11, ReportServerId()),
     (0x2B, ReadDeviceIdentification(1)),
 )
-"""Functions that only tell something. Whether others exist nobody can ask without doing something."""
+"""Functions that only read. Whether other functions exist cannot be tested without side effects."""
 
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """What came of a question: `us` microseconds from the question to the last byte of the answer, `requests` it took."""
+    """The result of a question.
+
+    `us` is the time in microseconds from the question to the last byte of the answer, `requests` the number of requests
+    sent.
+    """
 
     outcome: Outcome
     us: int
@@ -68,8 +73,11 @@ class Asker(Protocol):
 
 
 class ModbusAsker:
-    """A unit behind `client`. What got no good reply is asked `retries` times more; behind each exchange the line has
-    `spacing_s` for others."""
+    """A unit behind `client`.
+
+    A question without a good reply is repeated up to `retries` times; after each exchange the line is left free for
+    `spacing_s` seconds.
+    """
 
     def __init__(
         self, client: ModbusClient, unit: int, clock: Clock, *, retries: int = 2, spacing_s: float = 0.0
@@ -129,7 +137,7 @@ class ModbusAsker:
 
 
 def _without_result(error: WireError) -> Silent | Invalid:
-    """Silence and a reply that is no valid one are different findings about a device."""
+    """Classify a failed exchange: silence and an invalid reply are different findings about a device."""
     if isinstance(error, ReplyTimeout):
         return Silent(error.message)
     return Invalid(error.message, values=error.got_bytes // 2 if isinstance(error, WrongSize) else 0)

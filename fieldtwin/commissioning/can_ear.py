@@ -1,6 +1,7 @@
-"""What a CAN bus carries, by listening alone: which nodes beat, who speaks SDO, what else there is. Pure.
+"""Observe a CAN bus passively: the nodes with heartbeats, the SDO traffic, and everything else. Pure.
 
-Identifiers are read by the predefined connection set of CiA 301, 7.3.3. Frames that we sent are not to be fed.
+Identifiers are interpreted by the predefined connection set of CiA 301, 7.3.3. The caller must not feed frames that it
+sent.
 """
 
 from __future__ import annotations
@@ -18,8 +19,11 @@ _STUFF = 1.1
 
 @dataclass(slots=True)
 class NodeHeard:
-    """A node id in the traffic. `state` from its heartbeat; `period_s` between two of them; `pdos` by the predefined
-    identifiers, which a node need not keep."""
+    """A node ID in the traffic.
+
+    `state` is from its heartbeat; `period_s` is the time between two heartbeats; `pdos` are by the predefined
+    identifiers, which a node need not keep.
+    """
 
     state: NmtState | None = None
     heartbeats: int = 0
@@ -56,11 +60,11 @@ class BusHeard:
     times: int = 0
     lss_requests: int = 0
     others: int = 0
-    """Frames that are none of CANopen's."""
+    """Number of frames that are not CANopen."""
 
     @property
     def has_master(self) -> bool:
-        """Whether somebody commands here."""
+        """Return whether a master sends commands on this bus."""
         return bool(self.sdo_masters or self.nmt_commands or self.lss_requests or self.commands)
 
     def load(self, seconds: float, bitrate: int) -> float:

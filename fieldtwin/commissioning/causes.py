@@ -1,7 +1,7 @@
-"""Why a wire is silent, or what comes over it is garbage: causes, most likely first. Pure: evidence in, a ranked list out.
+"""Find the causes of a silent or garbled line, most likely first. Pure: evidence in, a ranked list out.
 
-A weight is no probability: it orders what to look at first, and 0 is left out. Each cause says what speaks for it and what
-to do; where nothing is wrong the list is empty.
+A weight is not a probability: it orders the causes, and a weight of 0 is omitted. Each cause states its evidence and
+the remedy; if nothing is wrong, the list is empty.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from fieldtwin.gateway.connections.line_counters import LineCounters
 from fieldtwin.gateway.core.endpoint import SerialSettings
 
 MANY = 0.2
-"""A share of errors that is no accident."""
+"""A share of errors that cannot be chance."""
 HEALTHY = 0.97
 ENOUGH_TEXT = 12
 """Fewer readable bytes are chance."""
 _EDGES = frozenset({0x00, 0x80, 0xC0, 0xE0, 0xF0, 0xF8, 0xFC, 0xFE, 0xFF})
-"""What a receiver makes of bits that are many times longer than its own."""
+"""Bytes that a receiver sees when the sender's bits are many times longer than its own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +40,7 @@ class Cause:
 
 @dataclass(frozen=True, slots=True)
 class Probe:
-    """One question that was sent: what of it came back, and whether somebody answered.
+    """One question that was sent: its echo, and its answer.
 
     `echo`: ``none``, ``whole`` or ``damaged``. `answer`: ``none``, ``good`` or ``damaged``.
     """
@@ -53,7 +53,10 @@ class Probe:
 
 @dataclass(frozen=True, slots=True)
 class SerialEvidence:
-    """What is known of a serial line. `errors` None: the port counts none. `verdict`: the settings that traffic proved."""
+    """The evidence about a serial line. `errors` None: the port has no counters.
+
+    `verdict`: the settings that traffic proved.
+    """
 
     settings: SerialSettings
     heard: Heard

@@ -1,8 +1,9 @@
-"""What a dump knows about each address of a Modbus table: readable, refused, silent, no valid reply, or not asked.
+"""The state of each address of a Modbus table in a dump: readable, refused, silent, invalid reply, or not asked.
 
-The states are derived from the recorded reads alone, so that the terminal, the file, the reports and `diff` cannot disagree. An
-address is readable once a read that contains it was answered with values. Otherwise the shortest read that contains it decides,
-and only if that read is short: the refusal of 125 registers says nothing about any one of them.
+The states are derived from the recorded reads alone, so that the terminal, the file, the reports and `diff` cannot
+disagree. An address is readable once a read that contains it was answered with values. Otherwise the shortest read that
+contains it decides, and only if that read is short: the refusal of 125 registers does not show which of them is
+refused.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ Spans = Sequence[tuple[int, int]]
 
 
 class Coverage:
-    """The states of one table. `longest_deciding`: reads of at most so many values decide about each address in them."""
+    """The states of one table. Reads of at most `longest_deciding` values decide about each address in them."""
 
     def __init__(self, longest_deciding: int = SHORT) -> None:
         self.states = bytearray(ADDRESSES)
@@ -133,10 +134,10 @@ def _tail(stretch: Stretch) -> int:
 
 
 def describe(table: Table, coverage: Coverage, scope: Spans, *, function_refused: bool = False) -> dict[str, Any]:
-    """The states of a table as a dump file and the JSON output hold them.
+    """Return the states of a table in the form of a dump file and of the JSON output.
 
-    The lists hold ranges in which every address has that state. `sampled` holds stretches in which only some were asked.
-    `unknown` is empty where the device refused the whole function, which is a definite answer.
+    The lists hold ranges in which every address has that state. `sampled` holds ranges in which only some addresses
+    were read. `unknown` is empty where the device refused the whole function, which is a definite answer.
     """
 
     def text(low: int, high: int) -> str:

@@ -1,7 +1,7 @@
-"""What differs between two dumps, or between a dump and what a profile or an EDS says of the device. Named where there are names.
+"""Compare two dumps, or a dump with a profile or an EDS. Differences are named where names are known.
 
-Pure. A difference is something that two devices of one kind, or a device and its profile, should not have; what is merely worth
-knowing is a note.
+Pure. A difference is one that two devices of one kind, or a device and its profile, should not have; anything else that
+the user should know is a note.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from fieldtwin.gateway.protocols.canopen.dictionary import ObjectDictionary
 
 NOT_THERE = 0x0602_0000
 NOTHING_WRONG = (0x0800_0024, 0x0800_0022, 0x0800_0021)
-"""Aborts that say that there is no data now, or not in this state: the object is there."""
+"""SDO abort codes that mean "no data now" or "not in this state": the object exists."""
 
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """`name` at `at`: what was on the one side and on the other, and what kind of difference that is."""
+    """A difference of `name` at `at`: the two sides and the kind of the difference."""
 
     kind: str
     name: str
@@ -41,7 +41,10 @@ class Difference:
 
 @dataclass
 class Differences:
-    """What was found; `compared` values and objects were looked at, `notes` are no differences."""
+    """The result of a comparison.
+
+    `compared` counts the values and objects that were compared, `notes` are remarks that are not differences.
+    """
 
     found: list[Difference] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
@@ -50,8 +53,11 @@ class Differences:
 
 @dataclass(frozen=True, slots=True)
 class Leave:
-    """What is left out: tags whose name fits a pattern in `ignore`, numbers nearer than `tolerance` (by name, then by ``*``), and
-    with `settings` all that cannot be written."""
+    """The exclusions of a comparison.
+
+    Excluded are tags whose name matches a pattern in `ignore`, numbers that differ by less than `tolerance` (by name,
+    then by ``*``), and with `settings` everything that cannot be written.
+    """
 
     ignore: tuple[str, ...] = ()
     tolerance: Mapping[str, float] = field(default_factory=dict)
@@ -108,7 +114,7 @@ def diff_dumps(
 
 
 def diff_profile(dump: Dump, profile: DeviceProfile, leave: Leave | None = None) -> Differences:
-    """Whether a Modbus profile says what the dump shows: its tags are there, their values make sense, its limits hold."""
+    """Compare a Modbus profile with a dump: its tags exist, their values are plausible, its limits hold."""
     leave, out, last = leave or Leave(), Differences(), dump.passes[-1]
     asked = set(dumped_tags(profile)[0])
     named: set[Cell] = set()
@@ -134,7 +140,7 @@ def diff_profile(dump: Dump, profile: DeviceProfile, leave: Leave | None = None)
 
 
 def diff_dictionary(dump: Dump, dictionary: ObjectDictionary) -> Differences:
-    """Whether a node's EDS says what the dump shows: its objects are there, as long as their types, constants as stated."""
+    """Compare a node's EDS with a dump: objects exist with the size of their type; constants have the stated values."""
     out, last = Differences(), dump.passes[-1]
     for entry in dictionary:
         cell = (entry.index, entry.subindex)
@@ -178,7 +184,7 @@ def cells_of(tag: Tag) -> list[Cell]:
 
 
 def value_in(one: Pass, tag: Tag, profile: DeviceProfile | None) -> TagValue | None:
-    """What a pass holds of a tag, scaled by its scale factor; None where it is not whole."""
+    """Return a tag's value in a pass, scaled by its scale factor; None where registers or bytes of it are missing."""
     cells = cells_of(tag)
     if not all(c in one.cells for c in cells):
         return None
@@ -261,8 +267,10 @@ def _implausible(tag: Tag, value: TagValue) -> list[Difference]:
 
 
 def _refused(dump: Dump, cells: Sequence[Cell]) -> bool:
-    """Whether the device was asked for one of `cells` and said no. Silence, an invalid reply and what was not asked for do not
-    count."""
+    """Return whether the device refused a request for one of `cells`.
+
+    Silence, an invalid reply and cells that were not requested do not count.
+    """
     if any(c in dump.passes[-1].refused for c in cells) or any(dump.state_of(c) == REFUSED for c in cells):
         return True
     line = dump.maps.get(str(cells[0][0]))

@@ -48,12 +48,13 @@ Sweeping = Sweep | ProfileSweep | ObjectSweep | ListedObjects
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """What is dumped. For Modbus `spans`, or the profile's tags where there are none; for CANopen `objects`, or the EDS.
+    """The task of a dump.
 
-    `stride` as in `Sweep`; `most` the longest read to try; `pairs`: the device knows pairs of registers only. `passes` times
-    through, `every_s` from the start of one to the start of the next. `functions`: ask which harmless functions there are.
-    `budget_s`: how long each table (or the objects) may take for questions without a result, where the device is silent or gives
-    a value only whole. `spacing_s`: the pause after each request, which counts against it.
+    For Modbus it reads `spans`, or the profile's tags if there are none; for CANopen `objects`, or the EDS's. `stride`
+    as in `Sweep`; `most` is the longest read to try; `pairs`: the device has pairs of registers only. It makes `passes`
+    passes, one every `every_s` seconds from start to start. `functions`: find out which harmless functions exist.
+    `budget_s`: the time that each table (or the objects) may take for questions without a result, where the device is
+    silent or allows a value to be read only whole. `spacing_s`: the pause after each request, which counts against it.
     """
 
     target: Target
@@ -87,7 +88,7 @@ class Job:
         }
 
     def sweeps(self) -> list[Sweeping]:
-        """What is to be asked, one sweep for each range or table."""
+        """Return the sweeps of the first pass, one for each range or table."""
         target, budget_us = self.target, round(self.budget_s * 1e6)
         if target.protocol == "canopen":
             if self.objects or target.dictionary is None:
@@ -111,7 +112,7 @@ class Job:
 
 @dataclass
 class Result:
-    """What a dump came to. `requests` are those sent in this session, `replayed` those answered from the file."""
+    """The result of a dump. `requests` counts those sent in this session, `replayed` those answered from the file."""
 
     maps: list[TableMap] = field(default_factory=list)
     functions: dict[int, dict[str, Any]] = field(default_factory=dict)
@@ -142,8 +143,11 @@ class Dumper:
         self.result = Result()
 
     async def run(self) -> Result:
-        """Everything. Raises `Unreachable` where the device answered nothing at all, and what ends a connection; what was
-        answered until then is in the file."""
+        """Run all passes and return the result.
+
+        Raises `Unreachable` where the device answered no request at all, and errors that end a connection; the answers
+        received until then are in the file.
+        """
         result = self.result
         self._pass(0)
         sweeps = self._job.sweeps()
@@ -155,7 +159,7 @@ class Dumper:
             await self._functions()
         if not result.answered:
             raise Unreachable("nobody answers", where=f"{self._job.target.url} address {self._job.target.address}")
-        for sweep in sweeps:  # only now: a device that is not there is told soon
+        for sweep in sweeps:  # only after the first reads, so that a missing device is reported soon
             if isinstance(sweep, Sweep):
                 await self._follow(sweep, beyond_silence(sweep), total, total)
                 await self._follow(sweep, other_lengths(sweep), total, total)
@@ -207,7 +211,7 @@ class Dumper:
         }  # fmt: skip
 
     async def _again(self, number: int, sweeps: Sequence[Sweeping]) -> None:
-        """A later pass: what the first one found, in the fewest reads."""
+        """Make a later pass: read the readable addresses of the first pass in the fewest reads."""
         if not self._recorded and self._job.every_s:
             await self._clock.sleep_until_ns(self._pass_ns + round(self._job.every_s * NS_PER_S))
         self._pass(number)

@@ -15,7 +15,7 @@ from fieldtwin.commissioning.dump_sweep import ROUND, Asking, Sweep
 LEVELS = ((1000, 4096), (500, 1024), (100, 256), (ROUND, 64), (16,))
 """Where manuals begin blocks, the likeliest first."""
 SILENT_AGAIN = 3
-"""After so many questions in a row without a reply, a block that was found in silence has ended."""
+"""Number of consecutive questions without a reply that end a readable block inside a silent area."""
 LENGTHS = (1, 2, 4, 8, 16, 32)
 """Registers in a read that looks for values that the device gives only whole."""
 
@@ -70,7 +70,7 @@ def other_lengths(sweep: Sweep) -> Asking:
 
 
 def _places(sweep: Sweep, length: int) -> Iterator[int]:
-    """Where a read of `length` may be the first of a block. Pairs are asked for in both alignments."""
+    """Yield the addresses at which a read of `length` may start a block. Pairs are tried in both alignments."""
     span = sweep.span
     states = sweep.coverage.states
     near = [a for a in range(span.address, span.end) if states[a] in (REFUSED, INVALID)]

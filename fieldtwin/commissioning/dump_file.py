@@ -52,7 +52,7 @@ READABLE_VERSIONS = (1, 2)
 TABLES: tuple[Table, ...] = ("holding", "input", "coil", "discrete")
 MOST_LINE_BYTES = 1 << 20
 MOST_CELLS = 50_000_000
-"""Cells of all passes together: what a computer holds. A file with more is refused, not loaded."""
+"""Maximum number of cells in all passes together, limited by memory. A larger file is refused."""
 
 Cell = tuple[str, int] | tuple[int, int]
 """A register (table, address) or an object (index, subindex)."""
@@ -93,7 +93,7 @@ class Dump:
     ended: bool = False
     whole_bytes: int = 0
     coverage: dict[str, Coverage] = field(default_factory=dict)
-    """What the first pass says about the addresses of each table that was asked."""
+    """The states of the addresses of each table, by the first pass."""
     asked: dict[str, list[tuple[int, int]]] = field(default_factory=dict)
 
     @property
@@ -102,7 +102,7 @@ class Dump:
 
     @property
     def names_ranges(self) -> bool:
-        """Whether addresses were asked for, and not the tags of a profile."""
+        """Return whether the dump is of address ranges, not of the tags of a profile."""
         return bool(self.header["ranges"]) or not self.header.get("profile")
 
     def scope(self, table: str) -> list[tuple[int, int]]:
@@ -118,7 +118,7 @@ class Dump:
 
     @property
     def unknown(self) -> tuple[int, int]:
-        """How many addresses or objects are unknown, and how many were to be asked for."""
+        """Return the number of unknown addresses or objects, and the number of all in the scope of the dump."""
         counts = [line["counts"] for line in self.maps.values() if "counts" in line]
         return sum(c["unknown"] for c in counts), sum(n for c in counts for key, n in c.items() if key != "unknown")
 
@@ -146,9 +146,9 @@ class Dump:
 
 
 def load_dump(path: Path, *, keep_lines: bool = False) -> Dump:
-    """Read a dump. A last line that is not whole was being written when the writer died: it is left out.
+    """Read a dump. An incomplete last line is left by a writer that died, and is skipped.
 
-    Raises `FileInvalid` with the line for anything else that is no dump.
+    Raises `FileInvalid` with the line number for any other line that is not part of a dump.
     """
     dump: Dump | None = None
     cells = 0
@@ -280,7 +280,7 @@ STATE_OF = {Taken: READABLE, Refused: REFUSED, Silent: SILENT, Invalid: INVALID}
 
 
 def outcome_of(line: dict[str, Any]) -> Outcome:
-    """What a recorded answer was."""
+    """Return the outcome that a line records."""
     us = int(line.get("us", 0))
     if "hex" in line:
         return Taken(bytes.fromhex(line["hex"]), us)

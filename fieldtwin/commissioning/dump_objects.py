@@ -14,7 +14,7 @@ from fieldtwin.gateway.protocols.canopen.dictionary import ObjectDictionary
 
 NO_OBJECT, NO_SUBINDEX = 0x0602_0000, 0x0609_0011
 MOST_MISSING = 8
-"""After so many subindices in a row that do not exist an array has ended, whatever its subindex 0 says."""
+"""Number of consecutive missing subindices that end an array, whatever the value of its subindex 0."""
 LEVELS = ((0x1000,), (0x100, 0x800), (0x40,), (0x10,))
 """Where profiles begin groups of objects, the likeliest first."""
 EVERYTHING = ((0x1000, 0x9FFF),)

@@ -1,7 +1,7 @@
-"""What a profile names, read in the fewest requests that its limits and the device's own allow.
+"""Read the tags of a profile in the fewest requests that the limits of the profile and of the device allow.
 
-A generator as `dump_sweep` is, over the planner that runs the plant (`fieldtwin.gateway.devices.read_plan`): a refused read is
-halved, and what is learnt on the way is used from the next pass on.
+A generator as `dump_sweep` is, over the planner that runs the plant (`fieldtwin.gateway.devices.read_plan`): a refused
+read is halved, and limits learnt on the way are used from the next pass on.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class ProfileSweep:
         self.plan.pass_ended()
 
     def reads(self) -> list[RegisterRange]:
-        """What the next pass reads."""
+        """Return the reads of the next pass."""
         return [read.range for read in self.plan.reads]
 
 

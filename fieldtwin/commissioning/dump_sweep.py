@@ -1,12 +1,12 @@
-"""How a whole register table is found out with few reads: what can be read, where the holes are, how long a read may be.
+"""Explore a whole register table with few reads: the readable addresses, the holes, and the longest read.
 
-Pure: a sweep is a generator that yields what to ask and is sent what came of it. The same answers always lead to the same
-questions, which is how an interrupted dump goes on: what was recorded is answered again, and nothing is asked twice.
+Pure: a sweep is a generator that yields questions and receives their outcomes. The same answers always lead to the same
+questions. This is how an interrupted dump continues: recorded answers are replayed, and no question is sent twice.
 
-A read that is refused has a hole in it or is too long, and the exception code does not tell which (devices disagree). So a
-single register decides; after a readable prefix the next register decides again, and a short read over the border.
-Where nothing can be read only some addresses are asked (`Sweep.stride`). Where the device is silent `asking` stops early, because
-each question costs a timeout; `dump_beyond` continues from there within a time budget.
+A read that is refused contains a hole or is too long, and the exception code does not show which (devices disagree).
+Therefore a single register decides; after a readable prefix the next register decides again, and a short read across
+the border. In an area that cannot be read only some addresses are tried (`Sweep.stride`). Where the device is silent
+`asking` stops early, because each question costs a timeout; `dump_beyond` continues from there within a time budget.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from fieldtwin.gateway.protocols.modbus.requests import MAX_READ_BITS, MAX_READ_
 
 ILLEGAL_FUNCTION = 0x01
 DENSE = 8
-"""So many addresses after a readable one are all asked before a sweep strides."""
+"""Number of addresses after a readable one that are all tried before a sweep strides."""
 ROUND = 50
 """A stride also stops at multiples of this, because manuals like round numbers."""
 MOST_SILENT = 10
-"""After so many reads in a row without a reply a sweep stops asking address by address."""
+"""Number of consecutive reads without a reply after which a sweep stops trying single addresses."""
 TRUSTED_SILENCE = 2
-"""Once so many patient questions got no reply, silence is how this device refuses: probes are not repeated any more."""
+"""Number of repeated questions without a reply after which silence counts as a refusal; probes are no longer repeated."""
 MOST_PAIR_TRIALS = 4
 
 
@@ -57,8 +57,7 @@ class Silent:
 
 @dataclass(frozen=True, slots=True)
 class Invalid:
-    """Something arrived and it was no valid reply. `values` is how many registers it carried where it was a reply of the wrong
-    size, else 0."""
+    """A reply that is not valid. `values` is its number of registers if only its size is wrong, else 0."""
 
     problem: str
     us: int = 0
@@ -72,13 +71,14 @@ Trying = Generator[RegisterRange, Outcome, bool]
 
 @dataclass
 class TableMap:
-    """What was found out about a table and cannot be seen from single addresses. Intervals are [start, end).
+    """The properties of a table that single addresses do not show. Intervals are [start, end).
 
-    A border, at its address, is where a read may not go over although both sides can be read. In ``(start, end, n)`` of `units`
-    reads take multiples of `n` registers from `start` on. `max_read` is the longest read that was taken; `limit_proved` says that
-    one more is refused (or that it is the standard's limit). `codes` counts exceptions. `stopped` says why not everything was
-    asked that the sweep intended to ask; `function_refused` that the device does not know the table's function.
-    `lengths` are the read lengths that were asked for wherever the sweep looked for registers among refusals.
+    A border is an address that a read may not cross although both sides can be read. In ``(start, end, n)`` of `units`
+    reads take multiples of `n` registers from `start` on. `max_read` is the longest accepted read; `limit_proved` means
+    that one more register is refused (or that it is the standard's limit). `codes` counts exceptions. `stopped` is the
+    reason why the sweep did not ask all its questions; `function_refused` means that the device does not know the
+    table's function. `lengths` are the read lengths that were tried wherever the sweep looked for registers among
+    refusals.
     """
 
     table: Table
@@ -169,7 +169,10 @@ class Sweep:
         self._lost, self._silent = False, 0
 
     def walk(self, at: int) -> Asking:
-        """Ask from `at` on until the span ends or the device is silent. What is known further on is not asked again."""
+        """Read from `at` on until the span ends or the device is silent.
+
+        Addresses known to be readable are not read again.
+        """
         self.resume()
         end, begins = self.span.end, at
         while at < end and not self.halted:
@@ -349,7 +352,10 @@ class Sweep:
 
     @staticmethod
     def _add(spans: list[tuple[int, int]], start: int, end: int) -> None:
-        """Put [start, end) in. Nearly always it goes up and touches the last one; what goes back is put in order."""
+        """Add [start, end).
+
+        Nearly always it follows or touches the last interval; otherwise the intervals are sorted and joined.
+        """
         if not spans or spans[-1][1] < start:
             spans.append((start, end))
         elif spans[-1][0] <= start:

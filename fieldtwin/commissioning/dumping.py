@@ -36,9 +36,9 @@ CAN_BITS = 2 * 130
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """How many requests the first pass takes, and how long: where everything can be read, and where nearly nothing can.
+    """The number of requests and the duration of the first pass, if everything can be read and if nearly nothing can.
 
-    `budgets_s` is how long questions without a result may take besides, in all tables together.
+    `budgets_s` is the additional time that questions without a result may take, in all tables together.
     """
 
     least_requests: int
@@ -103,7 +103,7 @@ def estimate(job: Job, spacing_s: float) -> Estimate:
 
 
 def frames(job: Job) -> list[str]:
-    """What would be sent if everything could be read."""
+    """Return the frames that would be sent if everything could be read."""
     target = job.target
     shown: list[str] = []
     node = CanopenPoint(None, target.url, target.address)
@@ -128,7 +128,7 @@ def frames(job: Job) -> list[str]:
 
 
 def log_path(out: Path) -> Path:
-    """Where the log of all that is sent for the dump `out` is kept: beside it."""
+    """Return the path of the log of all sent frames for the dump `out`, in the same folder."""
     return out.with_name(out.name.removesuffix(".jsonl") + ".sent.jsonl")
 
 
@@ -146,7 +146,7 @@ async def dump(
 ) -> Result:
     """Dump to the file `out`, which must not exist unless `resume`. Raises as `Dumper.run`, and `FileInvalid`.
 
-    `resume` with a file that is complete does nothing but further passes.
+    For a file that is complete, `resume` only makes further passes.
     """
     clock = clock or WallClock()
     if job.target.address == 0 and Endpoint.parse(job.target.url).scheme in ("rtu", "ascii", "rtu+tcp"):

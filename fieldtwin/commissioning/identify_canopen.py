@@ -1,6 +1,6 @@
 """`identify` of a CANopen node: 1000h, 1008h, 1009h, 100Ah and 1018h, compared with the data sheets of known profiles.
 
-Reads only, one object at a time with a pause behind each.
+Reads only, one object at a time with a pause after each.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ LONGEST_TEXT = 256
 
 @dataclass(slots=True)
 class CanIdentity:
-    """What was found out about a node."""
+    """The findings about a node."""
 
     url: str
     node: int
@@ -33,7 +33,7 @@ class CanIdentity:
     candidates: list[Candidate] = field(default_factory=list)
     answers: bool = False
     conflict: str = ""
-    """Why there seem to be two nodes with this id; what was read is then of either."""
+    """The reason why two nodes seem to have this ID; a value may then come from either of them."""
 
     @property
     def summary(self) -> str:

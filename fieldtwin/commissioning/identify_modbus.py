@@ -1,4 +1,4 @@
-"""`identify` of a Modbus unit: what it says of itself, then whether a known profile's registers make sense. Reads only."""
+"""`identify` of a Modbus unit: its own identification, then whether a known profile's registers are plausible. Reads only."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from fieldtwin.gateway.protocols.modbus.request import Request
 from fieldtwin.gateway.protocols.modbus.requests import ReadRegisters
 
 MOST_TAGS = 24
-"""Values of one profile that are read to see whether they make sense, besides those of its `identify`."""
+"""Number of values of a profile that are read to see whether they are plausible, in addition to those of its `identify`."""
 SILENT = (ReplyTimeout, CrcError, Desync)
 NAMES = {0: "vendor", 1: "product code", 2: "revision", 3: "vendor URL", 4: "product", 5: "model", 6: "application"}
 R = TypeVar("R", bound=Reply)
@@ -46,7 +46,7 @@ R = TypeVar("R", bound=Reply)
 
 @dataclass(slots=True)
 class ModbusIdentity:
-    """What was found out about a unit."""
+    """The findings about a unit."""
 
     url: str
     unit: int
@@ -80,9 +80,9 @@ async def identify_modbus(
     connector: Connector | None = None,
     clock: Clock | None = None,
 ) -> ModbusIdentity:
-    """Ask `unit` at `url` what it is, and compare with `profiles`. At most `per_s` requests a second.
+    """Identify `unit` at `url`, by its own answers and by comparison with `profiles`. At most `per_s` requests a second.
 
-    Raises `Unreachable` where the wire cannot be opened or is lost; a unit that does not answer is told in the result.
+    Raises `Unreachable` where the endpoint cannot be opened or is lost; the result reports a unit that does not answer.
     """
     result = ModbusIdentity(url, unit)
     async with modbus_at(
@@ -110,7 +110,7 @@ async def identify_modbus(
 
 
 def modbus_frames(url: str, unit: int) -> list[str]:
-    """What is sent before any profile's registers are read, for `--dry-run`."""
+    """Return the frames that are sent before any profile's registers are read, for `--dry-run`."""
     headers = [ReadRegisters("holding", base, 2) for base in sunspec.BASES]
     questions = [ReportServerId(), *headers, *(ReadDeviceIdentification(code) for code in (1, 2, 3))]
     return [frame_of(url, unit, question).hex(" ") for question in questions]

@@ -20,11 +20,11 @@ from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.errors import FileInvalid
 
 FLOCK = 3
-"""So many floats of one order support each other."""
+"""Number of floats of one word order at which they support each other."""
 PRIOR_WEIGHT = 4.0
-"""What is known of devices in general counts as this many registers seen."""
+"""Weight of the general knowledge about devices, in number of registers seen."""
 SINGLE_COST = 7.0
-"""What a value of one register costs where the device knows pairs only."""
+"""Cost of a value of one register where the device has pairs only."""
 REGISTER_TABLES, BIT_TABLES = ("holding", "input"), ("coil", "discrete")
 
 
@@ -80,8 +80,10 @@ def series_of(dumps: Sequence[Dump]) -> Series:
 
 
 def without_repetitions(series: Series) -> Series:
-    """The passes in which some register differs from the pass before: a device that was asked faster than it measures says the
-    same again, which is no evidence."""
+    """Return the passes in which some register differs from the pass before.
+
+    A device that is read faster than it measures repeats its values, and repetitions are not evidence.
+    """
     columns = [words for table in REGISTER_TABLES for words in series.cells.get(table, {}).values()]
     kept = [i for i in range(series.passes) if i == 0 or any(w[i] != w[i - 1] for w in columns)]
     if len(kept) in (1, series.passes):
@@ -91,7 +93,7 @@ def without_repetitions(series: Series) -> Series:
 
 
 def infer(series: Series) -> Inference:
-    """What the registers probably are. Pure; takes some milliseconds a register."""
+    """Infer the meaning of the registers. Pure; takes some milliseconds a register."""
     seen = without_repetitions(series)
     tables = [(table, seen.cells.get(table, {})) for table in REGISTER_TABLES]
     clocks, runs = [], []
@@ -110,7 +112,7 @@ def infer(series: Series) -> Inference:
 def _between(
     address: int, words: Sequence[Sequence[int]], clocks: Sequence[Reading]
 ) -> list[tuple[int, Sequence[Sequence[int]]]]:
-    """What is left of a run when its clocks are taken out."""
+    """Return the parts of a run between its clocks."""
     taken = {r.address - address for r in clocks}
     parts: list[tuple[int, list[Sequence[int]]]] = []
     for i, word in enumerate(words):

@@ -1,8 +1,9 @@
-"""What a probability of the model is worth: how often readings with it were right on generated maps whose truth is known.
+"""Calibrate the model's probabilities by the share of right readings on generated maps whose truth is known.
 
-The model's arithmetic takes its assumptions for granted, so its probabilities are too high where registers could be read in
-several ways that look the same. Each kind of reading therefore has a curve from the model's probability to the observed share of
-right readings. The curves are fitted by `benchmarks/infer_calibration.py --fit` and checked there on other maps. Pure.
+The model's arithmetic takes its assumptions for granted, so its probabilities are too high where registers could be
+read in several ways that look the same. Each kind of reading therefore has a curve from the model's probability to the
+observed share of right readings. The curves are fitted by `benchmarks/infer_calibration.py --fit` and checked there on
+other maps. Pure.
 """
 
 from __future__ import annotations
@@ -61,7 +62,7 @@ CURVES: dict[str, Curve] = {
 
 
 def kind_of(kind: str, registers: int, *, moves: bool, capped: str) -> str:
-    """The kind of a reading that has a curve of its own."""
+    """Return the kind of a reading, which selects its calibration curve."""
     if kind == "string":
         return "text"
     if not moves:

@@ -70,7 +70,7 @@ def whole_numbers(words: Sequence[Sequence[int]], order: str) -> list[int]:
 
 
 def decode_series(words: Sequence[Sequence[int]], kind: str, order: str) -> list[float] | None:
-    """The raw numbers of each pass's words; None where one is none (a BCD digit above 9)."""
+    """Return the raw numbers of each pass's words; None where a word is not a number (a BCD digit above 9)."""
     return decode_numbers(whole_numbers(words, order), kind)
 
 
@@ -122,7 +122,10 @@ def cost_of(wholes: Sequence[int], kind: str, order: str) -> float:
 
 
 def order_cost(kind: str, order: str, orders: Mapping[str, float]) -> float:
-    """What an order costs where the four have these costs. One register has no word order, only bytes that are swapped or not."""
+    """Return the cost of an order, given the costs of the four orders.
+
+    One register has no word order; its bytes are either swapped or not.
+    """
     if kind == "string":
         return ORDER_COST[order]
     if REGISTERS_OF[kind] > 1:
@@ -150,7 +153,10 @@ def _first_cost(first: int, bits: int, *, signed: bool) -> float:
 
 
 def walk_cost(numbers: Sequence[int]) -> float:
-    """The steps of a series, which stands, wanders or counts: heavy tails around no step, or around the usual one."""
+    """Return the cost of the steps of a series that is constant, wanders or counts.
+
+    The distribution has heavy tails around a step of zero or around the usual step.
+    """
     steps = [b - a for a, b in pairwise(numbers)]
     if not steps:
         return 0.0
@@ -202,7 +208,7 @@ def _real_steps_cost(numbers: Sequence[float], bits: int) -> float:
 
 
 def _real_walk(distances: Sequence[float], fine: Sequence[float]) -> float:
-    """Cauchy distributed, told to the resolution of each value; 0.0 is told by itself."""
+    """Return the cost of Cauchy distributed distances, to the resolution of each value; a value of 0.0 has a fixed cost."""
     scale = max(median(distances), sum(distances) / len(distances) / 4, 0.3 * max(fine), 1e-300)
     total = 3.0
     for distance, resolution in zip(distances, fine, strict=True):
@@ -235,7 +241,7 @@ def _ordered(value: float, kind: str) -> int:
 
 
 def _text_cost(words: Sequence[Sequence[int]], order: str) -> float:
-    """Text stands still and is printable, padded with NULs or blanks at its end."""
+    """Return the cost of a text: it is constant, printable and padded with NULs or blanks at its end."""
     if any(row != words[0] for row in words[1:]):
         return IMPOSSIBLE
     data = b"".join(w.to_bytes(2) for w in words[0])

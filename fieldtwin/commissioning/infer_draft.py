@@ -1,8 +1,8 @@
-"""A draft profile from what was inferred: valid for the profile reader as it stands, with the doubts beside it as comments.
+"""Write a draft profile from inferred registers: valid for the profile reader, with the doubts as comments.
 
-It must never sound surer than the inference: what is a guess is marked so, and a value of unknown type is drafted register by
-register.
-Every register and bit that could be read has a tag, so that an emulator of the draft answers what the device answers.
+It must never sound more certain than the inference: guesses are marked, and a value of unknown type is drafted register
+by register. Every register and bit that could be read has a tag, so that an emulator of the draft answers as the device
+does.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def checked(text: str, path: Path) -> DeviceProfile:
 
 
 def tag_name(reading: Reading) -> str:
-    """``input_12``, until somebody knows better."""
+    """Return a preliminary name such as ``input_12``, for the user to replace."""
     return f"{reading.table}_{reading.address}"
 
 
@@ -126,7 +126,7 @@ def _flags(reading: Reading) -> list[str]:
 
 
 def _states(dumps: Sequence[Dump]) -> list[str]:
-    """What the dumps found beside the registers of the draft, so that nobody takes silence for a refusal."""
+    """Return comments on addresses outside the draft, so that silence is not taken for a refusal."""
     lines = []
     for line in (m for d in dumps for m in d.maps.values() if "counts" in m):
         counts = line["counts"]
@@ -157,7 +157,7 @@ def _bits(series: Series) -> tuple[list[str], int]:
 
 
 def _limits(dumps: Sequence[Dump], series: Series) -> list[str]:
-    """What the dumps learnt of functions, read length and gaps."""
+    """Return the functions, read length and gaps that the dumps found, as keys of a profile."""
     maps = [m for d in dumps for m in d.maps.values()]
     words = [m for m in maps if m["map"] in ("holding", "input") and m.get("max_read")]
     proved = [int(m["max_read"]) for m in words if m.get("limit_proved")]

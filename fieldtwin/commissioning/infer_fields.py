@@ -1,8 +1,8 @@
-"""Which registers belong together, as which type and in which order: all readings of a run are weighed against each other.
+"""Find the registers that belong together, their type and order, by weighing all readings of a run against each other.
 
 Each reading of a stretch of registers has a cost (`infer_costs`); a run of registers is tiled by readings. A reading's
-probability is the share of all tilings, weighed by their costs, that contain it (forward and backward sums, as in a hidden Markov
-model). So a word that makes sense with both of its neighbours is doubtful, and says so.
+probability is the share of all tilings, weighed by their costs, that contain it (forward and backward sums, as in a
+hidden Markov model). So a word that fits both of its neighbours is doubtful, and is reported as such.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ FEWEST_PASSES, FEWEST_VALUES = 6, 4
 
 
 class Level(Enum):
-    """What a probability is worth in words."""
+    """The verbal level of a probability."""
 
     CERTAIN = "certain"
     LIKELY = "likely"
@@ -82,7 +82,10 @@ class Reading:
 
     @property
     def level(self) -> Level:
-        """Certain needs movement seen: what stands still could be anything with the same bits."""
+        """Return the level of the reading.
+
+        Certainty needs observed changes: a constant could be anything with the same bits.
+        """
         if self.probability < GUESS:
             return Level.UNKNOWN
         if self.probability < LIKELY:
@@ -124,8 +127,10 @@ def run_of(table: str, address: int, words: Sequence[Sequence[int]]) -> Run:
 
 
 def infer_run(run: Run, orders: Mapping[str, float] = ORDER_COST, single_cost: float = 0.0) -> list[Reading]:
-    """The most probable tiling of a run. `orders`: what each order costs; `single_cost`: what a value of one register costs
-    besides."""
+    """Return the most probable tiling of a run.
+
+    `orders`: the cost of each order; `single_cost`: the additional cost of a value of one register.
+    """
     count = len(run.words)
     extra = {(t.type, t.order): order_cost(t.type, t.order, orders) for t in run.tiles}
     tiles = [
@@ -161,7 +166,7 @@ def _tiles(words: Sequence[Sequence[int]], start: int) -> list[_Tile]:
     for size in range(2, min(MOST_TEXT_REGISTERS, len(words) - start) + 1):
         last = words[start + size - 1]
         if any(w != last[0] for w in last) or (size == 2 and any(w != words[start][0] for w in words[start])):
-            break  # text stands still
+            break  # text does not change
         row = [w[0] for w in words[start : start + size]]
         for order in orders_of("string"):
             price = cost([row] * len(last), "string", order)

@@ -16,10 +16,11 @@ MOST_BITS, FEWEST_CHANGES = 8, 3
 
 
 def carry_evidence(highs: Sequence[int], lows: Sequence[int]) -> float:
-    """How much more likely it is that `highs` and `lows` are one number than that they change independently; 0 if nothing tells.
+    """Return how much more likely `highs` and `lows` are one number than two independent ones; 0 without evidence.
 
-    Evidence is a high word that changes exactly in those passes in which the low word overflows or underflows: of all ways to
-    place these changes among the passes only one fits. A high word that changes without such an overflow is no evidence.
+    Evidence is a high word that changes exactly in those passes in which the low word overflows or underflows: of all
+    ways to place these changes among the passes only one fits. A high word that changes without such an overflow is not
+    evidence.
     """
     steps = [((b - a), (d - c)) for (a, b), (c, d) in zip(pairwise(highs), pairwise(lows), strict=True)]
     changes = [(up, low) for up, low in steps if up]

@@ -1,6 +1,6 @@
-"""What a value does, seen over time: it counts, it is a state, it is the time, it is another value scaled.
+"""Classify values by their behaviour over time: a counter, a state, a time of day, or another value scaled.
 
-Pure. Every mark is said only of what was seen often enough; what is a mere likeness is a note and says perhaps.
+Pure. A mark needs enough observations; a mere resemblance becomes a note that begins with "perhaps".
 """
 
 from __future__ import annotations
@@ -62,14 +62,14 @@ def _bits(reading: Reading) -> tuple[int, ...]:
 
 
 def _is_time(numbers: Sequence[float], times_s: Sequence[float]) -> bool:
-    """Seconds since 1970, within a day of the truth (clocks stand in all time zones), and going as time goes."""
+    """Return whether the values are seconds since 1970, within a day of the truth (any time zone), and advance with time."""
     near = all(abs(n - t) < DAY_S for n, t in zip(numbers, times_s, strict=True))
     shifts = [n - t for n, t in zip(numbers, times_s, strict=True)]
     return near and max(shifts) - min(shifts) <= 2 + 0.01 * (times_s[-1] - times_s[0])
 
 
 def _runs_with(steps: Sequence[float], elapsed: Sequence[float]) -> bool:
-    """Whether it goes by one a second, and the seconds differ enough from a mere count of the passes."""
+    """Return whether the value advances by one a second, with seconds that differ enough from a count of the passes."""
     total = sum(elapsed)
     return (
         total >= 20
@@ -80,7 +80,7 @@ def _runs_with(steps: Sequence[float], elapsed: Sequence[float]) -> bool:
 
 
 def _is_state(numbers: Sequence[float], steps: Sequence[float]) -> bool:
-    """Few small numbers from near 0 on, each held for a while. What trembles about a number is none."""
+    """Return whether the values are few small numbers near 0, each held for a while. A value that jitters is not a state."""
     states = set(numbers)
     changes = sum(s != 0 for s in steps)
     return (
@@ -93,7 +93,7 @@ def _is_state(numbers: Sequence[float], steps: Sequence[float]) -> bool:
 
 
 def _likeness(reading: Reading, numbers: Sequence[float], *, whole: bool) -> list[str]:
-    """What it looks like, without being more than that."""
+    """Return notes on mere resemblances."""
     if reading.type.startswith("float") or whole:
         for scale in SCALES if whole else (1.0,):
             for (low, high), what, unit in _MAINS:
@@ -155,7 +155,7 @@ def clock_fields(table: str, address: int, words: Sequence[Sequence[int]], times
 
 
 def _clock_s(row: Sequence[int], *, bcd: bool) -> float | None:
-    """Seconds since 1970 of year, month, day, hour, minute, second taken as UTC; None where that is no date."""
+    """Return the seconds since 1970 of year, month, day, hour, minute, second taken as UTC; None if they are not a date."""
     parts = [f"{w:x}" for w in row] if bcd else [str(w) for w in row]
     if not all(p.isdecimal() for p in parts):
         return None

@@ -1,4 +1,4 @@
-"""How long a device thinks: a histogram whose size does not grow with what it is told."""
+"""The response times of a device, in a histogram of constant size."""
 
 from __future__ import annotations
 

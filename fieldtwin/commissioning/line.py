@@ -1,7 +1,7 @@
-"""`line`: what a wire looks like before anything is sent, and why it is silent or garbage. Thin around `causes`.
+"""`line`: observe a line before anything is sent, and explain why it is silent or garbled. Thin around `causes`.
 
-Nothing is sent, but for one question where a probe was asked for: only that can show an echo. A probe is not sent into the
-traffic of others without leave.
+Nothing is sent, except one question if the user requested a probe: only a probe can show an echo. A probe is not sent
+into foreign traffic without permission.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ CONNECT_S = 5.0
 
 @dataclass(slots=True)
 class LineReport:
-    """What a wire looks like. `facts` are lines for a person, by name; the rest is for programs."""
+    """The observations on a line. `facts` are named lines of text for the user; the rest is for programs."""
 
     url: str
     kind: str
@@ -49,7 +49,7 @@ class LineReport:
 
     @property
     def healthy(self) -> bool:
-        """Whether nothing speaks for a fault; silence is none."""
+        """Return whether no evidence points to a fault; silence is no such evidence."""
         return not [c for c in self.causes if c.weight >= 50 and not c.harmless]
 
 
@@ -74,8 +74,11 @@ async def look_at_line(
     connector: Connector | None = None,
     clock: Clock | None = None,
 ) -> LineReport:
-    """Look at the wire at `url`. Raises `Unreachable` for a serial port or CAN bus that cannot be opened (a host that cannot
-    be reached is what is to be explained, and in the report), `NotAllowed` for a probe into the traffic of others."""
+    """Observe the line or bus at `url` and return the report.
+
+    Raises `Unreachable` for a serial port or CAN bus that cannot be opened (an unreachable host is explained in the
+    report instead), `NotAllowed` for a probe into foreign traffic.
+    """
     endpoint = Endpoint.parse(url)
     looker = _Looker(endpoint, look or LineLook(), on_progress, stop, taps, connector, clock or WallClock())
     if endpoint.is_can:
@@ -141,7 +144,7 @@ class _Looker:
             return connection.control_lines(), ignored, connection.counters() is not None
 
     async def _probe(self, settings: SerialSettings, unit: int, *, quiet: bool) -> Probe:
-        """One question; what comes back of it, and behind it."""
+        """Send one question and return its echo, its answer and the bytes after it."""
         sweep = UnitSweep(
             framing_of(self._endpoint),
             (unit,),
@@ -154,7 +157,7 @@ class _Looker:
             while sweep.asked < 2 and (step := sweep.poll(clock.monotonic_ns())) is not None:
                 if isinstance(step, Send):
                     if sweep.asked > 1:
-                        break  # one question: what is damaged is not asked again
+                        break  # one question only: it is not repeated if damaged
                     sent = step.data
                     await connection.write(sent)
                     sweep.handed_over(clock.monotonic_ns())
@@ -249,7 +252,7 @@ class _Looker:
 
 
 def probe_of(unit: int, sent: bytes, heard: bytes, *, answered: bool) -> Probe:
-    """What came back of a question: itself, somebody's answer, both, or something else."""
+    """Classify the bytes received after a question: its echo, an answer, both, or other bytes."""
     if heard.startswith(sent):
         echo, rest = "whole", heard[len(sent) :]
     elif len(heard) >= len(sent) - 1 and _alike(sent, heard) and not answered:

@@ -1,8 +1,8 @@
-"""Which settings a line runs at, from listening at one after the other: nothing is sent. Pure: what was heard in, a verdict out.
+"""Find the settings of a serial line by listening at one setting after another. Nothing is sent. Pure.
 
-A line that carries traffic shows something at every setting, so silence needs one look only. Where bytes come, the setting
-at which they are whole frames is the right one. Parity is known where the port counts its errors; a stop bit more is never
-seen by a receiver, which looks at one.
+A line that carries traffic yields bytes at every setting, so one attempt is enough to detect silence. The setting at
+which the bytes form whole frames is the right one. The parity is known where the port counts its errors; an additional
+stop bit cannot be detected, because a receiver checks only one.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ SHORTEST_S, LONGEST_S = 1.5, 6.0
 """How long one setting is listened to: longer where the line is silent for long between bursts."""
 
 ENOUGH_BYTES = 400
-"""So many bytes without one good frame, and this is not the setting."""
+"""Number of bytes without a good frame after which a setting is rejected."""
 
 
 @dataclass(frozen=True, slots=True)
 class Audition:
-    """What was heard at `settings`, and what the port counted meanwhile (None: it counts nothing)."""
+    """The bytes received at `settings`, and the port's error counts meanwhile (None: it has no counters)."""
 
     settings: SerialSettings
     heard: Heard

@@ -1,7 +1,7 @@
-"""A live wire for the commissioning verbs: opened by its URL, observed by taps, closed on leaving.
+"""A live connection for the commissioning commands: opened by its URL, observed by taps, closed on leaving.
 
-What a verb sends goes through the gateway's own master: the same framing, silences and refusals that run the plant. It
-must never know what a verb is for.
+A command sends through the gateway's own Modbus client or CANopen master, with the framing, silences and refusals that
+run the plant. This module must not depend on the purpose of a command.
 """
 
 from __future__ import annotations
@@ -35,10 +35,11 @@ async def modbus_at(
     connector: Connector | None = None,
     clock: Clock | None = None,
 ) -> AsyncIterator[ModbusClient]:
-    """A Modbus client at `url` (``rtu:/dev/ttyUSB0?baudrate=9600&frame=8N1``, ``tcp://HOST:502``...).
+    """Yield a Modbus client at `url` (``rtu:/dev/ttyUSB0?baudrate=9600&frame=8N1``, ``tcp://HOST:502``...).
 
-    `timeout_s` is for each reply, `spacing_s` the pause behind every exchange (the rate limit of sweeps); `taps` see all
-    that is sent and received. Raises `UsageError` for a url that is no Modbus wire, `Unreachable` where nobody is.
+    `timeout_s` is for each reply, `spacing_s` is the pause after every exchange (the rate limit of sweeps); `taps` see
+    everything that is sent and received. Raises `UsageError` for a URL that is not a Modbus endpoint, `Unreachable`
+    where it cannot be opened.
     """
     endpoint = Endpoint.parse(url)
     framing_of(endpoint)
@@ -61,10 +62,10 @@ async def canopen_at(
     connector: Connector | None = None,
     clock: Clock | None = None,
 ) -> AsyncIterator[CanopenMaster]:
-    """A CANopen master on the bus at `url`, already listening; it sends nothing by itself.
+    """Yield a CANopen master on the bus at `url`, already listening; it sends nothing by itself.
 
-    `bitrate` in bit/s, 0: whatever the bus runs at, where the medium knows. Raises `UsageError` for a url that is no CAN
-    bus, `Unreachable` or `ConnectionLost` where there is none.
+    `bitrate` in bit/s, 0: the bus's current rate, where the medium knows it. Raises `UsageError` for a URL that is not
+    a CAN bus, `Unreachable` or `ConnectionLost` where the bus cannot be opened.
     """
     clock = clock or WallClock()
     async with frames_at(url, bitrate, taps=taps, connector=connector, clock=clock) as connection:
@@ -78,7 +79,7 @@ async def canopen_at(
 async def bytes_at(
     url: str, *, taps: Sequence[Tap] = (), connector: Connector | None = None, clock: Clock | None = None
 ) -> AsyncIterator[ByteConnection]:
-    """The bytes of a wire, for whoever only listens. Raises as `modbus_at`."""
+    """Yield the byte connection at `url`, for listening only. Raises as `modbus_at`."""
     connection = await _observed(connector, taps, clock or WallClock()).open_bytes(Endpoint.parse(url))
     try:
         yield connection
@@ -95,7 +96,7 @@ async def frames_at(
     connector: Connector | None = None,
     clock: Clock | None = None,
 ) -> AsyncIterator[CanConnection]:
-    """The frames of a CAN bus, for whoever only listens. Raises as `canopen_at`."""
+    """Yield the frame connection of a CAN bus, for listening only. Raises as `canopen_at`."""
     endpoint = Endpoint.parse(url)
     if not endpoint.is_can:
         raise UsageError(

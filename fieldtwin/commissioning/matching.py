@@ -19,7 +19,7 @@ from fieldtwin.gateway.protocols.canopen.configure import Identity
 from fieldtwin.gateway.protocols.canopen.dictionary import ObjectDictionary
 
 ENOUGH_SIGNS = 6
-"""So many values that could have been nonsense and are not make a map likely."""
+"""Number of plausible values, out of those that could have been implausible, that make a map likely."""
 TELLING_BYTES = 4
 """A server id shorter than this is many devices'."""
 _SUNSPEC_PROFILE = re.compile(r"^sunspec/.*-(\d+)$")
@@ -51,7 +51,7 @@ class SunSpec:
 
 @dataclass(slots=True)
 class ModbusClues:
-    """What a unit says of itself. None: it was not told, for the reason in `silence` (by function, ``"2B"``)."""
+    """A unit's own identification. None: not obtained, for the reason in `silence` (by function, ``"2B"``)."""
 
     server_id: bytes | None = None
     objects: dict[int, str] | None = None
@@ -61,7 +61,7 @@ class ModbusClues:
 
 @dataclass(slots=True)
 class CanClues:
-    """What a node says of itself."""
+    """A node's own identification."""
 
     identity: Identity | None = None
     name: str = ""
@@ -83,7 +83,7 @@ class Candidate:
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """A tag that was read for a profile: its value, or why there is none. `refused`: the device said no."""
+    """A tag that was read for a profile: its value, or the problem. `refused`: the device refused the read."""
 
     tag: Tag
     value: TagValue | None
@@ -103,7 +103,7 @@ def certain(ranked: Sequence[Candidate]) -> str | None:
 
 
 def summary(ranked: Sequence[Candidate]) -> str:
-    """One sentence, careful: several that fit equally well are no answer."""
+    """Return a cautious sentence: several profiles that fit equally well are not an answer."""
     best = [c for c in ranked if c.sureness is not Sureness.RULED_OUT and c.sureness == ranked[0].sureness]
     if not best:
         return "no known profile fits"
@@ -165,7 +165,7 @@ def judge_modbus(profile: DeviceProfile, clues: ModbusClues, readings: Mapping[s
 def _own_words(
     profile: DeviceProfile, clues: ModbusClues, readings: Mapping[str, Reading]
 ) -> tuple[list[str], list[str], bool]:
-    """What the unit says of itself that `profile` states as well: for, against, and whether that is certain."""
+    """Compare the unit's identification with `profile`'s: reasons for, doubts, and whether they prove it."""
     reasons: list[str] = []
     doubts: list[str] = []
     certain = False
@@ -209,7 +209,7 @@ def _model_holds(profile: DeviceProfile, found: SunSpec, number: int) -> str:
 
 
 def _keys(profile: DeviceProfile, readings: Mapping[str, Reading]) -> tuple[list[str], list[str]]:
-    """What the profile's own `identify` says: for, and what rules it out."""
+    """Check the `identify` entries of the profile: reasons for, and contradictions that rule it out."""
     good: list[str] = []
     wrong: list[str] = []
     for entry in profile.form.identify:

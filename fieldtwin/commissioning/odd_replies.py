@@ -11,7 +11,7 @@ from fieldtwin.gateway.core.errors import ModbusExceptionReply
 
 @dataclass(frozen=True, slots=True)
 class OddReply:
-    """The same reply that does not fit the question, from one unit or from many. `pdu` is empty where it was no whole frame."""
+    """The same mismatched reply, from one unit or from many. `pdu` is empty if it was not a whole frame."""
 
     units: tuple[int, ...]
     settings: SerialSettings | None
@@ -19,7 +19,7 @@ class OddReply:
 
     @property
     def advice(self) -> str:
-        """What the reply is, and what may cause it on a wire of this kind."""
+        """Return a description of the reply and its possible cause on an endpoint of this kind."""
         if not self.pdu:
             if self.settings is not None:
                 return "damaged each time: two devices with one unit id, or a bad line"

@@ -1,4 +1,4 @@
-"""Histories as a picture. The one file that knows matplotlib, which is an extra: ``pip install fieldtwin[plot]``."""
+"""Plot histories. This is the only file that uses matplotlib, an optional extra: ``pip install fieldtwin[plot]``."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def check_plot(path: Path) -> None:
 def _there() -> bool:
     try:
         return find_spec("matplotlib") is not None
-    except ValueError:  # somebody took it out of the running interpreter
+    except ValueError:  # it was removed from the running interpreter
         return False
 
 

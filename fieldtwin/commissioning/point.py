@@ -51,7 +51,7 @@ MOST_SILENT = 3
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """A tag's value, or why there is none: then the value is bad and `problem` says what the device or the wire said."""
+    """A tag's value, or a bad value whose `problem` is the error of the device or the connection."""
 
     value: TagValue
     problem: str = ""
@@ -70,8 +70,8 @@ class Point(Protocol):
     ) -> dict[str, Answer]:
         """Return each tag's value by name, read in as few requests as possible.
 
-        What the device refuses or the wire loses is an answer too; raises only what ends the connection. `found` then holds
-        what was read until then. With `alone` the tags of a request that failed are read again, one by one.
+        A refused or lost read is an answer too; only errors that end the connection are raised. `found` then holds the
+        values read until then. With `alone` the tags of a request that failed are read again, one by one.
         """
         ...
 
@@ -126,13 +126,16 @@ def decoded(tag: Tag, data: bytes, t_ns: int) -> TagValue:
         kind = f"uint{8 * len(data)}" if len(data) in (1, 2, 4) else "string" if text else "bytes"
         tag = replace(tag, type=kind)
     size = OBJECT_BYTES.get(tag.type, None if tag.is_text else 8)
-    if size is not None and len(data) != size:  # another type than was said: shown, and never decoded as something else
+    if size is not None and len(data) != size:  # not the stated type: shown, and never decoded as another type
         return TagValue(data, Quality.UNCERTAIN, Reason.NOT_A_NUMBER, t_ns, data)
     return decode_little(tag, data, t_ns)
 
 
 class ModbusPoint:
-    """`unit` at `url`, asked through `client`. `profile` gives its limits and gaps; what it teaches is kept in `learnt`."""
+    """`unit` at `url`, queried through `client`.
+
+    `profile` gives its limits and gaps; limits that the device reveals are kept in `learnt`.
+    """
 
     protocol = "modbus"
 
@@ -148,7 +151,7 @@ class ModbusPoint:
 
     @property
     def is_broadcast(self) -> bool:
-        """Whether all units of the line are meant."""
+        """Return whether the unit ID addresses all units of the line."""
         return self.unit == 0 and framing_of(Endpoint.parse(self._url)) in ("rtu", "ascii")
 
     @property
@@ -159,10 +162,10 @@ class ModbusPoint:
     async def read(
         self, tags: Sequence[Tag], found: dict[str, Answer] | None = None, *, alone: bool = False
     ) -> dict[str, Answer]:
-        """As `Point.read`. A tag that is scaled by another one brings that along.
+        """Read as `Point.read`. A tag that is scaled by a second tag reads that tag too.
 
-        With `alone`, a unit that leaves `MOST_SILENT` requests in a row without a reply is not asked again: what it was asked
-        for together keeps the answer that it had then.
+        With `alone`, a unit that leaves `MOST_SILENT` requests in a row without a reply is not asked again: the tags
+        that were requested together keep the answer that they had then.
         """
         found = {} if found is None else found
         plan = self._plan(self._with_scales(tags))
@@ -292,7 +295,7 @@ class CanopenPoint:
 
 
 def _singly(read: Read) -> tuple[Read, ...]:
-    """Return a read of its own for each tag of `read`; none where it has one tag only, or has to be read whole."""
+    """Return a separate read for each tag of `read`; none where it has one tag only, or has to be read whole."""
     if read.messages or len(read.tags) < 2:
         return ()
     return tuple(Read(t.registers, (t,), ()) for t in read.tags)

@@ -1,4 +1,4 @@
-"""Where a long verb is, for whoever shows it."""
+"""The progress of a long command, for display."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Which device is meant, opened for asking, and its values as rows for a table or JSON.
+"""Find and open the device that a command line names, and turn its values into rows for a table or JSON.
 
-It must never write.
+This module must never write.
 """
 
 from __future__ import annotations
@@ -53,10 +53,10 @@ def target_of(
     timeout_s: float = 1.0,
     echo: bool = False,
 ) -> Target:
-    """The device that a command line means. Without `address` the profile's own from the factory, else 1.
+    """Return the device that a command line names. Without `address` it is the profile's factory setting, else 1.
 
-    A serial line whose URL says no baud rate or frame takes the profile's. Raises `UsageError` where wire and profile do not
-    belong together, `FileInvalid` for a profile or EDS that is none.
+    A serial line whose URL states no baud rate or frame takes the profile's. Raises `UsageError` where endpoint and
+    profile do not belong together, `FileInvalid` for an invalid profile or EDS.
     """
     endpoint = Endpoint.parse(url)
     profile = load_profile(find("devices", profile_name, extra=folders)) if profile_name else None
@@ -122,9 +122,9 @@ async def read_all(
 ) -> dict[str, Answer]:
     """Read each of `tags` once, and return a value or a problem for each of them by name.
 
-    A tag that cannot be read (`access: wo`) is not asked for. A tag of a request that failed is asked for alone. If the
-    connection is lost, the tags that were not read before have that as their problem; if none was, the error is raised:
-    `Unreachable` or `ConnectionLost`.
+    A tag that cannot be read (`access: wo`) is not requested. A tag of a request that failed is read alone. If the
+    connection is lost, the tags that were not read before have that as their problem; if none was read, the error is
+    raised: `Unreachable` or `ConnectionLost`.
     """
     found: dict[str, Answer] = {}
     lost: Unreachable | None = None

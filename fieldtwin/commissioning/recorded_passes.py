@@ -1,7 +1,7 @@
-"""A recording of exchanges as a dump: what `infer` needs of it, whoever asked and in whatever order.
+"""Convert a recording of exchanges into a dump for `infer`, for any client and any order of requests.
 
-A client polls groups of registers, each group at its own period. A round ends when a request is repeated; the newest value of
-every register then makes one pass. This module sends nothing and opens no file.
+A client polls groups of registers, each group at its own period. A round ends when a request is repeated; the newest
+value of every register then makes one pass. This module sends nothing and opens no file.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
-"""`scan` of a CANopen bus: listen, then a paced read of 1000h from each node, then LSS fastscan for those without an id.
+"""`scan` of a CANopen bus: listen, then read 1000h from each node, then LSS fastscan for nodes without an ID.
 
-Nothing is sent before the bus has been listened to, nothing at all where traffic was heard and nobody said that the bus may
-be shared, and no SDO to a node that another master speaks SDO with: two clients on one channel ruin each other's transfers.
+The reads are limited in rate. Nothing is sent before the bus has been observed. Nothing is sent at all if traffic was
+heard and the user did not allow sharing the bus. No SDO is sent to a node that exchanges SDOs with another master: two
+clients on one channel ruin each other's transfers.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ MOST_UNCONFIGURED = 16
 
 @dataclass(frozen=True, slots=True)
 class CanScanOptions:
-    """What a scan may do. `per_s`: SDO reads a second at most. `lss`: look for nodes without a node id."""
+    """The limits of a scan. `per_s`: SDO reads a second at most. `lss`: look for nodes without a node ID."""
 
     bitrate: int = 0
     nodes: tuple[int, ...] = ALL_NODES
@@ -54,7 +55,7 @@ class CanScanOptions:
 
 @dataclass(slots=True)
 class CanScan:
-    """What a scan found so far. `blocked`: nodes that another master speaks SDO with, not asked by us."""
+    """The findings of a scan so far. `blocked`: nodes that exchange SDOs with another master, not queried by the scan."""
 
     url: str
     bitrate: int = 0
@@ -122,7 +123,7 @@ class CanScanner:
         try:
             self.result.facts = self._facts(self._endpoint)
             await self._listen()
-            self.result.heard = deepcopy(self._ear.heard)  # what is heard from now on is answers to us as well
+            self.result.heard = deepcopy(self._ear.heard)  # later frames include answers to the scan
             if self._may_ask():
                 await self._ask()
         finally:
@@ -152,7 +153,10 @@ class CanScanner:
             result.notes.append(f"the interface runs at {facts.bitrate} bit/s, not at {options.bitrate}")
 
     async def _try_rates(self) -> None:
-        """An adapter whose bit rate is open: listen at one after the other. Garbage is no frame, so frames prove the rate."""
+        """Listen at one bit rate after another, for an adapter without a set bit rate.
+
+        Garbage never forms a frame, so frames prove the rate.
+        """
         result = self.result
         for rate in ADAPTER_RATES:
             if self._stop():
@@ -235,7 +239,7 @@ class CanScanner:
                 await self._look_for_unconfigured(master, len(options.nodes) * each_s, total_s)
 
     def _met_master(self) -> bool:
-        """Whether another master began to talk, which was silent while we listened."""
+        """Return whether another master, silent during the listening, has begun to send."""
         if self._options.share_bus or not self._ear.heard.has_master:
             return False
         note = "another master began to talk: stopped asking. --share-bus goes on, one node at a time"
@@ -283,7 +287,7 @@ class CanScanner:
             self._tell(Progress("LSS fastscan", done_s, total_s, "", len(result.nodes)))
             try:
                 while not self._stop() and len(result.unconfigured) < MOST_UNCONFIGURED:
-                    found = await lss.fastscan(verify=not result.unconfigured)  # who was found keeps quiet now
+                    found = await lss.fastscan(verify=not result.unconfigured)  # a node that was found keeps silent now
                     if found is None:
                         break
                     result.unconfigured.append(found)

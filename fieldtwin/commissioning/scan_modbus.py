@@ -1,7 +1,7 @@
-"""`scan` of a Modbus wire: listen, then the likely settings, then every unit. Thin: the pure parts decide, this moves bytes.
+"""`scan` of a Modbus endpoint: listen, then the likely settings, then every unit.
 
-Nothing is sent before the line has been listened to, and nothing at all where traffic was heard and nobody said that
-the bus may be shared.
+The pure parts decide, this moves bytes. Nothing is sent before the line has been observed, and nothing at all if
+traffic was heard and the user did not allow sharing the bus.
 """
 
 from __future__ import annotations
@@ -28,10 +28,13 @@ from fieldtwin.gateway.protocols.modbus.framings import Framing, framing_of
 from fieldtwin.gateway.wallclock import WallClock
 
 SHARED_QUIET_NS = 30 * NS_PER_MS
-"""On a line with another master: so much silence before each question."""
+"""Silence in seconds before each question on a line with another master."""
 QUICK_TIMEOUT_S, LINE_TIMEOUT_S, SOCKET_TIMEOUT_S = 0.2, 0.6, 1.0
-"""For each reply, where nobody says otherwise. libmodbus's servers take what follows a question to another unit within
-500 ms for its answer, and never hear a question that comes sooner: a sweep that is to find them has to be so slow."""
+"""Default timeout of each reply, in seconds.
+
+libmodbus's servers take a frame within 500 ms after a question to another unit for its answer, and miss a question that
+comes sooner: a sweep that is to find them must be this slow.
+"""
 MANY_FAILURES = 3
 MOST_BREAKS = 3
 """A far end that hangs up so often in a row over one unit is not asked for it again."""
@@ -39,7 +42,10 @@ MOST_BREAKS = 3
 
 @dataclass(frozen=True, slots=True)
 class ScanOptions:
-    """What a scan may do. None: as the wire suggests. `every_setting`: go on over all settings though units were found."""
+    """The limits of a scan. None: derived from the endpoint.
+
+    `every_setting`: try all settings even after units were found.
+    """
 
     units: tuple[int, ...] | None = None
     timeout_s: float | None = None
@@ -63,7 +69,7 @@ class FoundUnit:
 
 @dataclass(slots=True)
 class ModbusScan:
-    """What a scan found so far; whole when `stopped` is False."""
+    """The findings of a scan so far; complete when `stopped` is False."""
 
     url: str
     heard: Heard | None = None
@@ -85,7 +91,10 @@ class ModbusScan:
 
 
 class ModbusScanner:
-    """One scan of `url`; `run` it once. `stop` is asked often: once it says True, what was found is kept and `run` ends."""
+    """One scan of `url`; `run` it once.
+
+    `stop` is called often: when it returns True, `run` ends and the findings are kept.
+    """
 
     def __init__(
         self,
@@ -128,7 +137,7 @@ class ModbusScanner:
         return self.result
 
     def _doubt(self) -> None:
-        """Any exception is a presence; one is no proof of it."""
+        """Note doubtful units: any exception counts as a unit, but one exception does not prove it."""
         failures = [f.answer.unit for f in self.result.units if f.answer.exception == 4]
         if len(failures) >= MANY_FAILURES:
             self.result.notes.append(
@@ -141,7 +150,7 @@ class ModbusScanner:
         return self._met_master or self._stop()
 
     def planned(self) -> list[tuple[str, list[Step]]]:
-        """What `run` would ask after listening, phase by phase, where nobody answers."""
+        """Return the questions of `run` after listening, phase by phase, for the case that no unit answers."""
         if not self._endpoint.is_serial:
             first = spread_over(self._units)
             rest = [u for u in self._units if u not in first]
@@ -196,7 +205,7 @@ class ModbusScanner:
         """Listen; True where questions may follow."""
         options, result = self._options, self.result
         likely = [*plan.likely_settings(self._endpoint), *plan.likely_settings(replace(self._endpoint, params=()))]
-        first = said or likely[0]  # what was said may be wrong: traffic tells
+        first = said or likely[0]  # the stated settings may be wrong: traffic shows it
         audition = await self._audition(first, options.listen_s, whole=True)
         result.auditions.append(audition)
         result.heard = audition.heard
@@ -303,7 +312,7 @@ class ModbusScanner:
         ]
 
     async def _drive(self, sweep: UnitSweep, endpoint: Endpoint, tell: Callable[[], None]) -> None:
-        """Until everybody was asked, opening the wire anew where the far end hangs up."""
+        """Run the sweep until all units were asked, reopening the connection whenever the server closes it."""
         breaks, last_asked = 0, -1
         while True:
             url = str(endpoint)

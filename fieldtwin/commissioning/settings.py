@@ -61,7 +61,7 @@ class Step:
 
     @property
     def seconds(self) -> float:
-        """How long it takes where nobody answers."""
+        """Return the duration in seconds if no unit answers."""
         char_s = self.settings.char_time_s if self.settings else 0.0
         opening_s = OPENING_S if self.settings else 0.0
         return opening_s + expected_s(
@@ -74,7 +74,7 @@ class Step:
 
 
 def seconds_of(steps: Iterable[Step]) -> float:
-    """How long all of them take where nobody answers."""
+    """Return the total duration in seconds of all steps if no unit answers."""
     return sum(step.seconds for step in steps)
 
 
@@ -131,7 +131,7 @@ def all_settings(endpoint: Endpoint) -> list[SerialSettings]:
 
 
 def likely_settings(endpoint: Endpoint) -> list[SerialSettings]:
-    """What a quick pass tries of what `endpoint` leaves open."""
+    """Return the settings that a quick pass tries for those that `endpoint` leaves open."""
     if endpoint.scheme != "ascii":
         return _open(endpoint, LIKELY)
     return _open(endpoint, [SerialSettings(b, f) for f in ("7E1", "8N1") for b in (9600, 19200, 38400, 115200, 4800)])

@@ -26,7 +26,7 @@ def common(data: bytes) -> dict[str, str]:
 
 
 def next_model(data: bytes, address: int) -> tuple[int, int, int] | None:
-    """The model whose number and length stand in `data`, read at `address`: number, address, length. None at the end."""
+    """Return number, address and length of the model in `data`, read at `address`. None at the end."""
     number, size = int.from_bytes(data[:2], "big"), int.from_bytes(data[2:4], "big")
     if number in (0, END) or address + 2 + size > 0x10000:
         return None

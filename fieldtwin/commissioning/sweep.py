@@ -19,10 +19,13 @@ from fieldtwin.gateway.protocols.modbus.request import Request
 from fieldtwin.gateway.protocols.modbus.requests import ReadRegisters
 
 PROBE = ReadRegisters("holding", 0, 1)
-"""The question: a register that most devices have. One that has not says so, and is as present."""
+"""The question: a register that most devices have.
+
+A device without it answers with an exception, which shows that it is present.
+"""
 
 NOBODY = (0x0A, 0x0B)
-"""Exceptions by which a gateway says that behind it nobody answers (AP 7)."""
+"""Exceptions by which a gateway reports that no device answers behind it (AP 7)."""
 
 REST_NS = 30 * NS_PER_MS
 """How long the rest of a reply that has begun may take: a USB adapter hands over every 16 ms."""
@@ -33,7 +36,7 @@ NEVER_SILENT_NS = 5_000 * NS_PER_MS
 
 @dataclass(frozen=True, slots=True)
 class UnitAnswer:
-    """A unit that is there. `exception` is its code, 0 where it answered with data; `reply` is the PDU."""
+    """A unit that answered. `exception` is its code, 0 where it answered with data; `reply` is the PDU."""
 
     unit: int
     reply: bytes
@@ -97,13 +100,13 @@ class UnitSweep:
     ) -> None:
         self.found: dict[int, UnitAnswer] = {}
         self.damaged: dict[int, bytes] = {}
-        """Units that twice gave a reply that does not fit the question -> its PDU; empty where it was no whole frame."""
+        """Units that twice gave a reply that does not fit the question, with its PDU; empty if it was not a whole frame."""
         self.behind_gateway: set[int] = set()
         """Units of which a gateway said that they do not answer."""
         self.echo = False
         """What we send comes back."""
         self.foreign = 0
-        """Good frames of others: another master, or its units."""
+        """Number of good frames of another master or its units."""
         self.other_requests = 0
         """Good requests that are not ours: there is another master."""
         self.noise_bytes = 0

@@ -1,7 +1,8 @@
-"""What a serial line carries, by listening alone: frames, who is asked, who answers. Pure: chunks and their times in.
+"""Observe a serial line passively: frames, requests and replies. Pure: chunks of bytes and their times in.
 
-Both directions are on one pair of wires, so requests are told from replies by their shape and their order. A frame counts
-when its check sum is right. Nothing here knows at which baud rate it listens: `baud` compares what was heard at several.
+Both directions share one pair of wires, so requests and replies are distinguished by their shape and order. A frame
+counts if its check sum is right. This module does not know the baud rate at which it listens: `baud` compares the
+results at several.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ SETTLE_NS = 40 * NS_PER_MS
 """A silence behind which nothing belongs to what came before, behind a USB adapter as well."""
 
 SURE_FRAMES = 3
-"""So many good frames are no accident: one of four random bytes has a right check sum by chance once in 65,536."""
+"""Number of good frames that cannot be chance: one of 65,536 random four-byte sequences has a right check sum."""
 
 
 @dataclass(slots=True)
@@ -46,7 +47,7 @@ class Heard:
     repeated: int = 0
     """Requests that came twice at once, as where every sender hears itself."""
     glitches: int = 0
-    """Pieces of one or two bytes beside frames, as where a transceiver's direction is switched too early or too late."""
+    """Number of pieces of one or two bytes next to frames, caused by a transceiver that switches too early or late."""
     longest_gap_ns: int = 0
     values: dict[int, int] = field(default_factory=dict)
     """How often each byte value came."""
@@ -97,7 +98,7 @@ class LineEar:
             self._take(frame)
 
     def settle(self, now_ns: int) -> None:
-        """It is `now_ns`: after a silence, what is incomplete stays so."""
+        """End an incomplete frame, which counts as damaged, if the line has been silent for `SETTLE_NS` at `now_ns`."""
         if self._last_ns is not None and now_ns - self._last_ns > SETTLE_NS:
             for frame in self._splitter.flush():
                 self._take(frame)

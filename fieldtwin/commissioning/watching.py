@@ -1,6 +1,6 @@
-"""Values of one device again and again: their history, bounded, and a sparkline of it.
+"""Read values of one device repeatedly: their bounded history, and a sparkline of it.
 
-It must never write, and never asks faster than it is told to. Knows no screen.
+This module must never write, and never reads faster than requested. It does no output.
 """
 
 from __future__ import annotations
@@ -15,14 +15,17 @@ from fieldtwin.gateway.core.clock import NS_PER_S, Clock
 from fieldtwin.gateway.core.profile import Tag
 
 MOST_SAMPLES = 3600
-"""So many samples of a tag are kept for a sparkline and a plot; older ones are counted and forgotten."""
+"""Number of samples of a tag that are kept for a sparkline and a plot; older ones are counted and dropped."""
 BLOCKS = "▁▂▃▄▅▆▇█"
 GAP = " "
 
 
 @dataclass
 class History:
-    """What a tag was, in seconds since the start; None where there was no good value. `least` and `most` of all samples ever."""
+    """The history of a tag, in seconds since the start; None where there was no good value.
+
+    `least` and `most` are of all samples ever.
+    """
 
     times_s: deque[float] = field(default_factory=lambda: deque(maxlen=MOST_SAMPLES))
     values: deque[float | None] = field(default_factory=lambda: deque(maxlen=MOST_SAMPLES))
@@ -48,7 +51,7 @@ class History:
             self.least, self.most = min(self.least, number), max(self.most, number)
 
     def sparkline(self, width: int) -> str:
-        """The last `width` samples as blocks between their own smallest and largest; a blank where there is none."""
+        """Return the last `width` samples as blocks between their smallest and largest; a blank for a missing value."""
         return sparkline(list(self.values)[-width:])
 
 

@@ -1,7 +1,8 @@
-"""The log of all that a verb put on a wire, and of what came back: kept beside every dump, and wherever `--log` says.
+"""Log everything that a command sends and receives: next to every dump, and in the file of `--log`.
 
-JSON lines as a run's capture has them (``t_ns``, ``endpoint``, ``direction``, ``hex``, ``frame``), so `fieldtwin export` and
-Wireshark's readers take both. A line with ``"started"`` stands before each session: who, when, with what words.
+The JSON lines have the format of a run's capture (``t_ns``, ``endpoint``, ``direction``, ``hex``, ``frame``), so
+`fieldtwin export` and Wireshark's readers accept both. A line with ``"started"`` precedes each session: user, time and
+command line.
 """
 
 from __future__ import annotations

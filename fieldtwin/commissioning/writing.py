@@ -1,7 +1,7 @@
-"""Writing one value with care: what was there, what shall be there, what is there afterwards.
+"""Write one value with care: read the old value, write, read back and compare.
 
-Every refusal that needs no device comes before anything is sent. It must never repeat a write: a value that wears out its memory
-is written once, and a reply that was lost says nothing about what the device did.
+Every refusal that needs no device comes before anything is sent. This module must never repeat a write: a value that
+wears out its memory is written once, and a lost reply does not show whether the device executed the write.
 """
 
 from __future__ import annotations
@@ -30,8 +30,11 @@ class Write:
 
 @dataclass(frozen=True, slots=True)
 class Written:
-    """What came of a write. `before` and `after` are the raw bytes as read; None where the value cannot be read (write-only,
-    broadcast). `same`: the device held the value already and nothing was sent."""
+    """The result of a write.
+
+    `before` and `after` are the raw bytes as read; None where the value cannot be read (write-only, broadcast). `same`:
+    the device held the value already and nothing was sent.
+    """
 
     write: Write
     before: bytes | None
@@ -116,14 +119,16 @@ def parse_value(tag: Tag, text: str) -> Scalar:
 
 
 def check_broadcast(point: Point, *, i_know: bool) -> None:
-    """Raise `NotAllowed` where unit 0 of a line is meant and `i_know` is not said: every unit would execute it."""
+    """Raise `NotAllowed` for unit 0 of a line without `i_know`: every unit would execute the write."""
     if isinstance(point, ModbusPoint) and point.is_broadcast and not i_know:
         raise NotAllowed("unit 0 is every unit of the line, and none of them answers", expected="--i-know")
 
 
 async def before(point: Point, write: Write) -> Answer | None:
-    """What the device holds now; None where it cannot be read. Raises `CheckFailed` where it refuses or does not answer:
-    a write whose old value nobody knows cannot be put back."""
+    """Return the device's current value; None where it cannot be read.
+
+    Raises `CheckFailed` where the device refuses or does not answer: without the old value a write cannot be undone.
+    """
     if not write.tag.readable or _broadcasts(point):
         return None
     answer = (await point.read([write.tag]))[write.tag.name]
@@ -139,7 +144,8 @@ async def before(point: Point, write: Write) -> Answer | None:
 async def carry_out(point: Point, write: Write, old: Answer | None) -> Written:
     """Write, read back, compare. A nonvolatile value that is held already is not written.
 
-    Raises `VerifyFailed` when the device acknowledged and holds something else, besides the errors of wire and device.
+    Raises `VerifyFailed` when the device acknowledged the write but holds a different value, and the errors of
+    connection and device.
     """
     held = old.value.raw if old is not None else None
     if write.tag.nonvolatile and held is not None and _same(write, held):
@@ -151,9 +157,9 @@ async def carry_out(point: Point, write: Write, old: Answer | None) -> Written:
 
 
 async def restore(point: Point, done: Written) -> Written:
-    """Put back what was there before, and read that back. Nothing is written where the device holds it: a write that failed.
+    """Restore the value from before the write, and read it back. If the device holds it already, nothing is written.
 
-    Raises `NotAllowed` where nobody knows what was there, otherwise as `carry_out`.
+    Raises `NotAllowed` where the old value is not known, otherwise as `carry_out`.
     """
     tag = done.write.tag
     if done.before is None:

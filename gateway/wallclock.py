@@ -1,4 +1,4 @@
-"""The wall clock: the only place on the gateway's side that imports ``time``. Also the event loop whose waits end on time."""
+"""The wall clock, the only module of the gateway that imports ``time``, and the event loop whose waits end on time."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from fieldtwin.gateway.core.clock import NS_PER_S
 T = TypeVar("T")
 
 LEAD_NS, LEAD_SHARE = 60_000, 20
-"""How long before the end of a wait to be awake, at most; and its largest share of the wait, as one part in so many."""
+"""How long before the end of a wait to be awake: at most this many nanoseconds, and at most one 20th of the wait."""
 
 
 class WallClock:
     """`fieldtwin.gateway.core.clock.Clock` on the host's clocks.
 
-    `monotonic_ns` is CLOCK_MONOTONIC, which every process of a host shares: time stamps in the process image can be
-    compared across processes.
+    `monotonic_ns` is CLOCK_MONOTONIC, which all processes of a host share: time stamps in the process image can be
+    compared between processes.
     """
 
     def monotonic_ns(self) -> int:
@@ -39,39 +39,41 @@ class WallClock:
 
 
 def run(main: Coroutine[Any, Any, T]) -> T:
-    """As `asyncio.run`, on a `precise_loop`: for processes that keep the silences of a serial line."""
+    """Run `main` as `asyncio.run` does, on a `precise_loop`: for processes that keep the silences of a serial line."""
     with asyncio.Runner(loop_factory=precise_loop) as runner:
         return runner.run(main)
 
 
 def precise_loop() -> asyncio.AbstractEventLoop:
-    """asyncio's event loop with waits that end within some 20 us; elsewhere than on Linux its usual one.
+    """Return asyncio's event loop with waits that end within some 20 us; on systems other than Linux, its usual loop.
 
-    epoll counts in milliseconds, so asyncio is up to one late each time: a silence of 3.5 characters at 19200 baud, 2 ms,
-    takes half as long again.
+    epoll counts in milliseconds, so asyncio is up to one millisecond late each time: a silence of 3.5 characters at
+    19200 baud, 2 ms, takes half as long again.
     """
     selector = TimerSelector.make() if sys.platform.startswith("linux") else None
     return asyncio.SelectorEventLoop(selector)
 
 
 if sys.platform.startswith("linux"):
-    _TFD_FLAGS = os.O_NONBLOCK | os.O_CLOEXEC  # TFD_NONBLOCK and TFD_CLOEXEC are these (sys/timerfd.h)
+    _TFD_FLAGS = os.O_NONBLOCK | os.O_CLOEXEC  # TFD_NONBLOCK and TFD_CLOEXEC have these values (sys/timerfd.h)
 
     class TimerSelector(selectors.EpollSelector):
-        """epoll, and a timerfd (one a loop) that ends its waits. Python 3.13 has os.timerfd_create; before, libc is asked."""
+        """epoll, and a timerfd (one per loop) that ends its waits. Python 3.13 has os.timerfd_create; before, libc is
+        called."""
 
         def __init__(self, descriptor: int, settime: Any) -> None:
             super().__init__()
             self._descriptor = descriptor
             self._settime = settime
             self._spec = (ctypes.c_long * 4)()  # struct itimerspec: interval, then value; seconds and nanoseconds each
-            # Edge triggered: a timer that ran out wakes one wait and is not read. It has no key, so nobody hears of it.
+            # Edge triggered: a timer that expired wakes one wait and is not read. It has no key, so it is not reported
+            # to the loop.
             epoll: select.epoll = self._selector  # type: ignore[attr-defined]  # typeshed leaves it out
             epoll.register(descriptor, select.EPOLLIN | select.EPOLLET)
 
         @classmethod
         def make(cls) -> TimerSelector | None:
-            """A selector, or None where the C library or a sandbox has no timerfd."""
+            """Return a selector, or None if the C library or a sandbox has no timerfd."""
             try:
                 libc = ctypes.CDLL(None, use_errno=True)
                 descriptor = libc.timerfd_create(time.CLOCK_MONOTONIC, _TFD_FLAGS)
@@ -80,10 +82,11 @@ if sys.platform.startswith("linux"):
                 return None
 
         def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
-            """As in the base class; a wait never ends early, and at most a millisecond late should the timer fail.
+            """Select as the base class does; a wait never ends early, and ends at most a millisecond late if the timer
+            fails.
 
-            Waking up takes a computer some 50 us. The timer is that much ahead, and what is left is looked away: descriptors are
-            asked without waiting. That is at most a twentieth of a wait.
+            Waking up takes a computer some 50 us. So the timer expires that much earlier, and the rest of the wait is
+            spent polling the descriptors without waiting. That is at most a twentieth of a wait.
             """
             if timeout is None or timeout <= 0:
                 return super().select(timeout)

@@ -1,8 +1,8 @@
-"""The audit log: every write, NMT command and refusal, one JSON line each, appended and never rewritten.
+"""The audit log: every write, NMT command and refusal, as one JSON line each, appended and never rewritten.
 
-Who asked (the PLC, the safe-state logic, the start-up configuration), what, the old and the new value, and how it ended.
-A secret tag's values are not written down. A log that cannot be written stops writes to the plant: what is not on record
-does not happen.
+An entry holds the source (the PLC, the safe-state logic, the start-up configuration), the action, the old and the new
+value, and the result. A secret tag's values are not written down. If the log cannot be written, the plant is not
+written either: no action is taken without a record.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from fieldtwin.gateway.core.errors import Unreachable
 
 
 class AuditLog:
-    """Appends to `path`, which only its owner may read. Each entry is on disk before `write` returns its control."""
+    """Appends to `path`, which only its owner may read. Each entry is written to the file before `note` returns."""
 
     def __init__(self, path: Path, clock: Clock) -> None:
         self._clock = clock
@@ -30,7 +30,8 @@ class AuditLog:
         self._file: BinaryIO = os.fdopen(descriptor, "ab", buffering=0)
 
     def note(self, action: str, device: str, *, by: str, result: str, **details: Any) -> None:
-        """One entry. `action` is write, nmt, sdo or refuse; `result` is asked, done, refused or failed, with a reason."""
+        """Write one entry. `action` is write, nmt, sdo or refuse; `result` is asked, done, refused or failed, with a
+        reason."""
         entry = {
             "utc_ns": self._clock.utc_ns(),
             "action": action,

@@ -1,4 +1,4 @@
-"""How long to leave somebody alone who did not answer: doubling, with a ceiling."""
+"""The delay before the next try of a device that did not answer: doubling, with an upper limit."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ class Backoff:
         self.failures = 0
 
     def restate(self, first_s: float, limit_s: float) -> None:
-        """From the next failure on, these delays."""
+        """Use these delays from the next failure on."""
         self._first_s, self._limit_s = first_s, limit_s
 
     def next_s(self) -> float:
-        """Note a failure; the delay before the next try."""
+        """Note a failure, and return the delay before the next try."""
         delay = min(self._limit_s, self._first_s * 2.0 ** min(self.failures, 20))
         self.failures += 1
         return delay

@@ -1,7 +1,8 @@
-"""Bridged writes and refusals on record: who, where, what, and how it ended.
+"""Audit records of bridged writes and refusals: client, target, request and result.
 
-A write is noted before it is on the wire and does not happen when it cannot be noted. A client that is refused again and again
-would fill the disk: at most one refusal a second and client is noted, with how many there were since.
+A write is recorded before it is sent, and is not carried out if it cannot be recorded. A client that is refused again
+and again would fill the disk. So at most one refusal per second and client is recorded, with the number of refusals
+since.
 """
 
 from __future__ import annotations
@@ -14,11 +15,11 @@ from fieldtwin.gateway.protocols.modbus.server_forward import ForwardedReply
 from fieldtwin.gateway.runtime.audit import AuditLog
 
 MOST_CLIENTS = 256
-"""Clients whose last refusal is remembered."""
+"""For how many clients the last refusal is remembered."""
 
 
 class WriteRecord:
-    """The audit entries of one bridge. `lost` counts what could not be written down."""
+    """The audit entries of one bridge. `lost` counts entries that could not be written."""
 
     def __init__(self, audit: AuditLog, clock: Clock) -> None:
         self.lost = 0
@@ -27,7 +28,7 @@ class WriteRecord:
         self._refusals: dict[str, tuple[int, int]] = {}
 
     def asked(self, by: str, device: str, unit: int, pdu: bytes) -> None:
-        """A write is about to go out. Raises exception 04 for the client where that cannot be noted."""
+        """Record a write that is about to be sent. Raises exception 04 for the client if it cannot be recorded."""
         try:
             self._audit.note("write", device, by=by, result="asked", unit=unit, pdu=pdu.hex())
         except Unreachable as e:
@@ -35,14 +36,14 @@ class WriteRecord:
             raise refusal(pdu[0], SERVER_FAILURE) from e
 
     def ended(self, by: str, device: str, unit: int, pdu: bytes, result: ForwardedReply | FieldtwinError) -> None:
-        """How a write ended."""
+        """Record the result of a write."""
         text = "done" if isinstance(result, ForwardedReply) else f"failed: {result}"
         if isinstance(result, ModbusExceptionReply):
             text = f"refused: exception {result.code:02X}h"
         self._note("write", device, by=by, result=text, unit=unit, pdu=pdu.hex())
 
     def refused(self, by: str, device: str, unit: int, pdu: bytes, code: int, why: str = "") -> None:
-        """A write that was not passed on."""
+        """Record a write that was not forwarded."""
         client = by.partition(" (")[0].rpartition(":")[0] or by  # without the port and the role
         now_ns = self._clock.monotonic_ns()
         last_ns, held_back = self._refusals.pop(client, (0, 0))
@@ -60,4 +61,4 @@ class WriteRecord:
         try:
             self._audit.note(action, device, by=by, result=result, unit=unit, pdu=pdu, **details)
         except Unreachable:
-            self.lost += 1  # counted; the next write will not start without a record
+            self.lost += 1  # counted; the next write does not start without a record

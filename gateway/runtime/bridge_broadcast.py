@@ -1,6 +1,7 @@
-"""An answer to whoever broadcast through a bridge, for clients that know no request without one.
+"""The answer to a client that sent a broadcast through a bridge, for clients that expect an answer to every request.
 
-On a line nobody answers a broadcast (SL 2.1), so this says only that it went out. It must never know a wire.
+Units on a serial line do not answer a broadcast (SL 2.1), so the answer only shows that it was sent. This module must
+not know a connection.
 """
 
 from __future__ import annotations
@@ -12,13 +13,14 @@ from fieldtwin.gateway.protocols.modbus.refusals import refusal
 from fieldtwin.gateway.protocols.modbus.server import NO_PATH, exception_pdu
 
 _REPEATED = {0x05: 5, 0x06: 5, 0x0F: 5, 0x10: 5, 0x16: 7}
-"""How much of the request the normal reply repeats (AP 6); of 15h all of it."""
+"""How many bytes of the request the normal reply repeats (AP 6); for 15h all of it."""
 
 
 def when_all_are_out(pdu: bytes, lines: Iterable[asyncio.Future[bytes | None]]) -> asyncio.Future[bytes | None]:
-    """The normal reply to `pdu` once every line is through with it and it went out on one of them; else exception 0A.
+    """Return the normal reply to `pdu` once every line has finished with it and it was sent on at least one; else
+    exception 0A.
 
-    `lines` hold what became of it on each line: an exception response where it did not go out.
+    `lines` hold the result of each line: an exception response if the broadcast was not sent.
     """
     answer: asyncio.Future[bytes | None] = asyncio.get_running_loop().create_future()
     open_ones = list(lines)

@@ -1,6 +1,7 @@
-"""Replies to reads that are kept for a moment, so that ten screens cost the line as much as one.
+"""A short-lived cache of read replies, so that ten screens load the bus as much as one.
 
-Bounded; a reply older than `age_ms` is never given out, and a write to a unit forgets what was read from it. Pure.
+The cache is limited in size. A reply older than `age_ms` is never returned, and a write to a unit deletes what was read
+from it. Pure.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ class ReplyCache:
         self.evicted = 0
 
     def get(self, bus: str, unit: int, pdu: bytes, now_ns: int) -> bytes | None:
-        """A reply that came within the last `age_ms`, or None."""
+        """Return a reply that was received within the last `age_ms`, or None."""
         found = self._kept.get((bus, unit, pdu)) if self._age_ns else None
         if found is None or now_ns - found[1] > self._age_ns:
             return None
@@ -42,6 +43,6 @@ class ReplyCache:
             self.evicted += 1
 
     def forget(self, bus: str, unit: int) -> None:
-        """Something was written to a unit; unit 0 is every unit of the bus."""
+        """Delete the replies of a unit that was written to; unit 0 means every unit of the bus."""
         for key in [k for k in self._kept if k[0] == bus and unit in (k[1], 0)]:
             del self._kept[key]

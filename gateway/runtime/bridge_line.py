@@ -1,7 +1,8 @@
-"""A Modbus RTU master on a serial line that asks the gateway: we are one or more slaves on its line.
+"""A Modbus RTU client on a serial line that sends requests to the gateway: the gateway acts as one or more servers on
+it.
 
-A reply on a line does not say which request it answers. So when the master says anything else before it has its answer, it
-has given up, and that answer is never sent: it would pass for the answer to what comes next.
+A reply on a serial line does not identify its request. So when the client sends anything else before it has its answer,
+it has given up, and that answer is never sent: the client would take it for the answer to the next request.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from fieldtwin.gateway.runtime.bridge_tcp import Answer, Ask, Caller
 
 @dataclass
 class LineCounters:
-    """Frames of anybody; requests to units of ours; answers that came too late; bytes that were no frame."""
+    """All frames; requests to our units; answers that came too late; bytes that were not part of a frame."""
 
     frames: int = 0
     requests: int = 0
@@ -32,7 +33,8 @@ class LineCounters:
 
 
 class LineFront:
-    """A serial line, until cancelled; a port that is gone is opened again. `ours` says which units we are."""
+    """A serial line, which runs until cancelled; a lost port is opened again. `ours` tells for which units we
+    answer."""
 
     def __init__(
         self, endpoint: Endpoint, connector: Connector, ask: Ask, ours: Callable[[int], bool], clock: Clock
@@ -50,11 +52,11 @@ class LineFront:
 
     @property
     def bound(self) -> Endpoint | None:
-        """The line, while it is open."""
+        """The serial line, while it is open."""
         return self.endpoint if self.connected else None
 
     def describe(self) -> dict[str, Any]:
-        """For the status."""
+        """Return the line's part of the status."""
         listening = str(self.endpoint) if self.connected else None
         return {"listening": listening, "error": self.error, **asdict(self.counters)}
 
@@ -96,7 +98,7 @@ class LineFront:
                     self._answering = asyncio.get_running_loop().create_task(reply, name="answer to a line")
 
     async def _next(self, connection: ByteConnection, line: RtuRequests) -> bytes:
-        """What comes next; empty after a silence that ends an unfinished frame."""
+        """Return the bytes that come next; empty after a silence that ends an unfinished frame."""
         if not line.pending:
             return await connection.read()
         try:
@@ -117,10 +119,10 @@ class LineFront:
         try:
             await connection.write(request.reply(pdu))
         except ConnectionLost:
-            pass  # whoever reads the line learns of it
+            pass  # the task that reads the line gets the same error
 
     async def _give_up(self) -> None:
-        """The master went on: an answer that is still under way is not sent."""
+        """Cancel an answer that is still under way, because the client has given up on it."""
         task, self._answering = self._answering, None
         if task is None or task.done():
             return

@@ -1,7 +1,7 @@
-"""Who may ask what through a bridge: client networks and roles to units, functions and address ranges. What is not allowed
-is refused.
+"""The allow-list of a bridge: which client networks and roles may use which units, functions and address ranges. Every
+other request is refused.
 
-Pure: addresses and roles of clients as text, requests as `Asked`. Nothing here knows connections, buses or time.
+Pure: clients' addresses and roles are text, requests are `Asked`. This module does not know connections, buses or time.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from fieldtwin.gateway.protocols.modbus.server import ILLEGAL_ADDRESS, ILLEGAL_F
 Network = IPv4Network | IPv6Network
 
 LINE = "line"
-"""The client that a serial line is: it has no address."""
+"""The address of the client on a serial line, which has no network address."""
 
 ALLOWED = 0
 
 
 def network(text: str) -> Network:
-    """``10.0.0.0/24``, ``10.0.0.7`` or ``fd00::/8``. Raises `UsageError`."""
+    """Return the network ``10.0.0.0/24``, ``10.0.0.7`` or ``fd00::/8``. Raises `UsageError`."""
     try:
         return ip_network(text)
     except ValueError as e:
@@ -36,7 +36,7 @@ EVERYONE = (network("0.0.0.0/0"), network("::/0"))
 
 @lru_cache(maxsize=1024)
 def within(peer: str, networks: tuple[Network, ...]) -> bool:
-    """Whether a client's address is in one of `networks`; an IPv4 address in IPv6 form counts as itself."""
+    """Return whether a client's address is in one of `networks`; an IPv4 address in IPv6 form counts as IPv4."""
     try:
         address = ip_address(peer.partition("%")[0])
     except ValueError:
@@ -47,11 +47,12 @@ def within(peer: str, networks: tuple[Network, ...]) -> bool:
 
 @dataclass(frozen=True)
 class AllowRule:
-    """What the clients of `networks` may ask. `units` as the client says them; None: every unit.
+    """What the clients of `networks` may request. `units` as the client sends them; None: every unit.
 
-    `addresses` holds first and last address by table; None: every address. A table that it does not name is not allowed,
-    nor then is a function without register addresses. `roles`: those of clients' certificates (MBTLS 8.4), where the rule is
-    for some only; None: every client, with a certificate or without.
+    `addresses` holds first and last address by table; None: every address. If it is given, a table that it does not
+    name is not allowed, and neither is a function without register addresses. `roles` are roles in clients'
+    certificates (MBTLS 8.4), for a rule that applies to some clients only; None: every client, with or without a
+    certificate.
     """
 
     networks: tuple[Network, ...] = LOOPBACK
@@ -67,7 +68,7 @@ class AllowRule:
         return self.roles is None or role in self.roles
 
     def judge(self, unit: int, asked: Asked) -> int:
-        """`ALLOWED`, or the exception code that says how far the request got: unit, function, address."""
+        """Return `ALLOWED`, or the exception code of the first check that fails: unit, function, address."""
         if self.units is not None and unit not in self.units:
             return NO_PATH
         if asked.function not in self.functions or (asked.changes and not self.functions - READ_FUNCTIONS):
@@ -89,19 +90,19 @@ _FARTHEST = (ILLEGAL_ADDRESS, ILLEGAL_FUNCTION, NO_PATH)
 
 @dataclass(frozen=True)
 class Policy:
-    """An allow-list: a request passes when one rule allows all of it. Without `allow_writes` nothing that may change a
-    unit passes, whatever the rules say."""
+    """An allow-list: a request passes when one rule allows all of it. Without `allow_writes`, no request that may
+    change a unit passes, whatever the rules allow."""
 
     rules: tuple[AllowRule, ...] = (AllowRule(),)
     allow_writes: bool = False
 
     def admits(self, peer: str) -> bool:
-        """Whether a client from `peer` may connect at all."""
+        """Return whether a client from `peer` may connect at all."""
         return any(rule.admits(peer) for rule in self.rules)
 
     def judge(self, peer: str, unit: int, asked: Asked, role: str = "") -> int:
-        """`ALLOWED`, or the exception code to answer with: 0A for a unit, 01 for a function or a role (MBTLS 8.5), 02 for an
-        address."""
+        """Return `ALLOWED`, or the exception code to answer with: 0A for a unit, 01 for a function or a role (MBTLS
+        8.5), 02 for an address."""
         verdicts = {
             rule.judge(unit, asked) if rule.is_for(role) else ILLEGAL_FUNCTION
             for rule in self.rules

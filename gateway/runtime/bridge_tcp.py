@@ -1,9 +1,10 @@
-"""Modbus TCP clients of the gateway, with TLS or without: their connections, requests in order, answers in the same order.
+"""Modbus TCP clients of the gateway, with or without TLS: their connections, and answers in the order of the requests.
 
-Who answers is not known here: `ask` is given a request and returns its answer, or a promise of one. A client may have so
-many requests under way and no more (exception 06, case MB-053); one that does not read its answers is not read either.
-When its connection is lost, its promises are cancelled: nobody waits for them any more (case MB-060). A client that only
-closes its own direction (FIN after its last request) gets its answers before the connection is closed.
+This module does not know what answers a request: `ask` is given a request and returns its answer, or a promise of one.
+A client may have a limited number of requests under way (more get exception 06, case MB-053). While a client does not
+read its answers, its requests are not read either. When its connection is lost, its promises are cancelled, because
+their answers are no longer needed (case MB-060). A client that only closes its own direction (FIN after its last
+request) gets its answers before the connection is closed.
 """
 
 from __future__ import annotations
@@ -26,17 +27,17 @@ from fieldtwin.gateway.protocols.modbus.server_mbap import MbapRequests, TcpRequ
 from fieldtwin.gateway.runtime.backoff import Backoff
 
 REQUEST_WITHIN_S = 10.0
-"""A request that has begun is complete by then; otherwise its client is closed. Without this limit a client that sends one
-byte at a time would keep its place for ever."""
+"""A request that has begun must be complete within this time; otherwise its client is closed. Without this limit, a
+client that sends one byte at a time would keep its place without end."""
 
 MOST_UNSENT = 64
-"""Answers that may wait for a client to read; then no more of its requests are taken."""
+"""How many answers may wait for a client to read them; while more wait, no more of its requests are accepted."""
 
 
 @dataclass(frozen=True, slots=True)
 class Caller:
-    """Who asks: `name` tells one connection from another, `address` and `role` are what allow-lists know. The role is the
-    one in the client's certificate (MBTLS 8.4), empty without one."""
+    """The sender of a request. `name` identifies the connection; allow-lists use `address` and `role`. The role is the
+    one in the client's certificate (MBTLS 8.4), empty without a certificate."""
 
     name: str
     address: str
@@ -44,21 +45,21 @@ class Caller:
 
     @property
     def on_record(self) -> str:
-        """As audit logs name it."""
+        """The name in audit logs."""
         return f"{self.name} ({self.role})" if self.role else self.name
 
 
 Answer = bytes | None | asyncio.Future[bytes | None]
-"""A response PDU, None for silence, or a promise of either."""
+"""A response PDU, None for no answer, or a promise of either."""
 
 Ask = Callable[[Caller, int, bytes], Answer]
-"""``(caller, unit, request PDU)``. Never waits and never raises for what a client says."""
+"""``(caller, unit, request PDU)``. Never waits, and never raises an error because of what a client sends."""
 
 
 @dataclass
 class FrontCounters:
-    """Requests taken; refused because too many were under way; ADUs of other protocols; streams that made no sense; clients whose
-    request was not complete in time."""
+    """Requests accepted; requests refused because too many were under way; ADUs of other protocols; streams that could
+    not be parsed; clients whose request was not complete in time."""
 
     requests: int = 0
     busy: int = 0
@@ -68,8 +69,8 @@ class FrontCounters:
 
 
 class TcpFront:
-    """A listening port, until cancelled. A port that cannot be had is tried again, and the status says so; with `insist`
-    False it is the end (`EndpointBusy`, `Unreachable`)."""
+    """A listening port, which runs until cancelled. A port that cannot be opened is tried again, and the status shows
+    it; with `insist` False this ends the server (`EndpointBusy`, `Unreachable`)."""
 
     def __init__(
         self,
@@ -99,11 +100,11 @@ class TcpFront:
 
     @property
     def bound(self) -> Endpoint | None:
-        """Where it listens, with the port that was taken; None while it does not."""
+        """The address on which the server listens, with the actual port; None while it does not listen."""
         return self.listener.bound if self.listener is not None else None
 
     async def run(self) -> None:
-        """Listen, again and again until it works, and serve until cancelled."""
+        """Open the port, with repeated attempts, and serve until cancelled."""
         backoff = Backoff(0.25, 5.0)
         while self.listener is None:
             try:
@@ -123,7 +124,7 @@ class TcpFront:
             self.listener = None
 
     def describe(self) -> dict[str, Any]:
-        """For the status."""
+        """Return the server's part of the status."""
         c, listener = self.counters, self.listener
         return {
             "listening": str(listener.bound) if listener is not None else None,
@@ -161,7 +162,8 @@ class _Session:
         self._room = asyncio.Event()
 
     async def run(self) -> None:
-        """Until the client goes (`ConnectionLost`), its stream makes no sense any more, or a request takes too long to arrive."""
+        """Serve until the client goes (`ConnectionLost`), its stream cannot be parsed, or a request takes too long to
+        arrive."""
         stream = MbapRequests()
         try:
             async with Nursery() as nursery:
@@ -191,7 +193,7 @@ class _Session:
                     answer.cancel()
 
     async def _read(self, begun_ns: int | None) -> bytes | None:
-        """What the client sends next; None if the request that began at `begun_ns` is not complete in time."""
+        """Return what the client sends next; None if the request that began at `begun_ns` is not complete in time."""
         if begun_ns is None:
             return await self._connection.read()
         while (left_s := REQUEST_WITHIN_S - (self._clock.monotonic_ns() - begun_ns) / NS_PER_S) > 0:
@@ -200,10 +202,11 @@ class _Session:
         return None
 
     async def _answer_the_rest(self, writer: asyncio.Task[None]) -> None:
-        """The client sends nothing more. If it only closed its own direction, it still waits for its answers.
+        """Send the outstanding answers after the client stopped sending. If it only closed its own direction, it still
+        waits for them.
 
-        A client that closed both directions looks the same until something is sent to it. So at most the request under way
-        and the next one are carried out for nobody.
+        A client that closed both directions looks the same until something is sent to it. So at most the request under
+        way and the next one are carried out without a client that reads the answer.
         """
         while self._waiting and self._connection.lost is None and not writer.done():
             self._room.clear()
@@ -224,7 +227,7 @@ class _Session:
         self._news.set()
 
     async def _write(self) -> None:
-        """The answers, in the order of the requests (case MB-052)."""
+        """Send the answers, in the order of the requests (case MB-052)."""
         try:
             while True:
                 while self._waiting:

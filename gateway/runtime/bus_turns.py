@@ -1,6 +1,6 @@
-"""Whose turn it is on a Modbus bus: its devices as the bus sees them, and the poll that goes next.
+"""The order of polls on a Modbus bus: the state of its devices, and the poll that goes next.
 
-Pure: times are monotonic nanoseconds, passed in. It must never know a connection or what a poll does.
+Pure: times are monotonic nanoseconds, passed in. This module must not know a connection or what a poll does.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from fieldtwin.gateway.runtime.poll_schedule import PollSchedule, Rate, spread
 from fieldtwin.gateway.runtime.probing import MARGIN_NS, Probing
 
 FOREVER_NS = 2**62
-"""No device waits for its next poll."""
+"""The end of a free time that no poll limits."""
 
 
 @dataclass
 class DeviceState:
-    """What the bus knows about one of its devices. `tried`: it was asked something since the connection was opened.
-    `polls` counts groups that were read, and tries while it was away."""
+    """What the bus knows about one of its devices. `tried`: it was asked since the connection was opened. `polls`
+    counts the groups that were read, and the tries while it was away."""
 
     driver: RegisterDriver
     schedule: PollSchedule
@@ -34,43 +34,44 @@ class DeviceState:
     poll_errors: int = 0
     next_try_ns: int = 0
     busy_until_ns: int = 0
-    """It said that it is busy, and is given time until then."""
+    """The device answered "busy" and is given time until then."""
     reading: Reading | None = None
-    """The group that is being read, of which some transactions are left; it began to be due at `reading_due_ns`."""
+    """The group that is being read, with some transactions left; it has been due since `reading_due_ns`."""
     reading_due_ns: int = 0
     triggered: set[str] = field(default_factory=set)
     alone: bool = False
-    """It is the only device of its bus."""
+    """Whether it is the only device of its bus."""
     asked_ns: int = 0
-    """When it was tried last while it was away."""
+    """When it was last tried while it was away."""
     late_ns: int = 0
-    """What its reply took that came after a shortened timeout; 0: none did."""
+    """The duration of its reply that came after a shortened timeout; 0: there was none."""
     last_cost_ns: int = 0
-    """How long it had the bus in vain although it answered at first."""
+    """How long it used the bus without success although it answered at first."""
     timeout_ns: int = 0
     """The timeout of its next try; 0: its own."""
     answered_ns: int = 0
-    """When it answered a poll last."""
+    """When it last answered a poll."""
     silences: int = 0
-    """How often in a row a poll of it had no reply while it counts as there."""
+    """How many of its polls in a row had no reply while it counts as online."""
     fits: bool = True
     """Whether its next try can end before another device misses a period."""
 
     @property
     def retries_left(self) -> bool:
-        """Whether a request without a reply is worth repeating: not while the device may be absent and others wait."""
+        """Whether a request without a reply is worth repeating: not while the device may be absent and other devices
+        wait."""
         return self.online or (self.alone and not self.backoff.failures)
 
 
 def states_of(drivers: list[RegisterDriver], offset: float) -> list[DeviceState]:
-    """The devices of a bus, each with its groups' places in their periods; `offset` keeps several buses apart."""
+    """Return the states of a bus's devices, with the phases of their groups; `offset` keeps several buses apart."""
     rates = rates_of([driver.config for driver in drivers], offset)
     alone = len(drivers) == 1
     return [_state(driver, rates[driver.config.name], alone) for driver in drivers]
 
 
 def rates_of(configs: Sequence[DeviceConfig], offset: float = 0.0) -> dict[str, dict[str, Rate]]:
-    """By the names of the devices of one bus: the rates of their groups."""
+    """Return the rates of the groups of one bus's devices, by device name."""
     groups: list[tuple[tuple[str, str], int]] = []
     stated: dict[tuple[str, str], int] = {}
     for config in configs:
@@ -92,7 +93,7 @@ def _state(driver: RegisterDriver, rates: dict[str, Rate], alone: bool) -> Devic
 
 
 def restate(device: DeviceState, config: DeviceConfig, rates: dict[str, Rate], now_ns: int) -> None:
-    """Another configuration for a device of which nothing is being read."""
+    """Apply a new configuration to a device of which nothing is being read."""
     device.driver.reconfigure(config)
     device.backoff.restate(config.backoff_first_s, config.backoff_limit_s)
     device.schedule.restate(rates, config.phase, now_ns, there=device.online)
@@ -100,23 +101,24 @@ def restate(device: DeviceState, config: DeviceConfig, rates: dict[str, Rate], n
 
 
 class Turns:
-    """The order of polls among `devices`, and what `Probing` grants to those that are away. `share` is as there."""
+    """The order of polls among `devices`, and the tries that `Probing` grants to devices that are away. For `share` see
+    there."""
 
     def __init__(self, devices: list[DeviceState], share: float, t35_ns: int = 0) -> None:
         self._devices = devices
         self._probing = Probing(share, t35_ns)
         self._failed_ns = 0
         self.doubt_ns = 0
-        """Polls of devices that answered since then go before those of the others, and repetitions last."""
+        """Devices that answered a poll since this time are polled before the others; repetitions come last."""
 
     def next(
         self, spaced_ns: Callable[[int], int], now_ns: int, seen_ns: int = 0, bus_timeout_s: float = 1.0
     ) -> tuple[DeviceState | None, str, int]:
-        """The most overdue poll of those that may go now, else the one that may go first; and when that is.
+        """Return the most overdue poll of those that may start now, else the one that may start first; and its time.
 
-        `spaced_ns` tells until when a unit has its pause, `seen_ns` is the longest latency seen lately. A device that is away
-        has only its next try (group ""), for which its `timeout_ns` is set; a group of which some was read goes on before
-        another one of its device begins.
+        `spaced_ns` returns the end of a unit's pause; `seen_ns` is the longest latency seen lately. A device that is
+        away has only its next try (group ""), for which its `timeout_ns` is set. A group that is partly read is
+        continued before another group of its device begins.
         """
         best: tuple[int, int, int, int] | None = None
         found: tuple[DeviceState | None, str] = None, ""  # a bus without polls only carries jobs
@@ -148,11 +150,12 @@ class Turns:
         return *found, best[0] if best is not None else now_ns + NS_PER_S
 
     def restate(self, share: float) -> None:
-        """Another share, from the next try on."""
+        """Set a new share, from the next try on."""
         self._probing.restate(share)
 
     def _free_until_ns(self, poll_ns: int | None, now_ns: int) -> int | None:
-        """Until when the devices that answer can spare the bus; `now_ns` while a poll is due. None: no device answers."""
+        """Return until when the devices that answer do not need the bus; `now_ns` while a poll is due. None: no device
+        answers."""
         online = [device for device in self._devices if device.online]
         if not online:
             return None
@@ -169,9 +172,9 @@ class Turns:
         seen_ns: int,
         bus_timeout_s: float,
     ) -> tuple[tuple[int, int], DeviceState]:
-        """The device to ask first of those that are away, with when, and since when it waits.
+        """Return the device to ask first of those that are away, with the time of the try, and since when it waits.
 
-        Those that were not asked yet go before the others; among them, the one that was asked least recently.
+        Devices that were not asked yet come first; among them, the one that was asked least recently.
         """
         untried = [entry for entry in away if not entry[1].tried]
         best: tuple[tuple[int, int, int, int], DeviceState] | None = None
@@ -194,7 +197,7 @@ class Turns:
         seen_ns: int,
         bus_timeout_s: float,
     ) -> int:
-        """When `device` may be asked, at `ready_ns` at the earliest. Sets what it gets then."""
+        """Return when `device` may be asked, not before `ready_ns`. Sets the timeout of that try."""
         own_ns = _own_ns(device, bus_timeout_s)
         probing, failures, late_ns = self._probing, device.backoff.failures, device.late_ns
         device.fits = True
@@ -213,17 +216,18 @@ class Turns:
         return probing.may_go_ns(device.fits, now_ns)
 
     def short_s(self, device: DeviceState, seen_ns: int, bus_timeout_s: float) -> float:
-        """The shortened timeout of a device."""
+        """Return the shortened timeout of a device, in seconds."""
         return self._probing.short_ns(_own_ns(device, bus_timeout_s), seen_ns, device.late_ns) / NS_PER_S
 
     def failed(self, device: DeviceState, begun_ns: int, now_ns: int, clear_ns: int) -> None:
-        """`device` had the bus in vain; the line can be used again at `clear_ns`, after its quarantine."""
+        """Note that `device` used the bus without success; the bus can be used again at `clear_ns`, after its
+        quarantine."""
         self._failed_ns = now_ns
         if any(other.online for other in self._devices):
             self._probing.took(begun_ns, clear_ns, device.fits)
 
 
 def _own_ns(device: DeviceState, bus_timeout_s: float) -> int:
-    """How long the device may take to answer, in ns."""
+    """Return how long the device may take to answer, in ns."""
     own_s = device.driver.config.timeout_s
     return round((bus_timeout_s if own_s is None else own_s) * NS_PER_S)

@@ -1,4 +1,4 @@
-"""A configuration that a bus shall take over while it runs, each device between two of its polls."""
+"""A new configuration that a running bus is to take over, each device between two of its polls."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ AnyDriver = RegisterDriver | CanopenDriver
 
 @dataclass
 class Coming:
-    """`bus` and `devices`, all of that bus, by name: the same buses and devices as before, at the same places.
+    """`bus` and `devices`, all on that bus, by name: the same buses and devices as before, at the same addresses.
 
-    `taken` is called with each driver at once when it has its new configuration; `done` is set when all have.
+    `taken` is called with each driver as soon as it has its new configuration; `done` is set when all have.
     """
 
     bus: BusConfig

@@ -1,7 +1,8 @@
-"""The first write of an output: the gateway reads the device first, and does not write what the device holds already.
+"""The first write of an output: the gateway reads the device first, and does not write a value that it already holds.
 
-This holds before the first write only, and for a device that was not lost meanwhile: what a device holds when it comes back may
-be a default that reads the same by chance, so it is told again. A value that is not good counts for nothing.
+This applies only before the first write, and only to a device that was not lost meanwhile. What a device holds when it
+comes back may be a default that equals the wanted value by chance, so the value is written again. A value that is not
+good is not used.
 """
 
 from __future__ import annotations
@@ -12,11 +13,11 @@ from fieldtwin.gateway.devices.canopen_device import CanopenDriver
 from fieldtwin.gateway.runtime.output import SAFE, Output
 
 READ_BACK_NS = 2 * NS_PER_S
-"""How long the first write of an output waits, once its device is there, for the first reading of what the device holds."""
+"""How long the first write of an output waits, once its device is online, for the first reading of what it holds."""
 
 
 def waits_for_reading(output: Output, current: TagValue, now_ns: int) -> bool:
-    """Whether the first write has to wait for a reading that is still to come. A safe value does not wait."""
+    """Return whether the first write has to wait for a reading that is still to come. A safe value does not wait."""
     if output.due_since_ns is None:
         output.due_since_ns = now_ns
     if is_known(output, current) or output.by.startswith(SAFE) or not output.read_back:
@@ -26,8 +27,8 @@ def waits_for_reading(output: Output, current: TagValue, now_ns: int) -> bool:
 
 
 def is_known(output: Output, current: TagValue) -> bool:
-    """Whether `current` is what the device holds. A node may hold other values since its configuration was written: then
-    only a later reading counts."""
+    """Return whether `current` is what the device holds. A node may hold other values since its configuration was
+    written: then only a later reading counts."""
     if current.quality is not Quality.GOOD or output.due_since_ns is None:
         return False
     driver = output.driver

@@ -1,7 +1,7 @@
-"""The gateway: buses, drivers, tags, outputs and the process image, put together and run.
+"""The gateway: buses, drivers, tags, outputs and the process image, assembled and run.
 
-It is given a Connector, a clock and an image, and cannot tell a plant from its prototype. Its status is plain data for the
-control channel; nothing in it is written for a screen.
+It is given a Connector, a clock and an image, and cannot distinguish a plant from its prototype. Its status is plain
+data for the control channel; nothing in it is formatted for a screen.
 """
 
 from __future__ import annotations
@@ -33,13 +33,14 @@ from fieldtwin.gateway.runtime.taken import TakenFile
 from fieldtwin.gateway.store.exchange_log import ExchangeLog
 
 PLC_GRACE_NS = 10 * NS_PER_S
-"""How long a PLC may take to appear after the gateway's start before the outputs are made safe."""
+"""How long after the gateway's start a PLC may take to appear before the outputs are made safe."""
 _NUMBERS = (int, float)
 
 
 @dataclass(frozen=True)
 class GatewayConfig:
-    """What a gateway runs. `plc_lost_ms` is how old the PLC's last scan may be before its outputs count no more."""
+    """The configuration of a gateway. `plc_lost_ms` is the greatest age of the PLC's last scan at which its outputs are
+    followed."""
 
     buses: dict[str, BusConfig]
     devices: dict[str, DeviceConfig]
@@ -56,7 +57,7 @@ class GatewayConfig:
 
 
 def make_driver(config: DeviceConfig, bus: BusConfig, tags: TagTable, clock: Clock) -> RegisterDriver | CanopenDriver:
-    """The driver that a device's profile and bus ask for."""
+    """Return the driver that a device's profile and bus require."""
     if config.profile.protocol == "canopen":
         return CanopenDriver(config, tags, clock)
     if config.profile.inbox is not None:
@@ -65,8 +66,8 @@ def make_driver(config: DeviceConfig, bus: BusConfig, tags: TagTable, clock: Clo
 
 
 def stale_limits(driver: RegisterDriver | CanopenDriver) -> dict[str, int | None]:
-    """How long each readable tag is good without being refreshed, in ms. Tags read again and again grow stale; a register
-    that is read once, at identification, does not (None)."""
+    """Return how long each readable tag is good without being refreshed, in ms. Tags that are read cyclically become
+    stale; a register that is read once, at identification, does not (None)."""
     config, tags = driver.config, [t for t in driver.profile.tags.values() if t.readable]
     if isinstance(driver, CanopenDriver):
         return {f"{config.name}.{tag.name}": driver.stale_after_ms(tag) for tag in tags}
@@ -80,7 +81,7 @@ def stale_limits(driver: RegisterDriver | CanopenDriver) -> dict[str, int | None
 
 
 class Gateway:
-    """Runs until cancelled; `shut_down` then brings the outputs to their safe values."""
+    """The gateway, which runs until cancelled; `shut_down` then brings the outputs to their safe values."""
 
     def __init__(
         self,
@@ -137,7 +138,7 @@ class Gateway:
             self.tags.declare([name], stale_ms)
 
     def let_trigger(self, driver: RegisterDriver | CanopenDriver) -> None:
-        """Whether this driver may write what makes its device measure."""
+        """Set whether this driver may write the register that makes its device measure."""
         device, trigger = driver.config, driver.config.profile.form.trigger
         if isinstance(driver, RegisterDriver) and trigger is not None:
             driver.may_trigger = self.config.allow_writes and trigger.tag in device.writable
@@ -159,7 +160,7 @@ class Gateway:
         return bus
 
     def _make_outputs(self) -> list[Output]:
-        """Every tag that a program or a client of ours may write, and every tag that has a safe value, whoever else writes it."""
+        """Return every tag that a program or a client of the gateway may write, and every tag that has a safe value."""
         served = {t.tag for s in self.config.serve for t in s.tags if t.write}
         safe = {f"{device.name}.{local}" for device in self.config.devices.values() for local in device.safe}
         return [
@@ -176,7 +177,7 @@ class Gateway:
         return output
 
     def complete_outputs(self, driver: RegisterDriver | CanopenDriver) -> None:
-        """The configuration of a driver's device is another one: the tags that have a safe value only now are outputs, too."""
+        """Add the tags that have a safe value only after a new configuration of a driver's device as outputs."""
         known = {output.tag for output in self.outputs.outputs}
         tags = [f"{driver.config.name}.{local}" for local in driver.config.safe]
         if not isinstance(driver, TransmitterDriver):
@@ -192,7 +193,7 @@ class Gateway:
         return sources
 
     def _blocked(self, bus: str, unit: int) -> str:
-        """Why a bridge's client may not write to a unit; unit 0 is every unit of the bus."""
+        """Return why a bridge's client must not write to a unit, or ""; unit 0 means every unit of the bus."""
         on_it = [d for d in self.drivers.values() if d.config.bus == bus and unit in (d.config.address, 0)]
         return next((f"{d.config.where}: {d.identity_error}" for d in on_it if d.identity_error), "")
 
@@ -202,7 +203,8 @@ class Gateway:
     # -- running --------------------------------------------------------------------------------------------------------
 
     async def run(self) -> None:
-        """Run every bus and the exchange with the PLC, until cancelled or until one fails (a bug of ours)."""
+        """Run every bus and the exchange with the PLC, until cancelled or until one of them fails (an internal
+        error)."""
         async with Nursery() as nursery:
             for name, bus in self.buses.items():
                 nursery.start(bus.run(), f"bus {name}")
@@ -219,11 +221,11 @@ class Gateway:
         while True:
             now_ns = self.clock.monotonic_ns()
             self.tick(now_ns)
-            next_ns = max(next_ns + period_ns, now_ns)  # what was missed is skipped, never made up for in a burst
+            next_ns = max(next_ns + period_ns, now_ns)  # missed cycles are skipped, and not made up for in a burst
             await self.clock.sleep_until_ns(next_ns)
 
     def tick(self, now_ns: int) -> None:
-        """One exchange with the PLC and what follows from it. Never waits."""
+        """Exchange data with the PLC once and act on it. Never waits."""
         for pump in self.pumps:
             pump.refuse_when_local()
             self.exchange.untaken[pump.driver.outbox_tag] = pump.untaken
@@ -242,7 +244,7 @@ class Gateway:
             pump.tick(now_ns, self.exchange.all_consumed(pump.driver.message_tag))
 
     def _judge_plc(self, now_ns: int) -> None:
-        """A PLC whose heartbeat stopped, or which says that it stopped, commands nothing any more."""
+        """Follow the PLC's commands, unless its heartbeat stopped or it reports that it stopped."""
         if self._stopping:
             return
         x = self.exchange
@@ -263,7 +265,8 @@ class Gateway:
         self.plc_alive = alive
 
     async def shut_down(self, timeout_s: float = 1.0) -> bool:
-        """While `run` still runs: safe outputs, nodes stopped, polls ended. True when every output was confirmed in time."""
+        """Make the outputs safe, stop nodes and end polls, while `run` still runs. Return whether every output was
+        confirmed in time."""
         if self._stopping:
             return self.outputs.settled
         deadline_ns = self.clock.monotonic_ns() + int(timeout_s * NS_PER_S)

@@ -1,6 +1,8 @@
-"""The gateway's side of the process image: tags and messages in, outputs and messages out, and is the PLC alive.
+"""The gateway's side of the process image: tags and messages in, outputs and messages out, and whether the PLC is
+alive.
 
-`exchange` runs once a PLC cycle. It never waits: it reads the newest whole publication of the PLC and leaves one of its own.
+`exchange` runs once per PLC cycle. It never waits: it reads the newest complete publication of the PLC and publishes
+one of its own.
 """
 
 from __future__ import annotations
@@ -23,14 +25,14 @@ from fieldtwin.gateway.core.image import (
 from fieldtwin.gateway.core.values import DATA, NEVER, Quality, Reason, Scalar, TagValue
 from fieldtwin.gateway.runtime.tags import FOREVER_NS, TagTable
 
-_BAD = Quality.BAD  # an Enum's members are slow to look up
+_BAD = Quality.BAD  # a local name, because looking up an Enum's members is slow
 
 
 class ImageExchange:
-    """Publishes INPUTS from the tag table and the message queues; hands on OUTPUTS.
+    """Publishes INPUTS from the tag table and the message queues, and reads OUTPUTS.
 
-    `sources` are the queues of input messages by tag. Whoever uses this reads `outputs` (values by tag) and `new_messages`
-    (by tag, in order) after each `exchange`, and tells through `taken` how far each output message was dealt with.
+    `sources` are the queues of input messages by tag. The caller reads `outputs` (values by tag) and `new_messages` (by
+    tag, in order) after each `exchange`, and sets `untaken` to how many of the output messages it has not handled yet.
     """
 
     def __init__(self, image: Image, tags: TagTable, sources: Mapping[str, Consumer[DATA]]) -> None:
@@ -46,9 +48,9 @@ class ImageExchange:
         self._message_outputs = [t.name for t in outputs.tags if t.kind is TagKind.MESSAGE]
         self._consumed: dict[str, int] = {}
         self.untaken: dict[str, int] = {}
-        """By output message tag: how many messages that were read have not been dealt with yet."""
+        """By output message tag: how many messages that were read have not been handled yet."""
         self.outputs: dict[str, TagValue] = {}
-        """Made anew when a value or quality changed: times are those of that change."""
+        """Built anew when a value or quality changes; its times are those of that change."""
         self._seen: Snapshot | None = None
         self._taken = [
             (at, tag) for at, t in enumerate(inputs.tags) for tag in self._message_outputs if t.name == taken_name(tag)
@@ -61,7 +63,7 @@ class ImageExchange:
         self._resume(image)
 
     def _resume(self, image: Image) -> None:
-        """A restarted gateway goes on behind the last message that its predecessor said it had taken."""
+        """Continue after the last message that a previous gateway process reported as taken."""
         before = image.reader(INPUTS).snapshot()
         for tag in self._message_outputs:
             taken = before.value(taken_name(tag)).value
@@ -84,7 +86,8 @@ class ImageExchange:
         self._publish(now_ns)
 
     def _seen_before(self, snapshot: Snapshot) -> bool:
-        """Whether values and qualities are those of the last call. Snapshots share them as long as they are."""
+        """Return whether values, qualities and reasons equal those of the last call. Snapshots share these objects
+        while they are unchanged."""
         before, self._seen = self._seen, snapshot
         if before is None:
             return False
@@ -97,11 +100,12 @@ class ImageExchange:
         )
 
     def plc_age_ms(self, now_ns: int) -> float:
-        """Milliseconds since the PLC last published; infinite when it never did."""
+        """Return the milliseconds since the PLC last published; infinite if it never did."""
         return (now_ns - self._plc_heard_ns) / NS_PER_MS if self.plc_counter else float("inf")
 
     def all_consumed(self, tag: str) -> bool:
-        """True when the PLC has consumed every message of `tag` that it was given; never where no program takes them."""
+        """Return whether the PLC has consumed every message of `tag` that it was given; always False if no program
+        takes them."""
         return tag in self._depth and self._consumed.get(tag, 0) >= self._writer.last_sequence(tag)
 
     def _publish(self, now_ns: int) -> None:
@@ -120,7 +124,7 @@ class ImageExchange:
         columns.refresh(now_ns)
         for at, tag in self._taken:
             taken = self._reader.seen(tag)
-            if tag in self.untaken:  # what came just now is dealt with after this
+            if tag in self.untaken:  # messages that were read just now are handled later
                 taken -= self.untaken[tag] + len(self.new_messages.get(tag, ()))
             columns.put(at, taken, now_ns)
         self._writer.publish_mixed(
@@ -136,10 +140,11 @@ class ImageExchange:
 
 
 class _Columns:
-    """INPUTS as the tag table has them: only what is new, or may have grown stale, is looked up again."""
+    """INPUTS as the tag table has them: only values that are new, or that may have become stale, are looked up
+    again."""
 
     def __init__(self, specs: Sequence[TagSpec], tags: TagTable, others: Container[int]) -> None:
-        """`others`: the places of what the exchange itself puts."""
+        """`others`: the positions that the exchange itself writes."""
         self._tags = tags
         self._index = {s.name: at for at, s in enumerate(specs) if s.kind is not TagKind.MESSAGE and at not in others}
         self.values: list[Scalar | None] = [0 if s.kind is TagKind.MESSAGE else None for s in specs]
@@ -147,12 +152,12 @@ class _Columns:
         self.reasons = bytearray([Reason.NONE if s.kind is TagKind.MESSAGE else NEVER.reason for s in specs])
         self.times_ns = [0] * len(specs)
         self.changed = True
-        """Whether values, qualities or reasons may be others than when they were published last; for the publisher to reset."""
+        """Whether values, qualities or reasons may differ from those published last; the publisher resets it."""
         self._earliest_ns = -1
-        """No tag grows stale before; it may be earlier than the first that does."""
+        """No tag becomes stale before this time; it may be earlier than the first one that does."""
 
     def refresh(self, now_ns: int) -> None:
-        """What is new in the table, and what grew stale by `now_ns`."""
+        """Take over what is new in the table, and what became stale by `now_ns`."""
         news = self._tags.take_news()
         if now_ns > self._earliest_ns:
             self._earliest_ns = FOREVER_NS
@@ -175,7 +180,7 @@ class _Columns:
             self._earliest_ns = until_ns
 
     def put(self, at: int, value: int, now_ns: int) -> None:
-        """A number of the exchange's own. Good from the first time on."""
+        """Set a number that the exchange itself provides. It is good from the first time on."""
         self.times_ns[at] = now_ns
         if self.values[at] != value:
             self.values[at] = value

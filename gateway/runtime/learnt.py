@@ -1,8 +1,8 @@
-"""What devices taught about their gaps, kept from run to run, and said so that it can go into their profiles.
+"""The gaps that were learnt about devices, kept between runs, and reported so that they can go into their profiles.
 
-One JSON file in the run directory. An entry counts for the device it was learnt from only: same profile (by its hash), same
-endpoint, same unit. A file that cannot be read, or says anything else than what is written here, is as good as none: the
-devices teach it again. It must never know a wire.
+They are in one JSON file in the run directory. An entry is used only for the device from which it was learnt: same
+profile (by its hash), same endpoint, same unit ID. A file that cannot be read, or that has any other content, is
+ignored: the gaps are learnt again. This module must not know a connection.
 """
 
 from __future__ import annotations
@@ -22,11 +22,12 @@ from fieldtwin.gateway.devices.read_plan import Learnt
 from fieldtwin.gateway.devices.register_device import RegisterDriver
 
 MOST_BYTES = 4_000_000
-"""No file of ours is larger; one that is, is not read."""
+"""Our files are never larger; a larger file is not read."""
 
 
 class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One device. `gaps` as a profile has them; `borders`, of no registers, by the address that they stand before."""
+    """One device. `gaps` as in a profile; `borders`, which have no registers, by the address of the first register
+    after them."""
 
     profile: str
     endpoint: str
@@ -37,7 +38,7 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class LearntFile:
-    """The file at `path`, for `drivers` on `buses`. `load` before they are used; `save` now and then."""
+    """The file at `path`, for `drivers` on `buses`. Call `load` before they are used, and `save` from time to time."""
 
     def __init__(self, path: Path, drivers: Iterable[RegisterDriver], buses: Mapping[str, BusConfig]) -> None:
         self._path = path
@@ -46,12 +47,13 @@ class LearntFile:
         self._saved = 0
 
     def load(self) -> None:
-        """Give every driver what its device taught before."""
+        """Give every driver what was learnt about its device before."""
         try:
             with self._path.open("rb") as file:
                 entries = msgspec.json.decode(file.read(MOST_BYTES), type=dict[str, Entry])
         except (OSError, msgspec.DecodeError):
-            return  # none yet, or not one of ours: it is learnt again, and written anew
+            # there is no file yet, or it is not one of ours: the gaps are learnt again and the file is written anew
+            return
         for driver in self._drivers:
             entry = entries.get(driver.config.name)
             if entry is not None and self._same(driver, entry):
@@ -60,7 +62,7 @@ class LearntFile:
                     driver.know(learnt)
 
     def save(self) -> None:
-        """Write the file if something was learnt since. Raises `Unreachable` when the disk refuses."""
+        """Write the file if something was learnt since. Raises `Unreachable` if the disk refuses."""
         changes = sum(driver.learnt.changes for driver in self._drivers)
         if changes == self._saved:
             return
@@ -94,7 +96,7 @@ class LearntFile:
 
 
 def _learnt(driver: RegisterDriver, entry: Entry) -> Learnt | None:
-    """What an entry says; None where it makes no sense."""
+    """Return what an entry contains; None if it is invalid."""
     try:
         gaps = [resolve_gap(text, "sent") for text in entry.gaps]
         borders = [resolve_gap(text, "sent") for text in entry.borders]
@@ -107,8 +109,8 @@ def _learnt(driver: RegisterDriver, entry: Entry) -> Learnt | None:
 
 
 def describe_learnt(drivers: Iterable[object]) -> dict[str, Any]:
-    """Of every device that taught something: `gaps`, `borders`, `missing` tags, and `line`, which goes into its profile
-    in place of the `gaps` there ("" where nothing of it belongs there)."""
+    """Return what was learnt, for every device with an entry: `gaps`, `borders`, `missing` tags, and `line`, which
+    replaces the `gaps` in its profile ("" if nothing belongs there)."""
     found: dict[str, Any] = {}
     for driver in drivers:
         if isinstance(driver, RegisterDriver) and (driver.learnt.gaps or driver.learnt.missing):

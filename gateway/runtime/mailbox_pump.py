@@ -1,9 +1,10 @@
-"""Between a transmitter's mailboxes and the control logic: acknowledge what was consumed, send when there is room.
+"""The connection between a transmitter's mailboxes and the control logic: acknowledge what was consumed, send if there
+is room.
 
-A mailbox is acknowledged only when the PLC has consumed its message, so a command survives a gateway that dies in between. That
-it was consumed is kept before it is acknowledged, so that the successor of a gateway that died then does not hand it on again.
-A plant whose switch says `local` takes no commands: they are acknowledged, refused and on record. Mailboxes that are lent to a
-digital thread are its own: here nothing is read from them, and nothing written.
+A mailbox is acknowledged only when the PLC has consumed its message, so a command survives a gateway process that dies
+in between. The consumption is stored before the acknowledgement, so that the successor of a gateway that died then does
+not deliver the message again. A plant whose switch is set to `local` accepts no commands: they are acknowledged,
+refused and recorded. Mailboxes that are lent to a digital thread belong to it: this module does not read or write them.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ RETRY_NS = 1000 * NS_PER_MS
 
 
 class MailboxPump:
-    """Drives one transmitter. `inbox` holds what came and the PLC was not given yet; `tick` never waits."""
+    """The pump of one transmitter. `inbox` holds messages that were received and not yet given to the PLC; `tick` never
+    waits."""
 
     def __init__(
         self,
@@ -39,11 +41,12 @@ class MailboxPump:
         taken: TakenFile | None = None,
         journal: Refusals | None = None,
     ) -> None:
-        """`journal` takes the messages that do not reach the transmitter, and the commands that are refused."""
+        """`journal` receives the messages that do not reach the transmitter, and the commands that are refused."""
         self.driver = driver
         self._journal = journal
         self._withheld: tuple[str, object] | None = None
-        """What the journal was told last of a plant that may not be written, so that it is told once."""
+        """The last report to the journal about a plant that must not be written, so that each message is reported
+        once."""
         self._taken = taken or TakenFile(None)
         driver.taken_before = self._taken.of(driver.config.name)
         self.inbox: Consumer[DATA] = Consumer(driver.emitter.event, capacity=64)
@@ -51,7 +54,7 @@ class MailboxPump:
             driver.emitter.subscribe(self.inbox)
         self.commands_refused = 0
         self.remote = remote
-        """The plant's switch; it may be thrown at any time."""
+        """The plant's switch; it may change at any time."""
         self._boxes = Mailboxes(driver, bus, self._ended)
         self._bus = bus
         self._audit = audit
@@ -62,7 +65,8 @@ class MailboxPump:
         self._recorded: tuple[str, object] | None = None
 
     def command(self, payload: bytes, by: str) -> bool:
-        """A command that did not come through the mailbox; False when the plant's switch says `local`. On record either way."""
+        """Handle a command that did not come through the mailbox. Return False if the plant's switch is set to `local`.
+        The command is recorded in both cases."""
         name = self.driver.config.name
         result = "taken" if self.remote else "the plant says local"
         with suppress(Unreachable):
@@ -74,7 +78,8 @@ class MailboxPump:
         return self.remote
 
     def offer(self, payloads: list[bytes]) -> None:
-        """The control logic sent these, in order. Where the mailbox is lent, its thread has seen them in the process image."""
+        """Queue messages of the control logic, in order. If the mailbox is lent, its thread reads them from the process
+        image."""
         if self._lent:
             return
         for payload in payloads:
@@ -82,11 +87,11 @@ class MailboxPump:
 
     @property
     def untaken(self) -> int:
-        """Messages of the control logic that did not reach the transmitter's mailbox yet."""
+        """How many messages of the control logic have not reached the transmitter's mailbox yet."""
         return len(self.driver.consumer.queue) + self._sending
 
     def refuse_when_local(self) -> None:
-        """Drop what came in while the plant's switch says `local`."""
+        """Refuse the messages that arrived while the plant's switch is set to `local`."""
         if not self.remote:
             for item in self.inbox.drain():
                 self.commands_refused += 1
@@ -108,7 +113,7 @@ class MailboxPump:
             self._journal.note(name, f"{name}.{tag}", value, cause, reason, by, self._now_ns, audit=audit)
 
     def _withhold(self) -> None:
-        """A plant that may only be read: the first message that waits stays where it is, and is reported."""
+        """Report the first message that waits on a read-only plant; it stays in the queue."""
         if self.driver.consumer.queue:
             waits = ("outbox", self.driver.consumer.queue[0].data.hex())
             if waits != self._withheld:
@@ -116,7 +121,7 @@ class MailboxPump:
                 self._tell(*waits, Cause.READ_ONLY, "this plant is read-only (start with --allow-writes)", audit=True)
 
     def tick(self, now_ns: int, all_consumed: bool) -> None:
-        """Start the next exchange. `all_consumed` says that the PLC has consumed everything that it was given."""
+        """Start the next exchange. `all_consumed`: the PLC has consumed everything that it was given."""
         self._now_ns = now_ns
         self._keep(all_consumed)
         if not self._allow_writes:
@@ -134,9 +139,10 @@ class MailboxPump:
                 self._boxes.send(now_ns)
 
     def _keep(self, all_consumed: bool) -> None:
-        """Whether the message that lies in the inbox was taken. Before the device is there nobody knows what lies in it."""
+        """Store whether the message in the inbox was taken. Until the device is online, the content of the inbox is
+        unknown."""
         driver, name = self.driver, self.driver.config.name
-        with suppress(Unreachable):  # then it may come twice
+        with suppress(Unreachable):  # without the file the message may be delivered twice
             if driver.to_acknowledge:
                 if all_consumed and not self.inbox.queue:
                     self._taken.note(name, driver.emitted)
@@ -144,7 +150,7 @@ class MailboxPump:
                 self._taken.note(name, b"")
 
     def _on_record(self, tag: str, new: object, now_ns: int) -> bool:
-        """Note the write before it happens; without a record it waits and is tried again."""
+        """Record the write before it is sent; without a record it waits and is tried again."""
         name = self.driver.config.name
         try:
             self._audit.note("write", name, by="plc", result="asked", tag=f"{name}.{tag}", old=None, new=new)
@@ -161,5 +167,5 @@ class MailboxPump:
             result = "done" if error is None else f"failed: {error}"
             if error is not None:
                 self._tell(tag.rpartition(".")[2], new, cause_of(error), str(error))
-            with suppress(Unreachable):  # the next write will not start without a record
+            with suppress(Unreachable):  # the next write does not start without a record
                 self._audit.note("write", self.driver.config.name, by="plc", result=result, tag=tag, new=new)

@@ -1,5 +1,9 @@
-"""A transmitter's mailboxes, one exchange at a time: acknowledge what came, send when there is room, and look no more often than
-the modem's own pace makes sense. At either end of a link, under whoever decides what is said."""
+"""The exchanges with a transmitter's mailboxes, one at a time: acknowledge what was received, and send when there is
+room.
+
+The outbox is not checked more often than the modem's own speed justifies. Both ends of a link use this module, whatever
+decides about the messages.
+"""
 
 from __future__ import annotations
 
@@ -14,15 +18,18 @@ from fieldtwin.gateway.devices.transmitter import TransmitterDriver
 from fieldtwin.gateway.runtime.modbus_bus import Job, ModbusBus
 
 ASK_EVERY_NS = 50 * NS_PER_MS
-"""How often a full outbox is looked at again."""
+"""How often a full outbox is checked."""
 MOST_PATIENCE_NS = 2000 * NS_PER_MS
-"""How long a full outbox is not looked at, at most, because the message before took that long to leave it."""
+"""The longest time for which a full outbox is not checked because the previous message took that long to leave it."""
 INBOX_KEPT = 256
 
 
 class Patience:
-    """When a full outbox is worth a look: the next message will take about as long to leave it as the one before. Three quarters
-    of that, so that a modem that got faster is noticed. Pure; times are monotonic nanoseconds."""
+    """When a full outbox is worth a check: the next message will take about as long to leave it as the previous one.
+
+    Three quarters of that time are waited, so that a modem that became faster is noticed. Pure; times are monotonic
+    nanoseconds.
+    """
 
     def __init__(self) -> None:
         self._sent_ns: int | None = None
@@ -31,27 +38,27 @@ class Patience:
         self._was_full = False
 
     def asks(self, now_ns: int) -> bool:
-        """Whether to look now. It is taken as done."""
+        """Return whether to check now. A True result counts as a check."""
         if now_ns < self._next_ns or (self._sent_ns is not None and now_ns < self._sent_ns + self._wait_ns):
             return False
         self._next_ns = now_ns + ASK_EVERY_NS
         return True
 
     def full(self) -> None:
-        """It was looked at, and the message is still there."""
+        """Note that the outbox was checked and the message is still there."""
         self._was_full = True
 
     def sent(self, now_ns: int) -> None:
-        """There was room, and a message was put into it."""
+        """Note that there was room, and a message was put into the outbox."""
         if self._sent_ns is not None:
             took_ns = (now_ns - self._sent_ns) * 3 // 4
-            # Where nobody looked while it was full, it was free before by nobody knows how much.
+            # If the outbox was not checked while it was full, it became free at an unknown earlier time.
             self._wait_ns = min(took_ns, MOST_PATIENCE_NS if self._was_full else self._wait_ns)
         self._sent_ns, self._was_full = now_ns, False
 
 
 class Inbox(Consumer[DATA]):
-    """What a transmitter received; says so."""
+    """The messages that a transmitter received; sets an event for each."""
 
     def __init__(self, driver: TransmitterDriver, news: asyncio.Event) -> None:
         super().__init__(driver.emitter.event, INBOX_KEPT)
@@ -64,7 +71,8 @@ class Inbox(Consumer[DATA]):
 
 
 class Mailboxes:
-    """The exchanges of `driver` on `bus`. `ended` is called with each one's error, or None, `busy` is over by then."""
+    """The exchanges of `driver` on `bus`. `ended` is called with the error of each one, or None; `busy` is False by
+    then."""
 
     def __init__(
         self,
@@ -84,21 +92,21 @@ class Mailboxes:
         return not self.busy and self._bus.online(self.driver)
 
     def acknowledge(self) -> None:
-        """What came was taken: the next may come."""
+        """Acknowledge the message that was taken, so that the next one can arrive."""
         self._submit(self.driver.acknowledge)
 
     def send(self, now_ns: int) -> None:
-        """The first message in line, into an outbox that is free."""
+        """Send the first queued message, into an outbox that is free."""
         self._patience.sent(now_ns)
         self._submit(self.driver.send)
 
     def look(self, now_ns: int) -> None:
-        """See whether the outbox is free, where that makes sense already."""
+        """Check whether the outbox is free, if it is time for that."""
         if self._patience.asks(now_ns):
             self._submit(self._check)
 
     def next(self, now_ns: int, *, taken: bool) -> None:
-        """The exchange that is due, if any; `taken`: all that came may be acknowledged."""
+        """Start the exchange that is due, if any. `taken`: everything that was received may be acknowledged."""
         if not self.ready:
             return
         if self.driver.to_acknowledge and taken:

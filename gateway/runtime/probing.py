@@ -2,14 +2,17 @@
 
 A *probe* is one try of a device that is away, its first contact included. While another device of the bus answers,
 
-* a probe waits no longer than four times the longest of the latest replies on the bus, at least `LEAST_NS` and twice the silence
-  of 3.5 characters, at most the device's own timeout. A device whose reply came too late once gets twice the time that it took;
-* a probe that ends before any group could miss its period takes at most `share` of the bus's time, after a burst of `BURST_NS`;
-* one that cannot end so soon takes at most `share` / `LONG_PART`. Such probes give a device its own timeout, after three that
-  were shortened.
+* a probe waits no longer than four times the longest of the latest replies on the bus, at least `LEAST_NS` and twice the
+  silence of 3.5 characters, at most the device's own timeout. A device whose reply came too late once gets twice the time
+  that the reply took;
+* a probe that ends before any group could miss its period takes at most `share` of the bus's time, after a burst of
+  `BURST_NS`;
+* a probe that cannot end that soon takes at most `share` / `LONG_PART`. Such probes give a device its own timeout, after
+  three that were shortened.
 
-While no device answers, the timeout doubles from failure to failure until it is the device's own, so that the devices that do
-answer are found soon. A device alone on its bus is asked with its own timeout. Pure: times are monotonic nanoseconds, passed in.
+While no device answers, the timeout doubles from failure to failure until it is the device's own, so that the devices
+that do answer are found soon. A device alone on its bus is asked with its own timeout. Pure: times are monotonic
+nanoseconds, passed in.
 """
 
 from __future__ import annotations
@@ -17,19 +20,19 @@ from __future__ import annotations
 from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
 
 LEAST_NS = 50 * NS_PER_MS
-"""No timeout is shorter. A USB adapter alone may hold a reply back for 16 ms."""
+"""The shortest timeout. A USB adapter alone may delay a reply by 16 ms."""
 PATIENCE = 4
-"""A probe waits for so many times the longest latency seen lately."""
+"""A probe waits for this multiple of the longest latency seen lately."""
 LATE_PATIENCE = 2
-"""A device that answered too late gets so many times what it took."""
+"""A device that answered too late gets this multiple of the time that its reply took."""
 MARGIN_NS = 20 * NS_PER_MS
-"""What a probe takes beside its timeout: request, silences, and the host being late."""
+"""What a probe takes in addition to its timeout: request, silences, and delays of the host."""
 BURST_NS = 3 * NS_PER_S
-"""Probing time that may be spent at once, for instance on the first contact with all devices: 5 % of a minute."""
+"""Probing time that may be spent in one burst, for instance on the first contact with all devices: 5 % of a minute."""
 LONG_PART = 8
-"""Probes that make others miss polls get this part of the share."""
+"""Probes that make other devices miss polls get the share divided by this."""
 SHORT_TRIES = 3
-"""A device is asked so often with a shortened timeout before it gets its own."""
+"""How many times a device is asked with a shortened timeout before it gets its own."""
 
 
 class Probing:
@@ -41,38 +44,40 @@ class Probing:
         self._spent_until_ns = 0
         """When the share will have paid for all probes so far."""
         self._long_ns = 0
-        """From when on a probe may go that makes others miss polls."""
+        """The earliest time of the next probe that makes other devices miss polls."""
 
     def restate(self, share: float) -> None:
-        """Another share, from the next probe on."""
+        """Set a new share, from the next probe on."""
         self._share = share
 
     def short_ns(self, own_ns: int, seen_ns: int, late_ns: int) -> int:
-        """The shortened timeout of a device whose own one is `own_ns`.
+        """Return the shortened timeout of a device whose own timeout is `own_ns`.
 
-        `seen_ns` is the longest latency seen lately on the bus, `late_ns` what a late reply of the device took; 0: none.
+        `seen_ns` is the longest latency seen lately on the bus, `late_ns` the duration of a late reply of the device;
+        0: none.
         """
         return min(own_ns, max(self._least_ns, PATIENCE * seen_ns, LATE_PATIENCE * late_ns))
 
     def growing_ns(self, own_ns: int, seen_ns: int, late_ns: int, failures: int) -> int:
-        """The timeout behind so many failures while no device answers."""
+        """Return the timeout after `failures` failures while no device answers."""
         return min(own_ns, self.short_ns(own_ns, seen_ns, late_ns) << min(failures, 20))
 
     def long_may_go(self, failures: int, now_ns: int) -> bool:
-        """Whether a device that failed so often is due for its own timeout."""
+        """Return whether a device that failed this often is due for its own timeout."""
         return failures >= SHORT_TRIES and now_ns >= self._long_ns
 
     def fits(self, cost_ns: int, now_ns: int, free_until_ns: int) -> bool:
-        """Whether a probe that may take `cost_ns` ends before a group could miss its period."""
+        """Return whether a probe that may take `cost_ns` ends before a group could miss its period."""
         return now_ns + cost_ns <= free_until_ns
 
     def may_go_ns(self, fits: bool, now_ns: int) -> int:
-        """When a probe may go: now, or when the budget allows it."""
+        """Return when a probe may start: now, or when the budget allows it."""
         paid_ns = self._spent_until_ns - int(BURST_NS / self._share)
         return max(now_ns, paid_ns, 0 if fits else self._long_ns)
 
     def took(self, begun_ns: int, end_ns: int, fitted: bool) -> None:
-        """A device had the bus in vain from `begun_ns` to `end_ns`; `fitted` says that no group missed its period."""
+        """Note that a device used the bus without success from `begun_ns` to `end_ns`; `fitted`: no group missed its
+        period."""
         spent_ns = end_ns - begun_ns
         self._spent_until_ns = max(self._spent_until_ns, begun_ns) + int(spent_ns / self._share)
         if not fitted:

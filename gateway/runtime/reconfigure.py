@@ -1,9 +1,9 @@
-"""Another configuration for a gateway that runs: pace, limits, scaling, safe values; between two polls, none lost or doubled.
-The plant's switch with it, at once.
+"""Apply a new configuration to a running gateway: timing, limits, scaling and safe values. It is applied between two
+polls, and no poll is lost or doubled. The plant's switch is applied at once.
 
-Buses, devices, addresses, tags and what is bound to them have to be the same: whoever calls has compared the files
-(`fieldtwin.twin.plant.reloading`). A device has either its old configuration or its new one, never some of each; values that it
-holds are understood anew at once. Nothing here reads a file.
+Buses, devices, addresses, tags and their bindings must be unchanged: the caller has compared the files
+(`fieldtwin.twin.plant.reloading`). A device has either its old configuration or its new one, never a mixture; stored
+values are decoded anew at once. This module reads no file.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from fieldtwin.gateway.runtime.coming import AnyDriver, Coming
 from fieldtwin.gateway.runtime.gateway import Gateway, GatewayConfig, stale_limits
 
 OF_DECODING = frozenset({Reason.NONE, Reason.OUT_OF_RANGE, Reason.NOT_A_NUMBER, Reason.SENTINEL})
-"""Reasons that are found in the value itself."""
+"""Reasons that follow from the value itself."""
 
 
 async def reconfigure(gateway: Gateway, config: GatewayConfig) -> None:
-    """Take over `config`. Returns when every device has it: where a long group is being read, at its end."""
+    """Apply `config`. Returns when every device has it; if a long group is being read, that is at the group's end."""
     gateway.config = replace(gateway.config, buses=config.buses, devices=config.devices, remote=config.remote)
     for pump in gateway.pumps:
         pump.remote = config.remote
@@ -37,7 +37,7 @@ async def reconfigure(gateway: Gateway, config: GatewayConfig) -> None:
 
 
 class _Taking:
-    """What follows, in the gateway, when a driver has its new configuration: all of it at once."""
+    """Applies the consequences in the gateway when a driver has its new configuration, all of them in one step."""
 
     def __init__(self, gateway: Gateway, devices: Iterable[str]) -> None:
         drivers = [gateway.drivers[name] for name in devices]
@@ -56,7 +56,8 @@ class _Taking:
         gateway.complete_outputs(driver)
 
     def _understand(self, driver: AnyDriver, before: DeviceProfile) -> None:
-        """What the device said last, by the new profile. Its age stays what it is, and so does what is wrong with it."""
+        """Decode the last values of the device with the new profile. Their age stays, and so does a bad quality for
+        another reason."""
         tags, name = self._gateway.tags, driver.config.name
         changed = {n for n, tag in driver.profile.tags.items() if tag != before.tags[n] and tag.readable}
         for n in changed | {n for n, t in driver.profile.tags.items() if t.scale_by in changed}:

@@ -1,9 +1,9 @@
-"""The journal of writes that did not reach their device: which tag, which value, why, who asked, and how often.
+"""The journal of writes that did not reach their device: tag, value, cause, source and number of repetitions.
 
-An entry is an event for live views, traces, summaries and scenarios. A repetition is counted in the entry that it repeats, so
-that a program that asks for the same impossible value in every scan makes one entry. The journal is bounded: it keeps the newest
-`KEPT` entries and counts all. It also writes the refusals of commands into the audit log, at most one line a second and tag; a
-line says how many refusals it stands for.
+An entry is an event for live views, traces, summaries and scenarios. A repetition is counted in the entry that it
+repeats, so a program that commands the same impossible value in every scan makes one entry. The journal is limited: it
+keeps the newest `KEPT` entries and counts all. It also writes the refusals of commands into the audit log, at most one
+line per second and tag; a line gives the number of refusals that it covers.
 """
 
 from __future__ import annotations
@@ -26,17 +26,18 @@ from fieldtwin.gateway.core.errors import (
 from fieldtwin.gateway.runtime.audit import AuditLog
 
 KEPT = 256
-"""Entries that are kept."""
+"""How many entries are kept."""
 MERGE_NS = NS_PER_S
-"""A refusal of the same tag for the same cause within this time repeats the entry before, whatever its value."""
+"""A refusal of the same tag for the same cause within this time repeats the previous entry, whatever its value."""
 MERGE_AT_MOST_NS = 10 * NS_PER_S
-"""After this time a refusal of another value makes a new entry, so that whoever looks later sees that it goes on."""
+"""After this time a refusal of a different value makes a new entry, so that a later reader sees that refusals
+continue."""
 AUDIT_EVERY_NS = NS_PER_S
-"""The shortest time between two lines of the audit log about the same tag, cause and client."""
+"""The shortest time between two audit-log lines about the same tag, cause and client."""
 MOST_AUDITED = 1024
-"""Tags, causes and clients whose last line in the audit log is remembered."""
+"""For how many combinations of tag, cause and client the last audit-log line is remembered."""
 LATER = frozenset({5, 6, 10, 11})
-"""Modbus exception codes that say "not now" or come from a gateway on the way: the same write may succeed later."""
+"""Modbus exception codes that mean "not now" or come from a gateway on the path: the same write may succeed later."""
 
 
 class Cause(Enum):
@@ -45,37 +46,37 @@ class Cause(Enum):
     LIMIT = "limit"
     """The value is outside the limits of the tag, or its type cannot hold it, or it is not a number."""
     NOT_WRITABLE = "not writable"
-    """The configuration does not allow that this tag is written."""
+    """The configuration does not allow writing this tag."""
     READ_ONLY = "read-only"
-    """The plant runs without leave to write."""
+    """The plant runs without permission to write."""
     WRONG_DEVICE = "wrong device"
-    """Another device answers than the one that the system file expects."""
+    """The device that answers is not the one that the system file expects."""
     DEVICE = "device"
-    """The device answered and refused the value, or acknowledged it and holds another one."""
+    """The device answered and refused the value, or acknowledged it and holds a different one."""
     GROUP = "group"
     """Another member of the tag's group was refused, so the whole group is held back."""
     AWAY = "away"
     """The device does not answer. The value is written when it is back."""
     FAILED = "failed"
-    """The write was sent and not confirmed (no reply, a damaged reply, a busy device). The gateway tries again."""
+    """The write was sent and not confirmed (no reply, a corrupted reply, a busy device). The gateway tries again."""
     LOCAL = "local"
-    """The far side commanded a plant whose switch says `local`."""
+    """The topside controller sent a command to a plant whose switch is set to `local`."""
     NOT_NOW = "not now"
-    """A client asked while another write was under way or the outputs were in their safe state."""
+    """A client requested a write while another was under way or the outputs were in their safe state."""
 
 
 OF_PROGRAM = frozenset({Cause.LIMIT, Cause.NOT_WRITABLE})
-"""What the program or the configuration has to be changed for, whatever happens in the plant."""
+"""Causes that require a change to the program or the configuration, whatever happens in the plant."""
 OF_DEVICE = frozenset({Cause.WRONG_DEVICE, Cause.DEVICE})
-"""What a device that is disturbed may also refuse."""
+"""Causes that a disturbed device may also produce."""
 
 
 class HeldBack(NotAllowed):
-    """A member of a group that was not sent because of another member."""
+    """A member of a group was not sent because of another member."""
 
 
 def cause_of(error: FieldtwinError) -> Cause:
-    """The cause of a write that a driver or a bus ended with `error`."""
+    """Return the cause of a write that a driver or a bus ended with `error`."""
     if isinstance(error, HeldBack):
         return Cause.GROUP
     if isinstance(error, WrongDevice):
@@ -89,10 +90,11 @@ def cause_of(error: FieldtwinError) -> Cause:
 
 @dataclass(slots=True)
 class Refusal:
-    """One entry. `first` is the value of the first refusal, `value` that of the newest; `t_ns` and `last_ns` are monotonic.
+    """One entry. `first` is the value of the first refusal, `value` that of the newest; `t_ns` and `last_ns` are
+    monotonic.
 
-    `place` is the line of the program that set the value (``pump.st:14``), "" where it is not known. It is looked up in another
-    process after the entry was made; until then `known` is False.
+    `place` is the line of the program that set the value (``pump.st:14``), "" if it is not known. Another process looks
+    it up after the entry was made; until then `known` is False.
     """
 
     number: int
@@ -109,23 +111,23 @@ class Refusal:
     place: str = ""
     known: bool = True
     standing: bool = True
-    """False once another value was wanted, or the value was written."""
+    """False once a different value was wanted, or the value was written."""
 
     @property
     def of_program(self) -> bool:
-        """Whether a program or the safe state asked for it, and not a client."""
+        """Whether a program or the safe state requested the write, and not a client."""
         return self.by == "plc" or self.by.startswith("safe: ")
 
     @property
     def fault(self) -> str:
-        """What has to be changed: "program" where the program or the configuration is wrong, "device" where a device refused,
-        "" for what is by design, is retried, or was asked by a client."""
+        """What has to be changed: "program" if the program or the configuration is wrong, "device" if a device refused.
+        "" for a write that is refused by design, is tried again, or was requested by a client."""
         if not self.of_program:
             return ""
         return "program" if self.cause in OF_PROGRAM else "device" if self.cause in OF_DEVICE else ""
 
     def describe(self) -> dict[str, Any]:
-        """As plain data."""
+        """Return the entry as plain data."""
         return {
             "number": self.number,
             "tag": self.tag,
@@ -145,17 +147,17 @@ class Refusal:
 
 
 class Refusals:
-    """The journal of one gateway. `on_new` is called with each new entry; it may not raise."""
+    """The journal of one gateway. `on_new` is called with each new entry; it must not raise."""
 
     def __init__(self, audit: AuditLog) -> None:
         self.counts: Counter[Cause] = Counter()
         self.faults: Counter[str] = Counter()
-        """Entries of programs by `Refusal.fault`, also of those that are no longer kept."""
+        """How many entries of programs there were by `Refusal.fault`, including those that are no longer kept."""
         self.on_new: Callable[[Refusal], None] | None = None
         self.looks_up = False
-        """Whether something looks up the place of each entry of a program, and calls `place`."""
+        """Whether the place of each entry of a program is being looked up and reported with `placed`."""
         self.unrecorded = 0
-        """Refusals whose line could not be written into the audit log."""
+        """How many refusals could not be written into the audit log."""
         self._audit = audit
         self._entries: deque[Refusal] = deque(maxlen=KEPT)
         self._newest: dict[str, Refusal] = {}
@@ -165,7 +167,7 @@ class Refusals:
 
     @property
     def total(self) -> int:
-        """All refusals, repetitions included."""
+        """The number of refusals, repetitions included."""
         return sum(self.counts.values())
 
     def note(
@@ -181,7 +183,7 @@ class Refusals:
         old: object = None,
         audit: bool = True,
     ) -> None:
-        """A write of `value` did not reach the device. With `audit` it also gets a line in the audit log."""
+        """Note that a write of `value` did not reach the device. With `audit` it also gets a line in the audit log."""
         self.counts[cause] += 1
         if audit:
             self._record(device, tag, value, cause, reason, by, now_ns, old)
@@ -197,7 +199,7 @@ class Refusals:
             before.standing = False
         self._number += 1
         entry = Refusal(self._number, tag, value, value, cause, reason, by, now_ns, now_ns)
-        entry.standing = entry.of_program  # what a client asked for once is over
+        entry.standing = entry.of_program  # a client's request was for one write, so it does not stand
         entry.known = not (self.looks_up and by == "plc")
         if entry.of_program:
             self.faults[entry.fault] += 1
@@ -207,7 +209,7 @@ class Refusals:
             self.on_new(entry)
 
     def settle(self, tag: str) -> None:
-        """The tag was written, or a value is wanted that may be written: its last refusal stands no longer."""
+        """End the standing refusal of a tag, because the tag was written or a value is wanted that may be written."""
         if tag in self._newest:
             self._newest[tag].standing = False
 
@@ -240,20 +242,22 @@ class Refusals:
             self.unrecorded += 1  # counted; the write is refused with or without a record
 
     def flush(self) -> None:
-        """Write into the audit log how many refusals came since the last line about their tag. Called when the gateway stops."""
+        """Write into the audit log how many refusals came since the last line about their tag. Called when the gateway
+        stops."""
         for key, (last_ns, more) in list(self._audited.items()):
             self._write_rest(key, more)
             self._audited[key] = (last_ns, 0)
 
     def placed(self, number: int, program: str, place: str) -> None:
-        """The line of the program that set the value of entry `number` was looked up; "" where it is not known."""
+        """Set the line of the program that set the value of entry `number`; "" if it is not known."""
         for entry in reversed(self._entries):
             if entry.number == number:
                 entry.program, entry.place, entry.known = program, place, True
                 return
 
     def since(self, number: int) -> list[Refusal]:
-        """The entries after `number` that are kept, the oldest first, up to the first whose place is still looked up."""
+        """Return the entries after `number` that are kept, the oldest first, up to the first whose place is still
+        looked up."""
         found: list[Refusal] = []
         for entry in self._entries:
             if entry.number > number:
@@ -263,7 +267,7 @@ class Refusals:
         return found
 
     def describe(self) -> dict[str, Any]:
-        """For the status: counts by cause, and the entries that are kept."""
+        """Return the journal's part of the status: counts by cause, and the entries that are kept."""
         return {
             "total": self.total,
             "entries_made": self._number,

@@ -1,9 +1,9 @@
 """The process image as Modbus TCP registers, for HMIs and other controllers (`serve` section of a system file).
 
-A bad value must never look good: a read that touches a bad tag is refused with exception 04, or, where the file says so, a
-bad float is not a number and its quality register says why. What is uncertain is given out only where a quality register
-can say so. Half a value is never given out, nor taken: two reads could be of two samples. Writes go through the output
-writer's checks and the audit log; nothing else is writable.
+A bad value must never look good. A read that includes a bad tag is refused with exception 04; or, if the file asks for
+it, a bad float is NaN and its quality register holds the reason. An uncertain value is returned only if the tag has a
+quality register. Part of a value is never returned or accepted, because two reads could belong to two samples. Writes
+go through the output writer's checks and the audit log; no other register can be written.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from fieldtwin.gateway.runtime.tags import TagTable
 
 BIT_TABLES = ("coil", "discrete")
 DIRECT_UNITS = (0, 255)
-"""What a client that knows no unit ids says to a device that stands directly on TCP (TG 4.4.1.2, case MB-057)."""
+"""The unit IDs that a client without unit IDs sends to a device directly on TCP (TG 4.4.1.2, case MB-057)."""
 
 WRITING = frozenset({0x05, 0x06, 0x0F, 0x10, 0x15, 0x16, 0x17})
 """Function codes of requests that write."""
@@ -56,7 +56,8 @@ QUALITY_TABLE: Mapping[ServedTable, ServedTable] = {
 
 @dataclass(frozen=True, slots=True)
 class ServedTag:
-    """A tag and where it is served. `quality_at`: the address of its quality register, in `QUALITY_TABLE`'s table."""
+    """A tag and its position. `quality_at`: the address of its quality register, in the table given by
+    `QUALITY_TABLE`."""
 
     tag: str
     table: ServedTable
@@ -68,16 +69,17 @@ class ServedTag:
 
     @property
     def count(self) -> int:
-        """Registers or bits that it takes."""
+        """How many registers or bits it occupies."""
         return 1 if self.table in BIT_TABLES else REGISTERS[self.type]
 
 
 @dataclass(frozen=True)
 class ServeConfig:
-    """One server. `if_bad` "nan" is for floats; other types of a bad tag have nothing that could not be a value.
+    """One server. `if_bad` "nan" is for floats; other types have no bit pattern that cannot be a value.
 
-    `roles` in a client's certificate (MBTLS 8.4) may ask, `write_roles` write as well; None: every client, also one
-    without a certificate. `idle_s`: a client that is silent for so long is closed; 0: never.
+    Clients whose certificate has one of `roles` (MBTLS 8.4) may read, and those with one of `write_roles` may also
+    write; None: every client, also without a certificate. `idle_s`: a client that is silent for this long is closed; 0:
+    never.
     """
 
     name: str
@@ -93,16 +95,16 @@ class ServeConfig:
 
 
 class Writer(Protocol):
-    """Who carries out writes: the output writer."""
+    """Carries out writes: the output writer."""
 
     def request(self, tag: str, value: float, by: str, done: Callable[[FieldtwinError | None], None]) -> None:
-        """Write once; `done` is told how it ended."""
+        """Write once; `done` is called with the result."""
         ...
 
 
 @dataclass
 class ServeCounters:
-    """Reads answered; refused because of a bad tag; refused for another reason; writes that were carried out."""
+    """Reads answered; reads refused because of a bad tag; requests refused for another reason; writes carried out."""
 
     reads: int = 0
     bad: int = 0
@@ -134,7 +136,7 @@ class TagServer:
         listen: Listen = TcpListener.open,
         audit: AuditLog | None = None,
     ) -> None:
-        """`audit` takes the writes that are refused before they get to `writer`, which records those that it refuses itself."""
+        """`audit` receives the writes that are refused before they reach `writer`, which records its own refusals."""
         self.config = config
         self.counters = ServeCounters()
         self._record = WriteRecord(audit, clock) if audit is not None else None
@@ -162,13 +164,14 @@ class TagServer:
         await self.front.run()
 
     def describe(self) -> dict[str, Any]:
-        """For the status."""
+        """Return the server's part of the status."""
         return {**self.front.describe(), **asdict(self.counters), "unit": self.config.unit}
 
     # -- one request ------------------------------------------------------------------------------------------------
 
     def ask(self, caller: Caller, unit: int, pdu: bytes) -> Answer:
-        """Answer a request PDU. A unit that does not stand here has no path (0A): silence would only hide a wrong setting."""
+        """Answer a request PDU. A unit ID that is not served gets exception 0A: no answer would only hide a wrong
+        setting."""
         try:
             if unit != self.config.unit and unit not in DIRECT_UNITS:
                 raise refusal(pdu[0], NO_PATH)
@@ -199,7 +202,7 @@ class TagServer:
     # -- reading ----------------------------------------------------------------------------------------------------
 
     def _read(self, function: int, access: Access) -> bytes:
-        """All of it, or nothing (case MB-041's like for reads)."""
+        """Read the whole range, or nothing (for reads, the same as case MB-041)."""
         now_ns = self._clock.monotonic_ns()
         parts = [self._cell_bytes(function, cell, now_ns) for cell in self._covered(function, access)]
         if access.table not in BIT_TABLES:
@@ -210,7 +213,7 @@ class TagServer:
         return bytes(packed)
 
     def _covered(self, function: int, access: Access) -> list[_Cell]:
-        """The whole cells of a range; a gap or half a value is exception 02 (cases MB-048, MB-049)."""
+        """Return the whole cells of a range; a gap or part of a value is exception 02 (cases MB-048, MB-049)."""
         cells, at, end = self._cells[access.table], access.address, access.address + access.count
         found = []
         while at < end:
@@ -243,13 +246,13 @@ class TagServer:
     # -- writing ----------------------------------------------------------------------------------------------------
 
     def _write(self, caller: Caller, pdu: bytes, access: Access) -> Answer:
-        """One tag, whole. Answered when the device has confirmed it."""
+        """Write one whole tag. The client gets the answer when the device has confirmed the write."""
         function = pdu[0]
         cells = self._covered(function, access)
         if any(cell.is_quality or not cell.served.write for cell in cells):
             raise refusal(function, ILLEGAL_ADDRESS)
         if len(cells) != 1:
-            raise refusal(function, ILLEGAL_VALUE)  # two tags cannot be written together or not at all
+            raise refusal(function, ILLEGAL_VALUE)  # two tags cannot be written as one unit
         served = cells[0].served
         value = unpack(served.type, served.order, _written(pdu, served))
         if value is None:
@@ -272,7 +275,7 @@ def _is_one_of(role: str, roles: frozenset[str] | None) -> bool:
 
 
 def _written(pdu: bytes, served: ServedTag) -> bytes:
-    """The register bytes of a write request; a bit as one register."""
+    """Return the register bytes of a write request; a bit becomes one register."""
     if pdu[0] == 0x05:
         return bytes([0, pdu[3] == 0xFF])
     if pdu[0] == 0x0F:
@@ -281,14 +284,15 @@ def _written(pdu: bytes, served: ServedTag) -> bytes:
 
 
 def _code_of(error: FieldtwinError) -> int:
-    """What a client is told about a write that was not carried out."""
+    """Return the exception code for a write that was not carried out."""
     if isinstance(error, NotAllowed):
         return ILLEGAL_VALUE
     return SERVER_BUSY if isinstance(error, EndpointBusy) else SERVER_FAILURE
 
 
 def _quality_word(value: TagValue, *, fits: bool) -> int:
-    """0: good. Else the quality in the high byte and the reason in the low one; a value that the type cannot hold is bad."""
+    """Return 0 for good, else the quality in the high byte and the reason in the low byte. A value that the type cannot
+    hold is bad."""
     if value.good and not fits:
         return Quality.BAD << 8 | Reason.OUT_OF_RANGE
     return value.quality << 8 | value.reason

@@ -1,4 +1,4 @@
-"""Tag values as registers for those who read us, and back. Pure; big endian on the wire (AP 4.2), `order` as in profiles."""
+"""Tag values as registers for the gateway's clients, and back. Pure; big endian (AP 4.2), `order` as in profiles."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ REGISTERS = {name: struct.calcsize(text) // 2 for name, text in FORMATS.items()}
 
 
 def pack(kind: str, order: str, value: Scalar | None) -> bytes | None:
-    """The registers of `value`, None where the type cannot hold it: it is never cut down to what fits.
+    """Return the registers of `value`; None if the type cannot hold it, because a value is never truncated to fit.
 
-    A number goes into an integer type rounded.
+    A number is rounded for an integer type.
     """
     if value is None or isinstance(value, str | bytes) or not math.isfinite(value):
         return None
@@ -32,12 +32,12 @@ def pack(kind: str, order: str, value: Scalar | None) -> bytes | None:
 
 
 def not_a_number(kind: str, order: str) -> bytes | None:
-    """The registers that say that there is no value; None where the type has none that could not be one."""
+    """Return the registers that mean "no value" (NaN); None if the type has no value outside its normal range."""
     return reorder(struct.pack(FORMATS[kind], math.nan), order) if kind.startswith("float") else None
 
 
 def unpack(kind: str, order: str, data: bytes) -> float | None:
-    """The number in a tag's registers; None where it is none."""
+    """Return the number in a tag's registers; None if they do not hold a valid one."""
     number: float = struct.unpack(FORMATS[kind], reorder(data, order))[0]
     if kind == "bool":
         return float(number) if number in (0, 1) else None

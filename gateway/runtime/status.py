@@ -10,7 +10,7 @@ from fieldtwin.gateway.runtime.gateway import Gateway
 
 
 def describe(gateway: Gateway, now_ns: int) -> dict[str, Any]:
-    """Devices, buses, tags with quality and age, outputs, mailboxes and the PLC as the gateway sees it."""
+    """Return devices, buses, tags with quality and age, outputs, mailboxes, and the PLC as the gateway sees it."""
     return {
         "devices": _devices(gateway, now_ns),
         "buses": {name: _bus(bus) for name, bus in gateway.buses.items()},
@@ -62,7 +62,8 @@ def describe(gateway: Gateway, now_ns: int) -> dict[str, Any]:
 
 
 def _tags(gateway: Gateway, now_ns: int) -> dict[str, Any]:
-    """Every tag; one whose profile names its values has a `text` too, while its value is one of those."""
+    """Return every tag. If the profile names a tag's values, the tag also has a `text` while its value is one of
+    them."""
     found: dict[str, Any] = {name: gateway.tags.current(name, now_ns).describe(now_ns) for name in gateway.tags.names}
     for driver in gateway.drivers.values():
         for tag in driver.profile.tags.values():

@@ -1,9 +1,9 @@
-"""Messages that were taken out of a mailbox and are not acknowledged yet, kept across the death of the gateway: its successor
-acknowledges them, and hands them on no second time.
+"""Messages that were taken from a mailbox and are not acknowledged yet, kept when the gateway process dies.
 
-One JSON file in the run directory: of each transmitter the whole inbox, sequence and payload, as it was when its message was
-consumed. A file that cannot be read is as good as none: then a message may come twice. It is written before the acknowledgement,
-and in the operating system's hands then: it outlives the process, not a computer that loses its power at that instant.
+Its successor acknowledges them and does not deliver them a second time. They are in one JSON file in the run directory:
+for each transmitter the whole inbox, sequence and payload, as it was when its message was consumed. A file that cannot
+be read is ignored; then a message may be delivered twice. The file is written before the acknowledgement, but only
+handed to the operating system: it survives the end of the process, but not a power failure at that moment.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ import msgspec
 from fieldtwin.gateway.core.errors import Unreachable
 
 MOST_BYTES = 1_000_000
-"""No file of ours is larger; one that is, is not read."""
+"""Our files are never larger; a larger file is not read."""
 
 
 class TakenFile:
-    """The file at `path`; None keeps nothing beyond this process."""
+    """The file at `path`; with None, nothing is kept beyond this process."""
 
     def __init__(self, path: Path | None) -> None:
         self._path = path
@@ -31,14 +31,15 @@ class TakenFile:
                     entries = msgspec.json.decode(file.read(MOST_BYTES), type=dict[str, str])
                 self._taken = {device: bytes.fromhex(raw) for device, raw in entries.items()}
             except (OSError, msgspec.DecodeError, ValueError):
-                pass  # none yet, or not one of ours
+                pass  # there is no file yet, or it is not one of ours
 
     def of(self, device: str) -> bytes:
-        """The inbox whose message was taken; empty where there is none."""
+        """Return the inbox whose message was taken; empty if there is none."""
         return self._taken.get(device, b"")
 
     def note(self, device: str, raw: bytes) -> None:
-        """The message of this inbox was taken; empty: and acknowledged. Raises `Unreachable` when the disk refuses."""
+        """Note that the message of this inbox was taken; an empty `raw` means that it was also acknowledged. Raises
+        `Unreachable` if the disk refuses."""
         if raw == self.of(device):
             return
         self._taken.pop(device, None)

@@ -1,7 +1,7 @@
 """Counts the requests of a connection that stay unanswered, to decide when the connection is useless.
 
-A firewall or a crash can leave a TCP connection half open: everything that is sent on it is lost without an error (TG 4.2.2).
-Pure: reads the counters of a `ModbusClient`, and never touches the connection.
+A firewall or a crash can leave a TCP connection half open: everything that is sent on it is lost without an error (TG
+4.2.2). Pure: this module reads the counters of a `ModbusClient`, and never uses the connection.
 """
 
 from __future__ import annotations
@@ -9,15 +9,15 @@ from __future__ import annotations
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient
 
 MOST_UNANSWERED = 5
-"""After so many timeouts in a row a socket is useless."""
+"""After this many timeouts in a row a connection is useless."""
 
 
 class Unanswered:
     """The timeouts of `client` since its latest reply.
 
-    Those of hurried units, which polls and probes are, count only while no device is online: devices that are away are asked
-    often beside a device that is rarely polled, and their silence says nothing about the connection. A shortened timeout
-    counts as the part of the unit's own timeout that it is.
+    The timeouts of polls and probes, which hurry their units, count only while no device is online. Devices that are
+    away are asked often while another device is rarely polled, and their silence shows nothing about the connection. A
+    shortened timeout counts as a fraction: its part of the unit's own timeout.
     """
 
     def __init__(self, client: ModbusClient) -> None:
@@ -27,7 +27,7 @@ class Unanswered:
         self._waited = 0.0
 
     def too_many(self, any_online: bool) -> bool:
-        """Return whether the connection should be made anew. `any_online`: whether a device counts as online."""
+        """Return whether the connection should be opened anew. `any_online`: whether a device counts as online."""
         client, counters = self._client, self._client.counters
         answered = counters.replies + counters.exceptions
         others, waited = counters.timeouts - client.hurried_timeouts, counters.timeouts - client.not_waited

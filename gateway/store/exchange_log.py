@@ -1,8 +1,9 @@
 """The exchange log: the control logic's dataLog, kept in SQLite.
 
-The PLC logs what it exchanged while its period was positive (SPEC ruling 1) and sends each record through the process image;
-here they are stored in order, duplicates kept. Rows are committed in batches, off the event loop's critical path: `append`
-only queues, `flush` writes, and the queue has a bound whose overflow is counted.
+The PLC logs what it exchanged while its period was positive (SPEC ruling 1) and sends each record through the process
+image; here the records are stored in order, duplicates included. Rows are committed in batches, outside the event
+loop's critical path: `append` only queues, and `flush` writes. The queue is limited, and rows that do not fit are
+counted.
 """
 
 from __future__ import annotations
@@ -16,14 +17,14 @@ from fieldtwin.gateway.store.schema import migrate, refuse_newer
 
 QUEUE = 10_000
 KNOWN = 1_000
-"""Rows at the end of the store that are not taken again: more than a PLC can have under way."""
+"""How many rows at the end of the store are not stored again: more than a PLC can have under way."""
 
 
 class ExchangeLog:
     """One database file. `dropped` counts rows that did not fit the queue.
 
-    A gateway that is killed leaves neither holes nor doubles: it tells the PLC only of rows that are stored (`pending`), and its
-    successor, which gets the others again, leaves out those that were stored and not told.
+    A gateway process that is killed leaves neither gaps nor duplicates: it reports to the PLC only rows that are stored
+    (`pending`). Its successor receives the other rows again, and leaves out those that were stored but not reported.
     """
 
     def __init__(self, path: Path, *, system: str, prototype: bool) -> None:
@@ -42,7 +43,7 @@ class ExchangeLog:
             except BaseException:
                 self._db.close()
                 raise
-        except sqlite3.OperationalError as e:  # the disk, not what is in the file
+        except sqlite3.OperationalError as e:  # an error of the disk, not of the file's content
             raise Unreachable(f"cannot open the exchange log: {e}", where=str(path)) from e
         except sqlite3.DatabaseError as e:
             raise FileInvalid(
@@ -59,7 +60,7 @@ class ExchangeLog:
         self._known.update(self._db.execute(last, (KNOWN,)))
 
     def append(self, rows: list[tuple[str, int, int, bytes]]) -> None:
-        """Queue rows of (tag, sequence, monotonic ns, payload). What a predecessor stored is left out."""
+        """Queue rows of (tag, sequence, monotonic ns, payload). Rows that an earlier process stored are left out."""
         for row in rows:
             if self._known and row[:3] in self._known:
                 continue
@@ -70,24 +71,26 @@ class ExchangeLog:
 
     @property
     def waiting(self) -> int:
-        """Rows that are queued."""
+        """How many rows are queued."""
         return len(self._queue)
 
     def pending(self, tag: str) -> int:
-        """Rows of `tag` that are lost if this process is killed now, so that the PLC has to keep them.
+        """Return how many rows of `tag` are lost if this process is killed now, so that the PLC has to keep them.
 
-        0 while the disk refuses: up to `QUEUE` rows are kept here then, so that the PLC can go on.
+        The result is 0 while the disk refuses: up to `QUEUE` rows are kept here then, so that the PLC can continue.
         """
         if self._refused or self._volatile:
             return 0
         return self._pending[tag] + sum(row[0] == tag for row in tuple(self._queue))
 
     def flush(self) -> int:
-        """Write what is queued in one transaction; how many rows. Raises `Unreachable` when the disk refuses, keeping them."""
+        """Write the queued rows in one transaction and return their number. Raises `Unreachable` if the disk refuses;
+        the rows stay queued."""
         count = len(self._queue)
         if not count:
             return 0
-        self._pending = Counter(row[0] for row in tuple(self._queue))  # before they leave the queue: never too few
+        # set before the rows leave the queue, so that it is never too low
+        self._pending = Counter(row[0] for row in tuple(self._queue))
         rows = [self._queue.popleft() for _ in range(count)]
         try:
             with self._db:

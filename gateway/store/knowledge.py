@@ -1,4 +1,4 @@
-"""Opening the knowledge, whatever keeps it: a file's path, or the URL of a PostgreSQL database."""
+"""Opening the knowledge store: a file's path, or the URL of a PostgreSQL database."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ URLS = ("postgresql://", "postgres://")
 
 
 def check_place(place: str) -> None:
-    """Raise `UsageError` where a URL has a password in it, which is not repeated."""
+    """Raise `UsageError` if a URL contains a password. The message does not repeat the password."""
     if place.startswith(URLS) and has_password(place):
         raise UsageError(
             "a password in a URL can be read by everybody", got=without_password(place),
@@ -22,7 +22,8 @@ def check_place(place: str) -> None:
 
 
 async def open_knowledge(place: str, *, max_bytes: int = 0, offload: Offload | None = None) -> KnowledgeStore:
-    """A store at a path or URL. `max_bytes` and `offload` are for files. Raises `Unreachable`, `FileInvalid`, `UsageError`."""
+    """Open a store at a path or URL. `max_bytes` and `offload` are for files. Raises `Unreachable`, `FileInvalid`,
+    `UsageError`."""
     if not place.startswith(URLS):
         return await SqliteKnowledge.open(Path(place), max_bytes=max_bytes, offload=offload)
     check_place(place)

@@ -1,6 +1,7 @@
 """Knowledge in a PostgreSQL database, for twins that share one server (the extra `postgres`).
 
-Everything is in a schema of its own, `fieldtwin`, whose version stands in it. One connection, made again when it was lost.
+Everything is in a separate schema, `fieldtwin`, which also holds its version. One connection is used; it is opened
+again after it was lost.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ LATEST = max(SCRIPTS)
 BLOCK = 20_000
 CONNECT_S = 10.0
 COMMAND_S = 60.0
-_LOCK = 0x6669656C  # "fiel": while one migrates, others wait
+_LOCK = 0x6669656C  # "fiel": while one process migrates, others wait
 _SELECT = (
     "SELECT sequence, t_ms, kind, name, whole, real, words, data, quality, reason FROM event WHERE origin = $1 AND "
 )
@@ -32,7 +33,10 @@ _INSERT = (
 
 
 class PostgresKnowledge:
-    """See `fieldtwin.gateway.store.event.KnowledgeStore`. ``store = await PostgresKnowledge.open("postgresql://user@host/database")``."""
+    """A PostgreSQL store, see `fieldtwin.gateway.store.event.KnowledgeStore`.
+
+    ``store = await PostgresKnowledge.open("postgresql://user@host/database")``.
+    """
 
     def __init__(self, url: str) -> None:
         self._url = url
@@ -41,7 +45,7 @@ class PostgresKnowledge:
         self._db: asyncpg.Connection | None = None
         self._origins: dict[str, int] = {}
         self._whose: set[str] = set()
-        """Origins of others of which the store says whose they are."""
+        """Origins of other writers for which the store records the system."""
 
     @classmethod
     async def open(cls, url: str) -> PostgresKnowledge:
@@ -70,7 +74,7 @@ class PostgresKnowledge:
                 raise UsageError("the URL of a database", expected="postgresql://user@host/database", got=str(e)) from e
 
     def _drop(self) -> None:
-        """Whatever went wrong on this connection, the next piece of work begins on a new one."""
+        """Drop the connection after any error, so that the next operation opens a new one."""
         if self._db is not None:
             self._db.terminate()
             self._db = None
@@ -165,7 +169,7 @@ class PostgresKnowledge:
         try:
             return await self._do(work)
         except FieldtwinError:
-            self._origins.pop(origin, None)  # it may not have been kept either
+            self._origins.pop(origin, None)  # it may not have been stored either
             raise
 
     # -- reading ----------------------------------------------------------------------------------------------------------
@@ -245,7 +249,7 @@ class PostgresKnowledge:
 
 
 def _columns(events: Sequence[Event]) -> list[list[Any]]:
-    """Events as a list for each column but the origin's."""
+    """Return events as one list for each column except the origin's."""
     return [
         [e.sequence for e in events], [e.t_ms for e in events], [e.kind for e in events], [e.name for e in events],
         *([e.value if type(e.value) is kind else None for e in events] for kind in (int, float, str, bytes)),

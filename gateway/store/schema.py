@@ -1,7 +1,7 @@
-"""The numbered schemas of a SQLite file of ours, and bringing an old file up to date.
+"""The numbered schemas of our SQLite files, and the migration of an old file.
 
-Each number is a script beside this file, run once, in one transaction with the number itself: a file is of one version or of the
-next, never between. A file that a newer fieldtwin wrote is left alone.
+Each number is a script in this folder, run once, in one transaction with the number itself: a file has one version or
+the next, never an intermediate state. A file that a newer fieldtwin wrote is not changed.
 """
 
 from __future__ import annotations
@@ -17,12 +17,13 @@ LATEST = max(SCRIPTS)
 
 
 def script(number: int) -> str:
-    """The SQL that leads to version `number`."""
+    """Return the SQL script that leads to version `number`."""
     return files("fieldtwin.gateway.store").joinpath(SCRIPTS[number]).read_text(encoding="utf-8")
 
 
 def refuse_newer(db: sqlite3.Connection, path: Path) -> int:
-    """The version of the file; before anything is changed in it. Raises `FileInvalid` for one that is newer than this program."""
+    """Return the version of the file, before anything is changed in it. Raises `FileInvalid` for a file that is newer
+    than this program."""
     (version,) = db.execute("PRAGMA user_version").fetchone()
     if version > LATEST:
         raise FileInvalid(
@@ -36,7 +37,7 @@ def refuse_newer(db: sqlite3.Connection, path: Path) -> int:
 
 
 def migrate(db: sqlite3.Connection, path: Path) -> None:
-    """Bring the file to the latest version. `db` is in autocommit mode. Raises `FileInvalid` for a newer one."""
+    """Migrate the file to the latest version. `db` is in autocommit mode. Raises `FileInvalid` for a newer one."""
     for number in range(refuse_newer(db, path) + 1, LATEST + 1):
         try:
             db.executescript(f"BEGIN IMMEDIATE;{script(number)}PRAGMA user_version={number};COMMIT;")
@@ -44,5 +45,5 @@ def migrate(db: sqlite3.Connection, path: Path) -> None:
             if db.in_transaction:
                 db.execute("ROLLBACK")
             (now,) = db.execute("PRAGMA user_version").fetchone()
-            if now < number:  # else another process did it meanwhile
+            if now < number:  # otherwise another process migrated it meanwhile
                 raise

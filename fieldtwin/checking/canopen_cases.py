@@ -1,7 +1,7 @@
-"""The rows of the CANopen catalogue that can be run on a node from outside, with nothing but its SDO server, NMT and LSS.
+"""The CANopen test cases that can be run on a node from outside, through its SDO server, NMT and LSS alone.
 
-Rows that need the node's PDO configuration, its outputs, its errors or a disturbed bus are not here: CO-018, CO-022 to CO-025,
-CO-030, CO-034 to CO-039, CO-042, CO-043, CO-045 to CO-056, CO-058, CO-059, CO-061 to CO-066.
+Cases that need the node's PDO configuration, its outputs, its errors or a disturbed bus are not here: CO-018, CO-022 to
+CO-025, CO-030, CO-034 to CO-039, CO-042, CO-043, CO-045 to CO-056, CO-058, CO-059, CO-061 to CO-066.
 """
 
 from __future__ import annotations

@@ -46,7 +46,7 @@ async def begin_upload(wire: CanopenWire, key: Key) -> None:
 
 
 async def present(wire: CanopenWire, key: Key) -> bytes:
-    """The object's value. Raises `NotHere` where there is none."""
+    """Return the object's value. Raises `NotHere` if the object cannot be read."""
     value = await wire.upload(key)
     if isinstance(value, Reply):
         raise NotHere(f"{shown(key)}: {value}")
@@ -54,5 +54,5 @@ async def present(wire: CanopenWire, key: Key) -> bytes:
 
 
 def lacks(reply: Reply) -> bool:
-    """Whether an abort says that there is no such service."""
+    """Return whether an abort means that the node has no such service."""
     return reply.abort in (UNKNOWN_SPECIFIER, 0x0601_0000, 0x0800_0000)

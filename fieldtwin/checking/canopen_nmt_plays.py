@@ -1,6 +1,7 @@
-"""Cases of NMT, error control and LSS: they stop the node, restart it, or speak to others on the bus as well.
+"""Cases of NMT, error control and LSS: they stop the node, restart it, or send to other nodes on the bus as well.
 
-Whoever plays them has stopped the plant. A node that was OPERATIONAL is started again behind each. Clauses are CiA 301's.
+The user who runs them has stopped the plant. A node that was OPERATIONAL is started again after each. Clauses are CiA
+301's.
 """
 
 from __future__ import annotations
@@ -89,7 +90,7 @@ async def stopped(wire: CanopenWire) -> Finding:
 
 
 async def odd_commands(wire: CanopenWire) -> Finding:
-    """CO-033: resets of one and of three bytes, and one to a node id that there is not."""
+    """CO-033: send resets of one and of three bytes, and one to a node ID that does not exist."""
     async with _restored(wire):
         wire.forget()
         for data in (bytes((RESET_NODE,)), bytes((RESET_NODE, wire.node, 0)), bytes((RESET_NODE, wire.node | 0x80))):

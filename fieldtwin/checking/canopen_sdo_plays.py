@@ -19,14 +19,14 @@ from fieldtwin.gateway.protocols.canopen.sdo_block import crc16
 
 TOGGLE, UNKNOWN, BLOCK_SIZE = 0x0503_0000, 0x0504_0001, 0x0504_0002
 UNLIKELY = (0x5FFE, 0x5F0D, 0x2FFD, 0x1FFE)
-"""Indices that hardly anybody has."""
+"""Indices that very few devices have."""
 MOST_BLOCKS = 200
 COUNTED = (0x1018, 0x1010, 0x1016, 0x1029)
 """Records and arrays whose sub 00 says how many subindices there are."""
 
 
 async def toggle_repeated(wire: CanopenWire) -> Finding:
-    """CO-001: the toggle bit stays the same in the second segment; afterwards there is no transfer that could go on."""
+    """CO-001: repeat the toggle bit in the second segment; afterwards there is no transfer that could continue."""
     await begin_upload(wire, await long_object(wire))
     await wire.ask(b"\x60")
     repeated = await wire.ask(b"\x60")

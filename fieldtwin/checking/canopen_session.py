@@ -92,7 +92,7 @@ async def check_canopen(
 
 
 async def learn(wire: CanopenWire) -> dict[str, str]:
-    """Its device type, who it is, and an object of several segments. Raises `Unreachable` where it does not answer."""
+    """Read the device type and identity, and find an object of several segments. Raises `Unreachable` without an answer."""
     found: bytes | Reply = Reply()
     for _ in range(2):  # once may be a lost frame
         found = await wire.upload((0x1000, 0))

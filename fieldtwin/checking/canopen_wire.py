@@ -30,7 +30,7 @@ Key = tuple[int, int]
 
 
 def mux(index: int, subindex: int = 0) -> bytes:
-    """Index and subindex as they stand in an SDO (7.2.4.3.3)."""
+    """Return index and subindex in the form of an SDO (7.2.4.3.3)."""
     return index.to_bytes(2, "little") + bytes((subindex,))
 
 
@@ -41,13 +41,13 @@ def shown(key: Key) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Reply:
-    """What the node's SDO server said, or did not: `data` is the frame's, empty for silence."""
+    """The reply of the node's SDO server: `data` is the frame's, empty for silence."""
 
     data: bytes = b""
 
     @property
     def abort(self) -> int:
-        """The abort code, 0 where it is none."""
+        """The abort code, or 0 for a reply that is not an abort."""
         return int.from_bytes(self.data[4:8], "little") if self.data[:1] == b"\x80" else 0
 
     @property
@@ -64,9 +64,10 @@ class Reply:
 
 
 class CanopenWire:
-    """One bus and one node on it. `may_write` are objects that the user gave; `dictionary` what the EDS says, if there is one.
+    """One bus and one node on it.
 
-    `state` is the last NMT state that the node told by itself, None before it did.
+    `may_write` are objects that the user gave; `dictionary` is the content of the EDS, if there is one. `state` is the
+    last NMT state that the node reported by itself, None before the first.
     """
 
     def __init__(
@@ -86,7 +87,7 @@ class CanopenWire:
         self.danger = Danger.READ
         self.traits = frozenset({"can"})
         self.device_type = b""
-        """What 1000h answered when all was well: the object that everybody has (7.5.2.1)."""
+        """The node's answer for 1000h without faults: an object that every node has (7.5.2.1)."""
         self.long: Key | None = None
         """An object that takes more than one segment."""
         self.state: int | None = None
@@ -153,7 +154,7 @@ class CanopenWire:
         await asyncio.sleep(max(0.05, self._spacing_s))
 
     def forget(self) -> None:
-        """What came until now is not looked at any more."""
+        """Discard all frames received so far."""
         while self._connection.inbound.data_stream:
             frame = self._connection.inbound.read()
             if frame.can_id == ERROR_CONTROL + self.node and len(frame.data) == 1:
@@ -182,7 +183,7 @@ class CanopenWire:
         await self.tell(b"\x80" + mux(*key) + code.to_bytes(4, "little"))
 
     async def upload(self, key: Key) -> bytes | Reply:
-        """The value by an ordinary upload; the reply that was none where it failed."""
+        """Return the value by an ordinary upload, or the reply that ended a failed upload."""
         reply = await self.ask(b"\x40" + mux(*key))
         if reply.specifier != 2 or reply.data[1:4] != mux(*key):
             return reply

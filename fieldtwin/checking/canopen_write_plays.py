@@ -23,7 +23,7 @@ ANY_LENGTH = frozenset({DataType.VISIBLE_STRING, DataType.OCTET_STRING, DataType
 
 @asynccontextmanager
 async def _borrowed(wire: CanopenWire, key: Key) -> AsyncIterator[bytes]:
-    """What is in the object, which is put back. Raises `Unsaid` where that did not work."""
+    """Yield the object's value, and restore it. Raises `Unsaid` where that failed."""
     before = await present(wire, key)
     try:
         yield before
@@ -39,7 +39,7 @@ async def _borrowed(wire: CanopenWire, key: Key) -> AsyncIterator[bytes]:
 
 async def _unchanged(wire: CanopenWire, key: Key, before: bytes, wrong: str) -> Finding:
     if wrong:
-        await wire.abandon(key)  # whatever is still under way
+        await wire.abandon(key)  # ends any transfer in progress
     now = await wire.upload(key)
     if now != before:
         said = now.hex(" ").upper() if isinstance(now, bytes) else str(now)
@@ -50,7 +50,7 @@ async def _unchanged(wire: CanopenWire, key: Key, before: bytes, wrong: str) -> 
 async def _number(wire: CanopenWire) -> tuple[Key, bytes]:
     """Return the first given object that is a number of 1, 2 or 4 bytes; 1017h only if there is no other.
 
-    Raises `NotHere`, which says for each given object why it was not taken.
+    Raises `NotHere` with the reason for each given object.
     """
     why_not = []
     for key in sorted(wire.may_write, key=lambda key: key == (0x1017, 0)):
@@ -109,7 +109,7 @@ async def history_set(wire: CanopenWire) -> Finding:
 
 
 async def store_signature(wire: CanopenWire) -> Finding:
-    """CO-031: 1010h with a signature that is none."""
+    """CO-031: write an invalid signature to 1010h."""
     if isinstance(there := await wire.upload((0x1010, 1)), Reply):
         raise NotHere(f"it stores no parameters, 1010h: {there}")
     return await must_abort(wire, b"\x23" + mux(0x1010, 1) + b"none", 0x0800_0020, 0x0800_0022)

@@ -1,4 +1,4 @@
-"""What a check of a device comes to, whatever it speaks."""
+"""The result of a check of a device, for any protocol."""
 
 from __future__ import annotations
 
@@ -9,7 +9,11 @@ from fieldtwin.checking.device_case import DeviceResult, Spoken
 
 @dataclass(frozen=True, slots=True)
 class Checked:
-    """What the device says of itself, name to text, the results, what was said before the first, and how long all took."""
+    """The result of a check.
+
+    `identity` is the device's own identification, name to text; `before` are the frames before the first case, `took_s`
+    is the duration of the whole check.
+    """
 
     identity: dict[str, str]
     results: list[DeviceResult]

@@ -1,6 +1,6 @@
-"""What a case for a device is, what is said on the wire in it, and what was found. It knows no protocol.
+"""A case for a device, the frames exchanged in it, and its finding. It depends on no protocol.
 
-A device is judged from outside, as its master sees it: by what it answers, and when it keeps silent.
+A device is tested from outside, through its replies and its silence, as its client or master sees it.
 """
 
 from __future__ import annotations
@@ -20,8 +20,11 @@ Play = Callable[[W], Awaitable[Finding]]
 
 @dataclass(frozen=True, slots=True)
 class DeviceCase(About, Generic[W]):
-    """A case for devices. `wires`: on which it makes sense, all where none are named. `needs`: what the user has to
-    give for it (``holding``, ``coil``, ``object``: by ``--write``; ``eds``; ``i-know``)."""
+    """A case for devices.
+
+    `wires`: the transports on which it makes sense, all if empty. `needs`: inputs that the user has to give for it
+    (``holding``, ``coil``, ``object``: by ``--write``; ``eds``; ``i-know``).
+    """
 
     play: Play[W]
     wires: tuple[str, ...] = ()
@@ -43,7 +46,7 @@ class Spoken:
 
 @dataclass(frozen=True, slots=True)
 class DeviceResult(CaseResult):
-    """What was found, and all that was said meanwhile."""
+    """The finding, and all frames of the case."""
 
     spoken: tuple[Spoken, ...] = ()
 
@@ -53,4 +56,4 @@ class NotHere(Exception):
 
 
 class Unsaid(Exception):
-    """Raised inside a play: it cannot be told from outside. The case is inconclusive for this reason."""
+    """Raised inside a case that cannot be decided from outside. The case is inconclusive for this reason."""

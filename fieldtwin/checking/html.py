@@ -91,7 +91,7 @@ def _finding(result: DeviceResult) -> Markup:
 
 
 def wire_table(spoken: Sequence[Spoken]) -> Markup:
-    """What was said, line by line."""
+    """Return a table of the frames, one per row."""
     if not spoken:
         return Markup("")
     rows = [

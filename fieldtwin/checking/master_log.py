@@ -1,6 +1,7 @@
-"""The log of what a master under test and its hostile device have sent, as JSON lines like `fieldtwin.commissioning.wire_log`'s.
+"""Log the frames of a master under test and its hostile device.
 
-The directions are the master's: what it sent, and what it received.
+The JSON lines are like those of `fieldtwin.commissioning.wire_log`. The directions are the master's: the frames that it
+sent, and those that it received.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ class MasterLog(WireLog):
         self._where = where
 
     def on_event(self, event: Event) -> None:
-        """A frame is a line; connections, published values and the program's end are none."""
+        """Write a line for a frame; connections, published values and the program's end are not written."""
         if not isinstance(event, Asked | Told | Sent | Garbled):
             return
         _, frame, _ = line_of(event)

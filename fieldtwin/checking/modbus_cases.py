@@ -21,7 +21,7 @@ READ, WRITE, DISRUPT = Danger.READ, Danger.WRITE, Danger.DISRUPT
 LINE = ("rtu-line",)
 ASCII = ("ascii-line",)
 FRAMED = ("rtu-line", "rtu-stream")
-"""RTU frames, on a line or through TCP: what needs no pauses."""
+"""RTU frames, on a line or through TCP: cases that need no pauses."""
 ANY_LINE = ("rtu-line", "ascii-line", "rtu-stream")
 TCP = ("mbap-stream",)
 STREAM = ("mbap-stream", "rtu-stream")

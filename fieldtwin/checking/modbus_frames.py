@@ -1,7 +1,7 @@
-"""Modbus frames for checks: requests made by hand, the damaged ones included, and replies found in whatever came back.
+"""Modbus frames for checks: requests made by hand, including damaged ones, and replies found in the received bytes.
 
-Pure. A driver's framer refuses what is odd; here odd is what is looked for, so that nothing is thrown away: what is no
-frame is kept as `rest`. Sources: MODBUS over Serial Line V1.02 (SL), Messaging on TCP/IP V1.0b (TG).
+Pure. A driver's framer discards invalid data; a check looks for it, so nothing is discarded: bytes that form no frame
+are kept as `rest`. Sources: MODBUS over Serial Line V1.02 (SL), Messaging on TCP/IP V1.0b (TG).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _ASCII_FRAME = re.compile(rb":([0-9A-F]{6,512})\r\n")
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """A whole reply of somebody. `transaction` is `NO_TRANSACTION` on a line."""
+    """A whole reply. `transaction` is `NO_TRANSACTION` on a line."""
 
     unit: int
     pdu: bytes
@@ -29,7 +29,7 @@ class Answer:
 
     @property
     def refusal(self) -> int:
-        """The exception code, 0 where it is none (AP 7)."""
+        """The exception code, 0 for a normal reply (AP 7)."""
         return self.pdu[1] if self.pdu[0] & 0x80 and len(self.pdu) == 2 else 0
 
     def __str__(self) -> str:
@@ -55,7 +55,7 @@ def framed(framing: str, unit: int, pdu: bytes, transaction: int = 1) -> bytes:
 
 
 def ascii_frame(body: bytes, check: int | None = None) -> bytes:
-    """``:`` hex, LRC, CR LF (SL 2.5.2.1); another check sum if `check` says so."""
+    """Return ``:``, the hex digits, the LRC and CR LF (SL 2.5.2.1); `check` replaces the check sum."""
     return b":" + (body + bytes((lrc(body) if check is None else check,))).hex().upper().encode() + b"\r\n"
 
 
@@ -66,7 +66,7 @@ def mbap(body: bytes, transaction: int, protocol: int = 0, length: int | None = 
 
 
 def replies(framing: str, data: bytes) -> tuple[list[Answer], bytes]:
-    """All whole replies in `data`, in order, and what is none of them or not whole yet."""
+    """Return all whole replies in `data`, in order, and the bytes that form no reply or an incomplete one."""
     if framing == "rtu":
         return _rtu_replies(data)
     if framing == "ascii":
@@ -90,8 +90,11 @@ def _rtu_replies(data: bytes) -> tuple[list[Answer], bytes]:
 
 
 def _rtu_length(data: bytes) -> int:
-    """Of the frame that `data` begins with, 0 if it is none: a length that its function can have, else the shortest that fits."""
-    least = 5 if len(data) > 1 and data[1] & 0x80 else 4  # the CRC of 01 80 is 01 80: an exception is no shorter one
+    """Return the length of the frame at the start of `data`, 0 if there is none.
+
+    A length that its function can have is preferred, else the shortest that fits.
+    """
+    least = 5 if len(data) > 1 and data[1] & 0x80 else 4  # the CRC of 01 80 is 01 80, so an exception must be longer
     if len(data) < least:
         return 0
     fitting, crc = set(), 0xFFFF

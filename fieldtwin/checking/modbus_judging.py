@@ -54,7 +54,7 @@ async def silent_then_good(wire: ModbusWire, heard: Heard) -> Finding:
 
 
 def answers_good(wire: ModbusWire, heard: Heard, times: int) -> bool:
-    """Whether `heard` is the usual answer, so many times, and nothing else."""
+    """Return whether `heard` is the usual answer `times` times, without any other bytes."""
     return len(heard.answers) == times and all(wire.is_good(a) for a in heard.answers) and not heard.rest
 
 

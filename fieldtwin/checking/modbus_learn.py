@@ -1,6 +1,7 @@
-"""Learning what a Modbus device answers when all is well, by reads only: what the checks then lean on.
+"""Learn the normal answers of a Modbus device by reads only, as the reference of the checks.
 
-A device is present when it answers at all; an exception is an answer, but for those by which a gateway says that nobody is there.
+A device is present when it answers at all; an exception counts as an answer, except those by which a gateway reports a
+missing device.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ def read_of(function: int, address: int, count: int) -> bytes:
 
 
 def values_of(answer: Answer | None, function: int, count: int) -> bytes | None:
-    """The data of a whole reply to such a read, None where it is none."""
+    """Return the data of a whole reply to such a read, or None for any other reply."""
     size = 2 * count if function in (0x03, 0x04) else (count + 7) // 8
     if answer is None or answer.pdu[:2] != bytes((function, size)) or len(answer.pdu) != 2 + size:
         return None
@@ -31,10 +32,10 @@ def values_of(answer: Answer | None, function: int, count: int) -> bytes | None:
 
 
 async def learn(wire: ModbusWire, given: dict[str, int], writable: dict[str, int] | None = None) -> None:
-    """Fill `good`, `readable` and `refused` of `wire`; `given`: table -> address that the user says can be read,
-    `writable` the same of cells that may be written: these are tried before the usual addresses.
+    """Fill `good`, `readable` and `refused` of `wire`.
 
-    Raises `Unreachable` where nobody answers.
+    `given`: table -> address that can be read according to the user, `writable` the same of cells that may be written:
+    these are tried before the usual addresses. Raises `Unreachable` without an answer.
     """
     await wire.reopen()
     refusal: tuple[bytes, bytes] | None = None

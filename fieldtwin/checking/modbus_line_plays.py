@@ -1,6 +1,7 @@
-"""Cases of a serial line, RTU and ASCII: damaged frames, noise, pauses, neighbours. Nothing but reads is on the wire.
+"""Cases of a serial line, RTU and ASCII: damaged frames, noise, pauses, neighbours. They send reads only.
 
-SL is MODBUS over Serial Line V1.02. Where strict and tolerant receivers differ, both pass as long as they keep to one.
+SL is MODBUS over Serial Line V1.02. Where strict and tolerant receivers differ, both pass as long as they are
+consistent.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ async def gap_inside(wire: ModbusWire) -> Finding:
     """MB-005: a pause of 2.5 characters or 2 ms inside a frame."""
     frame = wire.frame(wire.good)
     await wire.say(frame[:4], wire.good)
-    await wire.pause(max(6.5 * wire.char_s, 0.002))  # what was written is under way for four characters
+    await wire.pause(max(6.5 * wire.char_s, 0.002))  # four characters are still in transmission
     await wire.say(frame[4:], wire.good, at_once=True)
     heard = await wire.hear()
     if answers_good(wire, heard, 1):
@@ -116,7 +117,7 @@ async def broadcast_read(wire: ModbusWire) -> Finding:
 
 
 async def _silent_neighbour(wire: ModbusWire) -> int:
-    """A unit id that nobody has. Raises `Unsaid` if all that were tried are somebody."""
+    """Return an unused unit ID. Raises `Unsaid` if a device answers each of those that were tried."""
     for unit in _neighbours(wire):
         if (await wire.ask(wire.good, unit, due=False)).nothing:
             await wire.settle()
@@ -170,7 +171,7 @@ async def neighbour_silent(wire: ModbusWire) -> Finding:
 
 
 async def stranger_function(wire: ModbusWire) -> Finding:
-    """MB-032: a function that nobody has, to another unit."""
+    """MB-032: send an unknown function to another unit."""
     other = await _silent_neighbour(wire)
     pdu = b"\x64\x00\x01"
     await wire.say(wire.frame(pdu, other), pdu)
@@ -241,7 +242,7 @@ async def noise_before_colon(wire: ModbusWire) -> Finding:
 
 
 async def no_character(wire: ModbusWire) -> Finding:
-    """MB-070: a character inside that is none of 0 to F."""
+    """MB-070: send a character other than 0 to F inside the frame."""
     frame = bytearray(wire.frame(wire.good))
     frame[5:6] = b"G"
     await wire.say(bytes(frame), wire.good)

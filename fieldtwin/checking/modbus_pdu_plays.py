@@ -183,7 +183,7 @@ async def unknown_object(wire: ModbusWire) -> Finding:
 
 
 async def unknown_category(wire: ModbusWire) -> Finding:
-    """MB-045: a read device id code that there is not."""
+    """MB-045: send an undefined read device ID code."""
     return await must_refuse(wire, b"\x2b\x0e\x07\x00", 0x03)
 
 

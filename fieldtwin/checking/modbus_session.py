@@ -34,9 +34,12 @@ OBJECT_NAMES = {
 
 @dataclass(frozen=True, slots=True)
 class ModbusOptions:
-    """How to check: `given` table -> address that can be read; `may_write` table -> (address, count) of cells that are
-    lent for writing; `go_on` says why nothing more may be sent, or nothing. On a serial line `listen_s` is listened first:
-    nothing is sent where somebody else talks, unless `share_bus`."""
+    """The options of a check.
+
+    `given` table -> address that can be read; `may_write` table -> (address, count) of cells that may be written
+    temporarily; `go_on` returns the reason to stop sending, or an empty string. A serial line is first observed for
+    `listen_s` seconds: nothing is sent if it carries foreign traffic, unless `share_bus`.
+    """
 
     endpoint: str
     unit: int
@@ -68,7 +71,7 @@ async def check_modbus(
     say: Callable[[str], None] = lambda text: None,
     tell: Callable[[DeviceResult], None] = lambda result: None,
 ) -> Checked:
-    """The whole check. Raises `Unreachable` where nobody answers, `NotAllowed` where somebody else talks on the line."""
+    """Run the whole check. Raises `Unreachable` without an answer, `NotAllowed` for foreign traffic on the line."""
     endpoint = Endpoint.parse(options.endpoint)
     clock = options.clock or WallClock()
     began_ns = clock.monotonic_ns()
@@ -103,7 +106,7 @@ async def check_modbus(
 
 
 async def read_identity(wire: ModbusWire) -> dict[str, str]:
-    """What the device says of itself by FC 43/14 and FC 17; empty where it says nothing."""
+    """Return the device's identification by FC 43/14 and FC 17; empty if it gives none."""
     identity: dict[str, str] = {}
     for code in (0x01, 0x02):
         answer = (await wire.ask(bytes((0x2B, 0x0E, code, 0)), due=False)).first
@@ -118,7 +121,7 @@ async def read_identity(wire: ModbusWire) -> dict[str, str]:
 
 
 def objects_in(pdu: bytes) -> dict[str, str]:
-    """Name to text of what a reply of FC 43/14 says; empty for what is none."""
+    """Return the objects in a reply of FC 43/14, name to text; empty for any other PDU."""
     said: dict[str, str] = {}
     if len(pdu) < 7 or pdu[:2] != b"\x2b\x0e":
         return said

@@ -95,7 +95,7 @@ async def _served_anew(wire: ModbusWire, why: str) -> Finding:
 
 
 async def length_zero(wire: ModbusWire) -> Finding:
-    """MB-055: length 0, and nothing behind it."""
+    """MB-055: send length 0 and no further bytes."""
     return await _wrong_length(wire, wire.next_transaction().to_bytes(2) + b"\0\0\0\0")
 
 
@@ -105,7 +105,7 @@ async def length_one(wire: ModbusWire) -> Finding:
 
 
 async def length_ffff(wire: ModbusWire) -> Finding:
-    """MB-055: length FFFFh with an ordinary request behind it."""
+    """MB-055: send length FFFFh, followed by an ordinary request."""
     return await _wrong_length(wire, _adu(wire, wire.next_transaction(), length=0xFFFF))
 
 
@@ -167,7 +167,7 @@ async def half_and_gone(wire: ModbusWire) -> Finding:
 
 
 async def many_connections(wire: ModbusWire) -> Finding:
-    """MB-065: 20 connections that nobody uses: one more is served all the same."""
+    """MB-065: open 20 idle connections: one more is still served."""
     held = []
     try:
         for _ in range(20):

@@ -26,18 +26,18 @@ MOST_HEARD = 8192
 CALM_S = 0.8
 """After this silence on a line no receiver waits for the rest of a frame, however slow its timers are (libmodbus: 0.5 s)."""
 PATIENCE = 3
-"""So many timeouts are waited for an answer that is due before it is called silence: slow is no fault."""
+"""Number of timeouts after which a missing answer counts as silence: a slow device is not faulty."""
 FIRST_TRANSACTION = 0x0100
-"""Ids begin anew with each case: the same case sends the same bytes, whatever was played before."""
+"""First transaction ID of each case: the same case always sends the same bytes, whatever ran before."""
 GATEWAY_SAYS_NO = (0x0A, 0x0B)
-"""Exceptions of a gateway that has no such device: nobody is there."""
+"""Exceptions of a gateway that has no such device."""
 
 Open = Callable[[], Awaitable[ByteConnection]]
 
 
 @dataclass(frozen=True, slots=True)
 class Heard:
-    """What came: whole replies, what is none, and whether the device hung up."""
+    """The received data: whole replies, other bytes, and whether the device closed the connection."""
 
     answers: tuple[Answer, ...]
     rest: bytes = b""
@@ -111,7 +111,7 @@ class ModbusWire:
         self._closed = False
 
     async def open_another(self) -> ByteConnection:
-        """One more, beside ours; whoever asks for it closes it."""
+        """Open one more connection; the caller closes it."""
         return await self._open()
 
     async def aclose(self) -> None:
@@ -162,7 +162,7 @@ class ModbusWire:
         await self.clock.sleep_until_ns(self._quiet_since_ns + round(self._spacing_s * NS_PER_S))
 
     async def hear(self, count: int = 1, within_s: float | None = None) -> Heard:
-        """What comes, until there are `count` whole replies, or nothing came for the timeout; ``count=0`` hears all."""
+        """Receive until there are `count` whole replies, or nothing came for the timeout; ``count=0`` receives everything."""
         data, closed = await self._bytes(count, self.timeout_s if within_s is None else within_s)
         answers, rest = replies(self.framing, data)
         return Heard(tuple(answers), rest, closed)
@@ -213,7 +213,7 @@ class ModbusWire:
         await asyncio.sleep(s)
 
     async def drain(self) -> Heard:
-        """What came unasked until now."""
+        """Receive the unrequested bytes that have arrived."""
         return await self.hear(0, self.pause_s)
 
     # -- when all is well -----------------------------------------------------------------------------------------

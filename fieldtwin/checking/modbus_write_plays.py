@@ -1,7 +1,7 @@
-"""Cases that write, to the cells that the user gave, and put back what was there.
+"""Cases that write to the cells that the user gave, and restore their values.
 
-What a case means to have refused is tried with a value that differs from the cell's, so that a write that happened all the
-same is seen. AP is the Modbus Application Protocol V1.1b3.
+A write that the device should refuse uses a value other than the cell's, so that a write that was executed is noticed.
+AP is the Modbus Application Protocol V1.1b3.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def _write(table: str, address: int, data: bytes) -> bytes:
 
 @asynccontextmanager
 async def _borrowed(wire: ModbusWire, table: str) -> AsyncIterator[tuple[int, bytes]]:
-    """The cell that may be written and what is in it, which is put back. Raises `Unsaid` where that did not work."""
+    """Yield the cell that may be written and its value, and restore it. Raises `Unsaid` where that failed."""
     if table not in wire.may_write:
         raise NotHere(f"no cell to write was given: --write {table}:ADDRESS")
     address, _ = wire.may_write[table]
@@ -72,7 +72,7 @@ async def write_none(wire: ModbusWire) -> Finding:
 async def _odd_coil(wire: ModbusWire, value: bytes) -> Finding:
     async with _borrowed(wire, "coil") as (address, before):
         on = bool(before[0] & 1)
-        # what is tried must not look like the state that is there: FF01 on a coil that is off, 0001 likewise
+        # the tested value must differ from the current state: FF01 on a coil that is off, 0001 likewise
         if on:
             heard = await wire.ask(_write("coil", address, b"\0"))
             if heard.first is None or heard.first.refusal:

@@ -1,6 +1,7 @@
-"""A check on paper, `--dry-run`: played on a device of ours in memory, in virtual time, to see what would be sent.
+"""A dry run of a check, `--dry-run`, which shows the frames that would be sent.
 
-Nothing is opened. A real device that answers otherwise leads to other frames in places: what it says decides how a case goes on.
+The check runs on a simulated device in memory, in virtual time. Nothing is opened. A real device with different answers
+leads to other frames in places: its answers decide how a case continues.
 """
 
 from __future__ import annotations
@@ -109,7 +110,7 @@ def canopen_on_paper(options: CanopenOptions) -> Checked:
 
 
 def _sheet(options: CanopenOptions) -> str:
-    """The data sheet of a node that has the objects that everybody has, and those that may be written, as numbers."""
+    """Return the data sheet of a node with the mandatory objects, and those that may be written, as numbers."""
     text = "[DeviceInfo]\nVendorName=paper\n"
     text += _var("1000", 7, "ro", "0x0") + _var("1001", 5, "ro", "0") + _var("1017", 6, "rw", "0")
     text += _var("1008", 9, "const", "a node on paper")

@@ -1,4 +1,4 @@
-"""Results of a check of a device as JSON and for JUnit. What the verdicts come to is `fieldtwin.conformance.results`'s."""
+"""Results of a check of a device as JSON and for JUnit. `fieldtwin.conformance.results` summarises the verdicts."""
 
 from __future__ import annotations
 

@@ -27,8 +27,11 @@ MOST_LOST = 3
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What may be played. `has`: what the user gave (``holding``, ``coil``, ``object``, ``eds``, ``i-know``); `at_most` the
-    highest danger; `for_s` the end of it all, 0 for none."""
+    """The limits of a check.
+
+    `has`: the inputs that the user gave (``holding``, ``coil``, ``object``, ``eds``, ``i-know``); `at_most` the highest
+    impact level; `for_s` the end of the whole check, 0 for none.
+    """
 
     only: frozenset[str] = frozenset()
     at_most: Danger = Danger.READ
@@ -130,7 +133,7 @@ async def play(
 
 
 async def _case(wire: W, case: DeviceCase[W], transcript: Transcript) -> tuple[Finding, bool]:
-    """What was found, and whether all was well before."""
+    """Return the finding of a case, and whether the device answered normally before it."""
     wire.danger = Danger.READ
     if not await wire.settle():
         return inconclusive("all was not well before it: the usual request got no answer"), False

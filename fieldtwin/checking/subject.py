@@ -1,4 +1,4 @@
-"""What a check is about: the device, as far as it names itself, who looked at it, when, and by which words."""
+"""The subject of a check: the device's identification, the user, the time, and the command line."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ from fieldtwin.__about__ import __version__
 
 @dataclass(frozen=True, slots=True)
 class Subject:
-    """`identity` is what the device says of itself, in its words, name to text: vendor, product, serial number...
+    """The subject of a check.
 
-    `started` is ISO 8601 in UTC, `took_s` the whole check. `at_most` is the highest danger that was allowed, `wrote` what was
-    given for writing.
+    `identity` is the device's own identification, in its words, name to text: vendor, product, serial number...
+    `started` is ISO 8601 in UTC, `took_s` the duration of the whole check. `at_most` is the highest impact level that
+    was allowed, `wrote` lists the cells and objects given for writing.
     """
 
     protocol: str
@@ -42,7 +43,7 @@ class Subject:
 
 
 def who() -> str:
-    """The name under which somebody is logged in here, empty where there is none."""
+    """Return the name of the logged-in user, empty if unknown."""
     try:
         return getpass.getuser()
     except (KeyError, OSError, ImportError):

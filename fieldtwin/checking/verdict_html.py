@@ -44,7 +44,10 @@ def colour_of(result: CaseResult) -> Verdict:
 
 
 def verdict_pill(result: CaseResult) -> Markup:
-    """The verdict; a failure that is no deviation has the colour of an inconclusive case and its own word."""
+    """Return the verdict as a label.
+
+    A failure that does not deviate from a standard has the colour of an inconclusive case and its own word.
+    """
     if colour_of(result) is result.verdict:
         return pill(result.verdict)
     return el("span", f"! {called(result)}", cls=f"pill {colour_of(result).value}")
@@ -57,7 +60,7 @@ def verdict_bar(results: Sequence[CaseResult]) -> Markup:
 
 
 def sources_note(results: Sequence[CaseResult]) -> Markup:
-    """What the sources of the cases stand for."""
+    """Return a note that explains the sources of the cases."""
     canopen = any(r.case.id.startswith("CO-") for r in results)
     return el("p", f"Sources. {CANOPEN_SOURCES if canopen else MODBUS_SOURCES} {ALL_SOURCES}", cls="small")
 

@@ -1,9 +1,9 @@
-"""The rows of the CANopen catalogue that concern masters and can be judged from the bus. Clauses are CiA 301 v4.2 unless said.
+"""The test cases for CANopen masters that can be checked on the bus. Clauses are CiA 301 v4.2 unless stated otherwise.
 
-A case is REQUIRED only where a clause demands what it asks. A client has to refuse a value that was transferred wrongly, but it
-may leave out the abort that tells the node (7.2.4: client and server "may" execute it): a case that asks for an abort is ROBUST.
-Only the end of a block upload has to be confirmed or aborted. What a master does about the loss or the restart of a node is the
-application's decision: such cases are ROBUST as well.
+A case is REQUIRED only where a clause demands the behaviour. A client has to refuse a value that was transferred
+wrongly, but it may omit the abort to the node (7.2.4: client and server "may" execute it): a case that expects an abort
+is ROBUST. Only the end of a block upload has to be confirmed or aborted. The reaction of a master to the loss or the
+restart of a node is the application's decision: such cases are ROBUST as well.
 """
 
 from __future__ import annotations

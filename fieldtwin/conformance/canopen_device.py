@@ -9,7 +9,7 @@ from fieldtwin.emulators.canopen.sdo_server import SdoServer
 
 TIMEOUT_NS = 2_000_000_000
 LONG_BYTES = 1000
-"""What a block upload gives, the word again and again: two sub-blocks."""
+"""The data of a block upload, the word repeated: two sub-blocks."""
 BOOT_UP, PRE_OPERATIONAL, OPERATIONAL, STOPPED = 0x00, 0x7F, 0x05, 0x04
 _STATES = {0x01: OPERATIONAL, 0x02: STOPPED, 0x80: PRE_OPERATIONAL}
 _RESETS = frozenset({0x81, 0x82})
@@ -17,7 +17,7 @@ _FIXED = {(0x1001, 0): b"\0", (0x1008, 0): b"fieldtwin", (0x1018, 0): b"\x04"}
 
 
 class OneWordObjects:
-    """Every object reads as `word` in `size` bytes, little-endian; what was written reads back."""
+    """Objects that all read as `word` in `size` bytes, little-endian; a written object reads back its value."""
 
     def __init__(self, word: int, size: int, held: dict[tuple[int, int], bytes]) -> None:
         self.word = word
@@ -56,12 +56,12 @@ class HonestNode:
         return self._server.request(request, now_ns)
 
     def acknowledge(self, now_ns: int) -> list[bytes]:
-        """What is good of a sub-block of a block download, said before its end."""
+        """Return the acknowledgement of the received part of a sub-block of a block download before its end."""
         return self._server.tick(now_ns + TIMEOUT_NS // 2)
 
     @property
     def receiving(self) -> bool:
-        """Whether frames are segments of a block download now, whatever stands in them."""
+        """Return whether frames are segments of a block download now, whatever their content."""
         return self._server.in_sub_block
 
     def poisoned(self, request: bytes, poison: int) -> bytes:

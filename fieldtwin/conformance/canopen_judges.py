@@ -59,7 +59,7 @@ notices = owes(_noticed)
 
 
 def _unmoved(seen: Observation) -> Finding | None:
-    """A heartbeat that is a little late is no event: nothing is commanded, no value goes."""
+    """Check that a heartbeat that is slightly late has no effect: no command is sent and no value disappears."""
     moved = any(_id(sent) == NMT for sent in seen.of(Sent, seen.begun_ns))
     if moved or any(shown.word is Word.NONE for shown in seen.of(Shown, seen.begun_ns)):
         return inconclusive("it took the node for lost: right only where its consumer time is shorter than that")
@@ -70,7 +70,7 @@ is_unmoved = owes(_unmoved)
 
 
 def _waits_for_each(seen: Observation) -> Finding | None:
-    """Every answer came within the timeout of its own request: none may be given up before."""
+    """Check that no request was repeated before its answer came. Every answer came within the timeout of its own request."""
     asked = list(seen.of(Asked, seen.begun_ns, seen.over_ns))
     for one, following in pairwise(asked):
         told = next(seen.of(Told, one.t_ns, seen.over_ns), None)
@@ -118,7 +118,7 @@ def _one_a_block(seen: Observation) -> Finding | None:
 
 BLOCK_ACKNOWLEDGED = 0xA2
 _OTHERS = frozenset((*range(0xC0, 0xE0), ABORT))
-"""First bytes of what is no segment of a block upload."""
+"""First bytes of frames that are not segments of a block upload."""
 one_a_block = owes(_one_a_block)
 
 

@@ -1,4 +1,4 @@
-"""What a hostile CANopen node does (CiA 301 v4.2, 7.2.4 for SDO). Pure: a request in, frames out."""
+"""The replies of a hostile CANopen node (CiA 301 v4.2, 7.2.4 for SDO). Pure: a request in, frames out."""
 
 from __future__ import annotations
 
@@ -141,7 +141,7 @@ def extended(scene: CanScene) -> list[SayFrame]:
 
 
 def honest(scene: CanScene) -> list[SayFrame]:
-    """What is odd is elsewhere: in what the node does not hear or say."""
+    """Reply correctly. The fault is elsewhere: in frames that the node ignores or does not send."""
     return [scene.reply(data) for data in scene.true]
 
 
@@ -227,6 +227,6 @@ def pdo_outside(scene: CanScene) -> list[SayFrame]:
 
 
 def emcy_partly_over(scene: CanScene) -> list[SayFrame]:
-    """Two errors, and one of them is over: the error register still says that there is one."""
+    """Send two errors, and report one of them as cleared: the error register still shows an error."""
     told = (b"\x10\x81\x11", b"\x00\x50\x19", b"\x00\x00\x11")
     return [*(scene.frame(EMCY, data.ljust(8, b"\0")) for data in told), *scene.honest()]

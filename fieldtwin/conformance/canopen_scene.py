@@ -1,4 +1,4 @@
-"""What a CANopen play has to work with, and its case. Pure."""
+"""The inputs of a CANopen reply function, and the CANopen test case. Pure."""
 
 from __future__ import annotations
 

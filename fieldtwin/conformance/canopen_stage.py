@@ -69,7 +69,7 @@ class CanopenStage:
         self.struck = self.first_ns = self.last_ns = 0
 
     def end(self) -> None:
-        """All that begins from now on is answered well; what is under way is played to its end."""
+        """Answer all new requests correctly from now on; a transfer in progress continues to its end."""
         self._case = None
 
     async def serve(self, connection: CanConnection) -> None:
@@ -217,7 +217,7 @@ class CanopenStage:
                 left -= 1
                 self.pending -= 1
         except ConnectionLost:
-            pass  # the bus is gone: `serve` says so
+            pass  # the bus is gone: `serve` reports it
         finally:
             self.pending -= left
 
@@ -239,7 +239,10 @@ class CanopenStage:
                 await self._connection.send(CanFrame(HEARTBEAT + number, bytes((BOOT_UP,))))
 
     async def _guard(self, number: int, now_ns: int) -> None:
-        """A guard request (CiA 301, 7.2.8.2.2.1): the state, with a toggle bit that alternates, but for the case about it."""
+        """Answer a guard request (CiA 301, 7.2.8.2.2.1) with the state and an alternating toggle bit.
+
+        In the case about guard requests the toggle bit is wrong.
+        """
         self.recorder.add(Sent(now_ns, MASTER, (HEARTBEAT + number).to_bytes(2, "big")))
         node, case = self._node(number), self._case
         toggle = self._guarded.get(number, 0)

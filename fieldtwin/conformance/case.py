@@ -1,4 +1,4 @@
-"""What a case is: an id of the catalogue, what the device does, what the master must do, and who judges it.
+"""A test case: its ID in the test-case list, the action of the device, the expected reaction of the master, and its check.
 
 Protocols are elsewhere.
 """
@@ -14,11 +14,11 @@ from fieldtwin.conformance.observation import Observation
 from fieldtwin.report.model import Verdict
 
 TRAIL_S = 0.3
-"""How long a case looks on after the master is back to good, where it does not say otherwise: what comes late is seen."""
+"""Default time that a case continues after the master has recovered, so that late effects are seen."""
 
 
 class Danger(Enum):
-    """What a case may do to whatever is behind the master, in rising order."""
+    """Impact level of a case on the equipment behind the master, in rising order."""
 
     OBSERVE = "observe"
     """Nothing: it only listens."""
@@ -27,7 +27,7 @@ class Danger(Enum):
     WRITE = "write"
     """Writes are answered oddly: the master may repeat them."""
     DISRUPT = "disrupt"
-    """The connection is cut, or the line disturbed for everybody on it."""
+    """The connection is cut, or the line is disturbed for all devices on it."""
 
     @property
     def rank(self) -> int:
@@ -95,12 +95,12 @@ Judge = Callable[[Observation], Finding]
 
 @dataclass(frozen=True, slots=True)
 class About:
-    """The part of a case that people see.
+    """The part of a case that is shown to users.
 
-    `id` is the catalogue's, with a letter behind it where a row is several cases. `clause` names the source: the clause of the
-    standard, or the project that reported the problem. `does` is what the checker does, a verb first ("inverts the CRC"), `must`
-    what the device or master, which has the `role`, is expected to do. `elsewhere` overrides `basis` and `clause` on single kinds
-    of wire.
+    `id` is that of the test-case list, followed by a letter where one entry has several cases. `clause` names the
+    source: the clause of the standard, or the project that reported the problem. `does` is the checker's action,
+    beginning with a verb ("inverts the CRC"), `must` is the expected behaviour of the device or master, which has the
+    `role`. `elsewhere` overrides `basis` and `clause` for certain kinds of transport.
     """
 
     id: str

@@ -1,4 +1,4 @@
-"""What a verdict about a master rests on: the frames and events of its case as lines, and the command that plays it again."""
+"""The evidence of a verdict about a master: the frames and events of its case as lines, and the command that repeats it."""
 
 from __future__ import annotations
 
@@ -20,8 +20,11 @@ ABORT = 0x80
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """One event. `t_ms` counts from the first request that was misanswered. `by` is ``master``, ``device``, ``probe`` or
-    ``program``; `data` is a frame in hex (a CAN frame as candump writes it), and `text` says what it is."""
+    """One event.
+
+    `t_ms` counts from the first request that received a wrong reply. `by` is ``master``, ``device``, ``probe`` or
+    ``program``; `data` is a frame in hex (a CAN frame in candump format), and `text` describes it.
+    """
 
     t_ms: float
     by: str
@@ -92,8 +95,10 @@ def _abort(data: bytes) -> str:
 
 
 def reproduce(argv: Sequence[str], id: str) -> str:
-    """The command line `argv` (without the program's name) for the case `id` alone. Options of ours stand before ``--``, after
-    which the program under test and its own options follow."""
+    """Return the command line `argv` (without the program's name) for the case `id` alone.
+
+    The checker's options stand before ``--``; the program under test and its own options follow it.
+    """
     at = list(argv).index("--") if "--" in argv else len(argv)
     ours, theirs = list(argv[:at]), list(argv[at:])
     kept: list[str] = []

@@ -12,11 +12,11 @@ from fieldtwin.gateway.core.clock import NS_PER_MS
 TURNAROUND_MS = 100
 """SL 2.4.1: the turnaround delay is typically 100 to 200 ms; it has to be long enough for any unit to process the request."""
 NO_DELAY_MS = 10
-"""A shorter pause than this is no turnaround delay at all."""
+"""A pause shorter than this is not a turnaround delay."""
 MOST = {0x01: 2000, 0x02: 2000, 0x03: 125, 0x04: 125, 0x0F: 1968, 0x10: 123}
 """AP 6: how many bits or registers a request of each function may name."""
 MOST_CONNECTIONS = 4
-"""So many at once are still no leak: the old ones may need their time to end."""
+"""Number of simultaneous connections that is not a leak yet: old ones may need time to close."""
 READS = frozenset({0x01, 0x02, 0x03, 0x04, 0x07, 0x0B, 0x0C, 0x11, 0x14, 0x17, 0x18, 0x2B})
 
 

@@ -1,7 +1,7 @@
-"""Judges that cases share: pure functions of an `Observation`.
+"""Checks that cases share: pure functions of an `Observation`.
 
-What every master owes, whatever was done to it, comes first: it goes on, it does not flood, it sends nothing that is no
-request, and no value of a bad frame is ever published. Then what the case is about.
+The first ones apply to every master in every case: it continues, it does not flood, it sends only valid requests, and
+it never publishes the value of a bad frame. The others are specific to cases.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.report.model import Verdict
 
 FLOOD_FACTOR = 5.0
-"""So many times the usual rate is a flood: a master that tries four times and polls on stays below."""
+"""Multiple of the usual rate that is a flood. A master that tries four times and polls on stays below it."""
 FLOOD_FLOOR = 30
-"""Requests within the case that are no flood, however rare they usually are."""
+"""Number of requests within the case that is not a flood, however low the usual rate is."""
 NEEDS_PROBE = "only its values can tell: give --probe"
 UNSEEN = "what it published was not seen: no --probe"
 
@@ -56,7 +56,7 @@ def goes_on(seen: Observation) -> Finding | None:
 
 
 def asks_cleanly(seen: Observation) -> Finding | None:
-    """What it sends are requests."""
+    """Check that the master sends only valid requests."""
     for bad in seen.of(Garbled, seen.begun_ns):
         return failed(f"sent {len(bad.data)} bytes that are no request: {bad.data[:16].hex(' ')}")
     return None
@@ -139,7 +139,11 @@ def took_odd_answer(seen: Observation) -> Finding | None:
 
 
 def keeps_waiting(seen: Observation) -> Finding | None:
-    """On a line, what comes after the next request answers the one before: a master that has asked again gave that up."""
+    """Check that the master waits long enough for a reply.
+
+    On a line, a frame after the next request answers the first one: a master that has asked again gave up waiting for
+    it.
+    """
     for told in seen.of(Told, seen.begun_ns):
         if told.good or not told.asked_ns:
             continue
@@ -164,10 +168,11 @@ either = owes(needs_probe)
 
 
 def answers_at_once(seen: Observation) -> Finding | None:
-    """A short frame is seen when it is there: the next request comes sooner than after silence.
+    """Check that a short frame is noticed on arrival: the next request comes sooner than after silence.
 
-    A master may also see it at once and then back off for about as long as it waits for silence. Therefore the second frame is
-    sent later than the first: a master that waits out its timeout asks again at the same time after both requests.
+    A master may also see it at once and then back off for about as long as it waits for silence. Therefore the second
+    frame is sent later than the first: a master that waits out its timeout asks again at the same time after both
+    requests.
     """
     gaps_s = [(delay_s, gap_s) for told in seen.of(Told, seen.begun_ns) for delay_s, gap_s in _gap_after(seen, told)]
     if not gaps_s:
@@ -214,9 +219,11 @@ def backs_off(seen: Observation) -> Finding | None:
 
 
 def quarantines(seen: Observation) -> Finding | None:
-    """After a timeout the same question, answered by a late reply of the same shape, is not to be told from a prompt one.
+    """Check that the master waits before it repeats a request that timed out.
 
-    Where a probe saw the late value this was decided already, but only a timeout that somebody named makes it a failure.
+    After a timeout, a late reply of the same shape cannot be distinguished from a prompt reply to the same question. If
+    a probe saw the late value, another check has already decided; otherwise it is a failure only if the user stated the
+    timeout.
     """
     late = next((t for t in seen.of(Told, seen.begun_ns) if not t.good), None)
     first = next(seen.of(Asked, seen.begun_ns), None)
@@ -232,7 +239,7 @@ def quarantines(seen: Observation) -> Finding | None:
 
 
 def late_is_not_data(seen: Observation) -> Finding | None:
-    """As `publishes_nothing_bad`; without the master's timeout nobody knows whether it could have waited for this."""
+    """Check as `publishes_nothing_bad`, but inconclusive without the master's timeout, within which it may accept a reply."""
     bad = publishes_nothing_bad(seen)
     if bad is not None and not seen.timeout_s:
         return inconclusive(f"{bad.reason}; a failure if its timeout is {seen.habit.silent_gap_s:.2f} s: say --timeout")
@@ -280,7 +287,7 @@ def reconnects(seen: Observation) -> Finding | None:
 
 
 def asked_once(seen: Observation) -> Finding | None:
-    """What nobody answers, because it is for all, is not repeated because nobody answered."""
+    """Check that a broadcast, which no device answers, is not repeated for lack of an answer."""
     first = next(seen.of(Asked, seen.begun_ns), None)
     again = next((a for a in seen.of(Asked, first.t_ns + 1) if a.target == first.target), None) if first else None
     if first is None or again is None:
@@ -298,7 +305,7 @@ def _when(seen: Observation, t_ns: int) -> str:
 
 
 def asks_for_less(seen: Observation) -> Finding | None:
-    """A read that was refused as a whole is asked for in parts."""
+    """Check that a read that was refused is repeated in parts."""
     first = next(seen.of(Asked, seen.begun_ns), None)
     if first is None:
         return inconclusive("no such read was seen")

@@ -1,4 +1,4 @@
-"""What the hostile device does on any framing, and on serial lines. Pure: a request in, moves out."""
+"""The replies of the hostile device on any framing, and on serial lines. Pure: a request in, moves out."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ OURS_AFTER_S = (0.020, 0.040, 0.010, 0.030)
 LATER = 0.5
 """Timeouts after the request that the second exception frame of MB-021 comes."""
 LATE = 1.5
-"""So many timeouts behind the request a late reply comes."""
+"""Number of timeouts after the request at which a late reply is sent."""
 
 
 def nothing(scene: Scene) -> list[Move]:
@@ -65,12 +65,12 @@ def corrupt_echo(scene: Scene) -> list[Move]:
 
 
 def late(scene: Scene) -> list[Move]:
-    """The first request is answered too late, with the poison; what comes meanwhile waits its turn behind it."""
+    """Answer the first request too late, with the poison; requests meanwhile are answered after it."""
     return [Say(scene.frame(scene.false), LATE * scene.timeout_s)]
 
 
 def late_other(scene: Scene) -> list[Move]:
-    """The first request is answered when one of another shape has come; that one is answered behind it."""
+    """Answer the first request when one of a different shape has come, and answer that one afterwards."""
     if scene.first is None:
         return []
     if scene.first.request == scene.request:

@@ -1,10 +1,11 @@
-"""The rows of the Modbus catalogue that concern masters, as cases: what the hostile device does, and what is expected.
+"""The test cases for Modbus clients: the action of the hostile device, and the expected reaction.
 
-SL = MODBUS over Serial Line V1.02, TG = Messaging on TCP/IP Implementation Guide V1.0b, AP = Application Protocol V1.1b3.
+SL = MODBUS over Serial Line V1.02, TG = Messaging on TCP/IP Implementation Guide V1.0b, AP = Application Protocol
+V1.1b3.
 
-A case is REQUIRED only where a clause demands what it asks. On a serial line SL 2.4.1 demands that the client checks each reply
-before it uses the data; on TCP TG 4.4.1.3 demands the check of header, transaction id, function code and format. `on_tcp` gives
-the basis and the clause of a case on TCP, where they differ from those on a line.
+A case is REQUIRED only where a clause demands the behaviour. On a serial line SL 2.4.1 demands that the client checks
+each reply before it uses the data; on TCP TG 4.4.1.3 demands the check of header, transaction ID, function code and
+format. `on_tcp` gives the basis and the clause of a case on TCP, where they differ from those on a line.
 """
 
 from __future__ import annotations

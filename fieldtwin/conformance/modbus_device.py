@@ -1,6 +1,7 @@
-"""The honest Modbus device under the hostile one: every address exists, every function of the standard works.
+"""The correct Modbus device underneath the hostile one: every address exists, every function of the standard works.
 
-All registers and bits hold one word, so that whatever a master reads and publishes is known; what it wrote it reads back.
+All registers and bits hold one word, so that every value that a master reads and publishes is known; it reads back the
+values that it wrote.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ class HonestDevice:
         return self._unit.respond(pdu, now_ns) or b""
 
     def answer_with(self, word: int, pdu: bytes, now_ns: int) -> bytes:
-        """What the answer would be if all cells held `word`: never for writes."""
+        """Return the answer that the device would give if all cells held `word`. Not for writes."""
         kept, written = self._bank.word, self._bank.written
         self._bank.word, self._bank.written = word, {}
         try:
@@ -146,7 +147,7 @@ class MbapWire:
 
 
 def mbap(tag: int, unit: int, pdu: bytes, *, protocol: int = 0, length: int | None = None) -> bytes:
-    """An ADU of Modbus TCP; `protocol` and `length` for those that are none (TG 3.1.3)."""
+    """Return an ADU of Modbus TCP; `protocol` and `length` override the header's fields to make it invalid (TG 3.1.3)."""
     counted = len(pdu) + 1 if length is None else length
     return b"".join(n.to_bytes(2, "big") for n in (tag, protocol, counted)) + bytes((unit,)) + pdu
 

@@ -32,7 +32,7 @@ from fieldtwin.gateway.core.nursery import Nursery
 BEHIND_S = 0.050
 """How long after an odd answer the next honest one comes at the soonest."""
 LINE_GAP_S = 0.060
-"""A pause that ends a frame on a line: what is left then is garbage."""
+"""Pause that ends a frame on a line; an incomplete frame is garbage then."""
 
 
 class Stage:
@@ -96,11 +96,11 @@ class Stage:
         self.on_event()
 
     def moves(self, wire: ModbusWire, request: bytes, tag: int, now_ns: int) -> list[Move]:
-        """What is done about a request that came at `now_ns`: honest, or what the play says."""
+        """Return the moves for a request received at `now_ns`: a correct reply, or that of the case."""
         true = self.device.answer(request[1:], now_ns)
         case = self.play
         if request[0] == 0 and not isinstance(wire, MbapWire):
-            return []  # a broadcast: nobody answers
+            return []  # a broadcast is not answered
         honest: list[Move] = [Say(wire.frame(request, tag, true), good=True)] if true else []
         if case is None or self.struck >= self.strikes or not true or not _wanted(case, request):
             return honest
@@ -153,7 +153,7 @@ class _Client:
                 self._stage.note(Garbled(now_ns, self._number, data[-garbage:]))
 
     async def _next(self) -> bytes:
-        """The next bytes, or none when a line has paused: what is left of a frame stays unfinished."""
+        """Return the next bytes, or none after a pause on a line, which ends an incomplete frame."""
         if not self._dirty or isinstance(self._wire, MbapWire):
             return await self._connection.read()
         try:
@@ -223,12 +223,12 @@ async def _hang_up(connection: ByteConnection, *, reset: bool) -> None:
 
 
 def wire_for(scheme: str) -> Callable[[], ModbusWire]:
-    """What frames are told by on an endpoint of `scheme`."""
+    """Return the framing of an endpoint of `scheme`."""
     return MbapWire if scheme == "tcp" else AsciiWire if scheme == "ascii" else RtuWire
 
 
 def traits(scheme: str) -> frozenset[str]:
-    """What a case may ask for: ``rtu``, ``ascii`` or ``tcp`` framing, and ``stream`` where a connection can be hung up."""
+    """Return the features that a case may need: ``rtu``, ``ascii`` or ``tcp``, and ``stream`` if it can be closed."""
     if scheme == "rtu+tcp":
         return frozenset({"rtu", "stream"})
     return frozenset({"tcp", "stream"}) if scheme == "tcp" else frozenset({scheme})

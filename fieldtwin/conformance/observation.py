@@ -1,6 +1,6 @@
-"""What a case saw of the master under test: frames and times, and what the master published. Plain values.
+"""The observations of a case about the master under test: frames and times, and the published values. Plain values.
 
-Judges get an `Observation` and nothing else, so that they can be tested without a wire.
+Checks receive only an `Observation`, so that they can be tested without a connection.
 """
 
 from __future__ import annotations
@@ -15,9 +15,12 @@ from fieldtwin.gateway.core.clock import NS_PER_S
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """A whole request of the master. `target` is what of a request counts as its shape: equal for one that is repeated
-    (Modbus: unit and PDU; SDO: node and the eight bytes). `tag` is the transaction id, 0 where there is none. `frame` is the
-    whole frame, in hex or as candump writes it."""
+    """A whole request of the master.
+
+    `target` is the shape of a request: equal for one that is repeated (Modbus: unit ID and PDU; SDO: node ID and the
+    eight bytes). `tag` is the transaction ID, 0 where there is none. `frame` is the whole frame, in hex or in candump
+    format.
+    """
 
     t_ns: int
     client: int
@@ -28,8 +31,11 @@ class Asked:
 
 @dataclass(frozen=True, slots=True)
 class Told:
-    """What the device sent; `good` if it was a true answer in an honest frame. `asked_ns` is the time of the request that it
-    answers, 0 where that is not known. `frame` is a CAN frame as candump writes it."""
+    """A reply of the device; `good` if it was a true answer in a correct frame.
+
+    `asked_ns` is the time of the request that it answers, 0 where that is not known. `frame` is a CAN frame in candump
+    format.
+    """
 
     t_ns: int
     client: int
@@ -41,8 +47,10 @@ class Told:
 
 @dataclass(frozen=True, slots=True)
 class Sent:
-    """A frame of the master that asks nobody for an answer: NMT, SYNC, a PDO, an SDO abort. `data` is two bytes of identifier
-    (big-endian), then the frame's."""
+    """A frame of the master that expects no answer: NMT, SYNC, a PDO, an SDO abort.
+
+    `data` is two bytes of identifier (big-endian), then the frame's.
+    """
 
     t_ns: int
     client: int
@@ -51,7 +59,7 @@ class Sent:
 
 @dataclass(frozen=True, slots=True)
 class Garbled:
-    """Bytes of the master that are no request."""
+    """Bytes of the master that do not form a request."""
 
     t_ns: int
     client: int
@@ -78,7 +86,7 @@ class Left:
 
 
 class Word(Enum):
-    """What a published value is. FIRST and SECOND are the two that honest answers hold."""
+    """The kind of a published value. FIRST and SECOND are the two values of correct answers."""
 
     FIRST = "first"
     SECOND = "second"
@@ -92,7 +100,7 @@ class Word(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Shown:
-    """What the probe says that the master publishes. `text` is it as it was read."""
+    """A value that the master publishes, as the probe reports it. `text` is the text that was read."""
 
     t_ns: int
     word: Word
@@ -113,10 +121,10 @@ E = TypeVar("E", Asked, Told, Sent, Garbled, Came, Left, Shown, Ended)
 
 @dataclass(frozen=True, slots=True)
 class Habit:
-    """How the master polls while all is well. Seconds.
+    """The polling behaviour of the master without faults. Seconds.
 
-    `period_s`: shape -> usual time between two requests of it; `longest_gap_s`: between any two requests; `silent_gap_s`: from
-    a request that nobody answered to the next request, 0 where that was not found out; `rate_per_s`: requests.
+    `period_s`: shape -> usual time between two requests of it; `longest_gap_s`: between any two requests;
+    `silent_gap_s`: from an unanswered request to the next request, 0 if not measured; `rate_per_s`: requests.
     """
 
     period_s: dict[bytes, float] = field(default_factory=dict)
@@ -127,10 +135,12 @@ class Habit:
 
 @dataclass(frozen=True)
 class Observation:
-    """One case. `begun_ns`: the first request that was misanswered; `over_ns`: the last odd thing that the device did, from
-    then on it was honest; `until_ns`: when the case stopped looking. `before` is the word that was held before, `after`
-    the one from `begun_ns` on, in odd frames too where those are to be taken, `last` the one from `over_ns` on.
-    `timeout_s`: the master's response timeout as its user says, 0 where nobody said.
+    """One case.
+
+    `begun_ns`: the first request that received a wrong reply; `over_ns`: the end of the device's last fault, after
+    which it replied correctly; `until_ns`: the end of the observation. `before` is the word that was held before,
+    `after` the one from `begun_ns` on, also in faulty frames if the master is to accept them, `last` the one from
+    `over_ns` on. `timeout_s`: the master's response timeout as stated by the user, 0 if not stated.
     """
 
     events: tuple[Event, ...]

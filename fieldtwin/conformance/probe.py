@@ -1,7 +1,7 @@
-"""What the master under test publishes: how a case learns whether a bad frame became a value.
+"""Probes for the values that the master under test publishes, which show whether a bad frame became a value.
 
-A probe is taught what the two honest words look like (`learn`), whatever the master makes of them: scaled, as a float, in two
-registers. What it shows later that is neither was made of something that no honest answer held.
+A probe learns the representation of the two correct words (`learn`), however the master converts them: scaled, as a
+float, in two registers. A later value that equals neither came from data that no correct answer contained.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ TIMEOUT_S = 2.0
 
 
 class Probe(Protocol):
-    """Shows values to whoever listens."""
+    """A source of published values."""
 
     on_shown: OnShown
 
     def learn(self, word: Word) -> bool:
-        """What is shown now stands for `word`; False while nothing is shown."""
+        """Learn that the current value represents `word`; return False while there is no value."""
         ...
 
 
@@ -65,7 +65,7 @@ class Classifier:
         return True
 
     def word(self, reading: str) -> Word:
-        """What a reading stands for; it is the latest from now on."""
+        """Return the word that a reading represents, and keep the reading as the latest."""
         self.latest = reading
         if not reading or reading in self._none:
             return Word.NONE
@@ -75,7 +75,10 @@ class Classifier:
 
 
 class RegisterProbe:
-    """Registers of a Modbus TCP server, polled: the master's own, or an HMI's behind it. A refusal is no value."""
+    """Registers of a Modbus TCP server, polled: the master's own, or those of an HMI behind it.
+
+    An exception is not a value.
+    """
 
     def __init__(self, text: str, connector: Connector, clock: Clock, classifier: Classifier) -> None:
         match = _REGISTER.match(text)
@@ -96,7 +99,7 @@ class RegisterProbe:
         return self._classifier.learn(word)
 
     async def run(self) -> None:
-        """Poll until cancelled. Whoever is not there shows nothing."""
+        """Poll until cancelled. A server that cannot be reached yields no value."""
         while True:
             try:
                 client = ModbusClient.at(
@@ -136,12 +139,12 @@ class _Lines:
 
 
 class OutputProbe:
-    """Whole numbers in what the master's program prints. A program prints much else, so a line is known by its form, which is its
-    text without the numbers.
+    """Whole numbers in the output of the master's program.
 
-    While the probe is taught, it notes the forms and the places in them where the honest words stand. Later, a number at such a
-    place is a published value, whatever it is, and the other numbers of a known form are none. Numbers in a form that was not
-    seen before are unclear, unless they are one of the three words. In the log (standard error) such a line is no value.
+    The program also prints other text, so a line is identified by its form: its text without the numbers. While the
+    probe learns, it notes the forms and the positions in them of the correct words. Later, a number at such a position
+    is a published value, whatever it is, and the other numbers of a known form are not. Numbers in an unknown form are
+    unclear, unless they are one of the three words. In the log (standard error) such a line is not a value.
     """
 
     def __init__(self, words: dict[int, Word]) -> None:
@@ -192,8 +195,7 @@ class OutputProbe:
 
 
 class MarkedOutputProbe:
-    """What the master's program prints after `mark` in a line is a published value, and nothing else is. What is no number there
-    stands for no value."""
+    """The values that the master's program prints after `mark` in a line. Any other text after it means "no value"."""
 
     def __init__(self, mark: str, classifier: Classifier) -> None:
         self._value = re.compile(re.escape(mark) + r"\s*([^\s,;:\"'(){}\[\]]+)")

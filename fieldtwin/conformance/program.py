@@ -19,7 +19,7 @@ OnText = Callable[[str, bool], None]
 
 
 def environment(endpoint: Endpoint) -> dict[str, str]:
-    """What the program finds the endpoint by. `endpoint` is the master's side of it."""
+    """Return the environment variables that tell the program its endpoint. `endpoint` is the master's side of it."""
     env = {"FIELDTWIN_ENDPOINT": str(endpoint)}
     if endpoint.is_serial:
         env["FIELDTWIN_TTY"] = endpoint.path
@@ -33,7 +33,7 @@ def environment(endpoint: Endpoint) -> dict[str, str]:
 
 
 def _flush(tty: str) -> None:
-    """A pty keeps what nobody read; a serial port that is closed does not."""
+    """Discard unread bytes: a pseudo-terminal keeps them, unlike a closed serial port."""
     try:
         descriptor = os.open(tty, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
     except OSError:

@@ -37,11 +37,14 @@ class PtyLine:
 
     @staticmethod
     def traits() -> frozenset[str]:
-        """What a case may ask of it. A port that is held exclusively (tty_ioctl(4), TIOCEXCL) still opens for root."""
+        """Return the features that a case may need.
+
+        A port that is held exclusively (tty_ioctl(4), TIOCEXCL) still opens for root.
+        """
         return frozenset({"port"} if os.geteuid() == 0 else {"port", "lock"})
 
     async def run(self) -> None:
-        """Serve the master; unplugged, do what was asked for, and serve on."""
+        """Serve the master; when the port is unplugged, do as the move says, and continue to serve."""
         plugged_in_again = False
         while True:
             await self._stage.serve(self._port, plugged_in_again=plugged_in_again)
@@ -63,7 +66,7 @@ class PtyLine:
         await self._port.aclose()
 
     def _unplug(self, move: Unplug) -> None:
-        """From here on nobody is served; `run` notices."""
+        """Stop serving the master; `run` notices it."""
         self._stage.pending += 1
         self._unplugged = move
         self._closing = asyncio.get_running_loop().create_task(self._port.aclose(), name="unplugging")
@@ -75,7 +78,7 @@ async def _open(listen: Endpoint) -> tuple[ByteConnection, Endpoint]:
 
 
 async def _held(path: str, for_s: float) -> None:
-    """Nobody else can open the port meanwhile."""
+    """Hold the port for `for_s` seconds, so that no other process can open it."""
     held = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
     try:
         fcntl.ioctl(held, termios.TIOCEXCL)

@@ -58,5 +58,5 @@ class Recorder:
         return Habit(periods, max(gaps, default=1.0), silent_gap_s, max(rate, 0.01))
 
     def count(self, kind: type[Asked] | type[Told], since_ns: int) -> int:
-        """How many events of a kind since a moment; of what was told, only the good."""
+        """Return the number of events of a kind since `since_ns`; of replies, only the good ones."""
         return sum(isinstance(e, kind) and (not isinstance(e, Told) or e.good) for e in self.since(since_ns))

@@ -17,7 +17,7 @@ from fieldtwin.report.model import CheckResult, Report, ScenarioResult, Verdict
 
 @dataclass(frozen=True, slots=True)
 class CaseResult:
-    """A case and what was found. `waived`: the waiver's reason, where a failure is one that somebody answers for."""
+    """A case and its finding. `waived`: the waiver's reason, if a failure is accepted."""
 
     case: About
     finding: Finding
@@ -42,7 +42,7 @@ class CaseResult:
 
 
 def waive(result: CaseResult, waivers: Waivers, today: date) -> CaseResult:
-    """The result under its waiver, if there is one. An expired one is a failure that says so, whatever was found."""
+    """Apply the waiver of the result, if there is one. An expired waiver is a failure, whatever the finding."""
     waiver = waivers.of(result.case.id, result.case.row)
     if waiver is None:
         return result
@@ -56,7 +56,7 @@ def waive(result: CaseResult, waivers: Waivers, today: date) -> CaseResult:
 
 ONLY_REQUIRED = frozenset({Basis.STANDARD})
 FOUND = {Basis.STANDARD: "failed", Basis.ROBUSTNESS: "robustness", Basis.FIELD: "field problem"}
-"""What a failure of a case on each basis is called in tables and counts."""
+"""The name of a failed case in tables and counts, by the basis of the case."""
 
 
 def counts_as_failed(result: CaseResult, fail_on: frozenset[Basis] = ONLY_REQUIRED) -> bool:
@@ -71,8 +71,10 @@ def exit_code(results: Sequence[CaseResult], fail_on: frozenset[Basis] = ONLY_RE
 
 
 def called(result: CaseResult) -> str:
-    """``passed``, ``failed``, ``robustness`` or ``field problem`` (failures that are no deviation), ``inconclusive``
-    or ``skipped``."""
+    """Return ``passed``, ``failed``, ``robustness``, ``field problem``, ``inconclusive`` or ``skipped``.
+
+    ``robustness`` and ``field problem`` are failures that do not deviate from a standard.
+    """
     return FOUND[result.case.basis] if result.verdict is Verdict.FAILED else result.verdict.value
 
 

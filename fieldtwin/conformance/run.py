@@ -1,7 +1,7 @@
-"""Plays the cases against a master, one after the other, and has each judged.
+"""Run the cases against a master, one after the other, and check each.
 
-First the master's habit is learnt; before each case all is well, after each one too. What cannot be brought about is skipped with
-the reason, what the master did not take part in is inconclusive.
+The run first measures the master's usual behaviour. The device replies correctly before and after each case. A case
+that cannot be carried out is skipped with the reason; a case without the master's participation is inconclusive.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from fieldtwin.gateway.core.errors import Unreachable
 
 POLL_S = 0.01
 STEADY = 3
-"""So many polls make a habit."""
+"""Number of polls that show the master's usual behaviour."""
 MANY = 1_000_000
 """Strikes of a case that goes on until its value was seen."""
 
 
 class Playable(Protocol):
-    """A case with its play, whatever the protocol: see `C` and `CanopenCase`."""
+    """A case with its reply function, for any protocol: see `C` and `CanopenCase`."""
 
     @property
     def about(self) -> Case: ...
@@ -72,9 +72,12 @@ class AnyStage(Protocol[C_contra]):
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What is to be played. `timeout_s` is the master's response timeout, 0 if unknown; `patience_s` how long anything may
-    take, `wait_s` until the master first asks; `has` the options that single cases need (``echo``); `at_most` the highest danger;
-    `for_s` the end of it all, 0 for none."""
+    """The options of a run.
+
+    `timeout_s` is the master's response timeout, 0 if unknown; `patience_s` is the longest time of any step, `wait_s`
+    the time until the master's first request; `has` the options that some cases need (``echo``); `at_most` the highest
+    impact level; `for_s` the end of the whole run, 0 for none.
+    """
 
     only: frozenset[str] = frozenset()
     timeout_s: float = 0.0
@@ -98,7 +101,7 @@ class MasterRun(Generic[C]):
     probe: Probe | None = None
     tell: Callable[[CaseResult], None] = lambda result: None
     restart: Callable[[], Awaitable[None]] | None = None
-    """Starts the program under test anew: what one case broke for good is no matter of the next one."""
+    """Restarts the program under test, so that lasting damage by one case does not affect the next."""
     results: list[CaseResult] = field(default_factory=list)
     habit: Habit = field(default_factory=Habit)
 
@@ -137,7 +140,7 @@ class MasterRun(Generic[C]):
         return self.results
 
     async def _learn(self) -> None:
-        """The habit, what the honest words look like, and how long silence is waited for."""
+        """Measure the master's polling behaviour, the representation of the correct words, and its response timeout."""
         stage = self.stage
         if not await self._until(lambda: any(isinstance(e, Asked) for e in stage.recorder.since(0)), self.plan.wait_s):
             if self._ended is not None:
@@ -167,7 +170,7 @@ class MasterRun(Generic[C]):
             raise Unreachable("the probe never showed the value that the device holds, or shows all alike", hint=held)
 
     async def _silence(self) -> float:
-        """From a request that nobody answers to the next one, in seconds; 0 if there was none."""
+        """Return the time in seconds from an unanswered request to the next request; 0 if there was none."""
         self.stage.begin(self.silent, 1)
         await self._until(lambda: self.stage.struck > 0, self.plan.patience_s)
         first_ns = self.stage.first_ns

@@ -1,4 +1,4 @@
-"""What a play has to work with: the request, true and false answers to it, and moves. Pure."""
+"""The inputs of a reply function: the request, true and false answers to it, and moves. Pure."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Deaf:
 
 @dataclass(frozen=True, slots=True)
 class Unplug:
-    """The port is gone for `out_s` and comes back under its name; then it is somebody else's for `held_s`."""
+    """Remove the port for `out_s` seconds and restore it under its name; then another process holds it for `held_s`."""
 
     out_s: float
     held_s: float = 0.0
@@ -100,10 +100,14 @@ Wants = Literal["register read", "read", "write", "read of several", "request to
 
 @dataclass(frozen=True, slots=True)
 class ModbusCase:
-    """A case with its play. `strikes`: so many requests are misanswered; `holds_good` where the odd frames hold the honest
-    word, and go on until it was seen. `framings`: where there is such a thing (``rtu``, ``ascii``, ``tcp``; ``stream`` for
-    anything that can be hung up, ``port`` for what can be unplugged, ``lock`` for what can be held). `needs` names an option
-    without which the case makes no sense; `trail_s` is how long the case looks on when all is well again."""
+    """A case with its reply function.
+
+    `strikes` requests receive a wrong reply; `holds_good`: the faulty frames hold the correct word, and continue until
+    it was seen. `framings` lists the endpoints on which the case is possible (``rtu``, ``ascii``, ``tcp``; ``stream``
+    for those that can be closed, ``port`` for those that can be unplugged, ``lock`` for those that can be held).
+    `needs` names an option without which the case makes no sense; `trail_s` is the time that the case continues after
+    the recovery.
+    """
 
     about: Case
     play: Play
@@ -114,7 +118,7 @@ class ModbusCase:
     needs: str = ""
     trail_s: float = TRAIL_S
     least: int = 1
-    """At least so many requests are misanswered, even where the honest word was seen before."""
+    """Minimum number of requests that receive a wrong reply, even if the correct word was seen before."""
 
     def on(self, **changes: object) -> ModbusCase:
         return replace(self, **changes)  # type: ignore[arg-type]

@@ -34,9 +34,12 @@ LISTENING = "tcp://HOST:PORT, rtu+tcp://HOST:PORT, pty:PATH, rtu:PORT or ascii:P
 
 @dataclass(frozen=True)
 class Options:
-    """What a user asked for. `words`: the two honest ones and the poison. `probe` as `RegisterProbe` reads it, ``output``,
-    ``output:TEXT``, or empty. `ascii`: what is on the line is Modbus ASCII. From `objects` on it is for CANopen only: fixed
-    objects, bytes of all others, nodes that boot by themselves."""
+    """The options of a run.
+
+    `words`: the two correct ones and the poison. `probe`: as `RegisterProbe` reads it, ``output``, ``output:TEXT``, or
+    empty. `ascii`: the line carries Modbus ASCII. The fields from `objects` on are for CANopen only: fixed objects, the
+    size in bytes of all others, nodes that boot by themselves.
+    """
 
     listen: Endpoint
     plan: Plan
@@ -85,7 +88,7 @@ async def judge_modbus_master(options: Options, listener: Listener) -> list[Case
 
 
 async def judge_canopen_master(options: Options, listener: Listener) -> list[CaseResult]:
-    """The same for the SDO client and NMT master on a CAN bus, which is made here if it is a software one."""
+    """Test the SDO client and NMT master on a CAN bus. A software bus is created here."""
     if not options.listen.is_can:
         expected = "can:fieldtwin/HOST:PORT or can:socketcan/INTERFACE"
         raise UsageError("where the master is listened for", expected=expected, got=str(options.listen))
@@ -112,7 +115,7 @@ async def judge_canopen_master(options: Options, listener: Listener) -> list[Cas
 async def _judged(
     run: MasterRun[C], options: Options, theirs: Endpoint, on_text: OnText, listener: Listener
 ) -> list[CaseResult]:
-    """The run, beside the program if there is one."""
+    """Run the cases, with the program under test if there is one."""
     task = asyncio.current_task()
     assert task is not None
     asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, task.cancel)

@@ -1,4 +1,4 @@
-"""What the hostile device does on TCP alone. Pure: a request in, moves out."""
+"""The replies of the hostile device on TCP only. Pure: a request in, moves out."""
 
 from __future__ import annotations
 

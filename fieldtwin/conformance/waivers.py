@@ -68,7 +68,7 @@ class Waivers:
 
 
 def load_waivers(path: Path, known: Collection[str]) -> Waivers:
-    """Read a file. `known` are the ids that there are; another one, or one that stands twice, is `FileInvalid`."""
+    """Read a file. `known` are the existing IDs; an unknown ID, or one that occurs twice, raises `FileInvalid`."""
     return read_waivers(load(path), known)
 
 

@@ -1,1 +1,1 @@
-"""CANopen (CiA 301), the master's side: protocol cores that know frames and ``now``, and a thin asyncio master."""
+"""The CANopen master (CiA 301): protocol cores that know only frames and ``now``, and a thin asyncio master around them."""

@@ -1,4 +1,4 @@
-"""SDO abort codes and what they mean (CiA 301, 7.2.4.3.17, table 22). Data only."""
+"""SDO abort codes and their meanings (CiA 301, 7.2.4.3.17, table 22). Data only."""
 
 from __future__ import annotations
 
@@ -49,5 +49,5 @@ MEANINGS: dict[int, str] = {
 
 
 def meaning(code: int) -> str:
-    """The standard's words for `code`; ``vendor or profile specific`` where it has none."""
+    """Return the standard's text for `code`, or ``vendor or profile specific`` if it has none."""
     return MEANINGS.get(code, "vendor or profile specific")

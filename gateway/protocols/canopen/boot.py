@@ -1,7 +1,7 @@
-"""Booting a node as CiA 302-2 has it: is it the one that is expected, and does it hold the configuration that it should?
+"""Boot a node as CiA 302-2 describes: check that it is the expected node, and that it holds the required configuration.
 
-Procedures over a master. They know object numbers of the standards and nothing of any device. Who may write, and what
-follows from an error, is the caller's business.
+The procedures use a master. They know object numbers of the standards but no particular device. The caller decides who
+may write, and what follows from an error.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from fieldtwin.gateway.protocols.canopen.master import CanopenMaster
 STORE_PARAMETERS = 0x1010
 SAVE = b"save"
 STORE_TIMEOUT_S = 5.0
-"""Non-volatile memory is slow."""
+"""Non-volatile memory is slow, so storing gets a longer timeout, in seconds."""
 
 _U32 = DataType.UNSIGNED32
 
 
 @dataclass(frozen=True, slots=True)
 class ExpectedIdentity:
-    """What a node has to say of itself (1F84h to 1F88h). None is not looked at."""
+    """The identity that a node has to report (1F84h to 1F88h). A field that is None is not checked."""
 
     device_type: int | None = None
     vendor: int | None = None
@@ -41,7 +41,7 @@ class ExpectedIdentity:
 
     @property
     def objects(self) -> dict[str, tuple[int, int, int]]:
-        """Of what is expected: name -> index, subindex, value, in the order in which CiA 302 asks."""
+        """Return the expected fields: name -> index, subindex, value, in the order in which CiA 302 checks them."""
         every = {
             "device_type": (DEVICE_TYPE, 0, self.device_type),
             "vendor": (IDENTITY, 1, self.vendor),
@@ -54,9 +54,10 @@ class ExpectedIdentity:
 
 @dataclass(frozen=True, slots=True)
 class Configuration:
-    """What a node shall hold. `date` is the expected configuration date and time (1F26h, 1F27h), None to write always.
+    """The configuration that a node has to hold.
 
-    `store` lets the node keep it (1010h:01), so that after its next start it need not be written again.
+    `date` is the expected configuration date and time (1F26h, 1F27h); None writes the configuration every time. With
+    `store` the node saves it (1010h:01), so that it need not be written again after the node's next start.
     """
 
     settings: tuple[Setting, ...]
@@ -65,9 +66,9 @@ class Configuration:
 
 
 async def identity_differences(master: CanopenMaster, node: int, expected: ExpectedIdentity) -> dict[str, str]:
-    """Read what is expected of the node's identity; name -> "expected X, got Y" of what is otherwise.
+    """Read the expected parts of the node's identity; return name -> "expected X, got Y" for those that differ.
 
-    An object that the node does not have is otherwise too. Raises what a read raises when the node does not answer.
+    An object that the node does not have also differs. Raises the errors of a read if the node does not answer.
     """
     wrong: dict[str, str] = {}
     for name, (index, sub, value) in expected.objects.items():
@@ -82,21 +83,21 @@ async def identity_differences(master: CanopenMaster, node: int, expected: Expec
 
 
 async def holds_configuration(master: CanopenMaster, node: int, date: tuple[int, int] | None) -> bool:
-    """Whether the node says that it was configured on `date` (1020h:01 and :02). Never, without a date."""
+    """Return whether the node reports that it was configured on `date` (1020h:01 and :02); False without a date."""
     if date is None or date == (0, 0):
         return False
     try:
         held = [await read_number(master, node, CONFIGURATION_DATE, sub, _U32) for sub in (1, 2)]
     except SdoAborted:
-        return False  # it has no 1020h
+        return False  # the node has no 1020h
     return (held[0], held[1]) == date
 
 
 async def download_configuration(master: CanopenMaster, node: int, configuration: Configuration) -> bool:
-    """Write the configuration unless the node holds it; whether it was written. Call it in PRE-OPERATIONAL.
+    """Write the configuration unless the node holds it; return whether it was written. Call it in PRE-OPERATIONAL.
 
-    Date and time are written last: a node that was interrupted does not pass for configured. Raises `SdoAborted` for the
-    first object that the node refuses, `VerifyFailed` when it does not keep the date.
+    Date and time are written last, so that a node whose configuration was interrupted does not appear configured.
+    Raises `SdoAborted` for the first object that the node refuses, `VerifyFailed` if it does not keep the date.
     """
     if await holds_configuration(master, node, configuration.date):
         return False
@@ -112,6 +113,6 @@ async def download_configuration(master: CanopenMaster, node: int, configuration
 
 
 async def write_settings(master: CanopenMaster, node: int, settings: Sequence[Setting]) -> None:
-    """Write objects one after the other, as the concise DCF has them."""
+    """Write objects one after the other, in the order of the concise DCF."""
     for setting in settings:
         await master.sdo_download(node, setting.index, setting.subindex, setting.data)

@@ -1,6 +1,7 @@
-"""CAN identifiers of CANopen: the pre-defined connection set and what a PDO may never use (CiA 301, 7.3.3 and 7.3.5).
+"""CAN identifiers of CANopen: the pre-defined connection set, and those that a PDO must not use (CiA 301, 7.3.3 and
+7.3.5).
 
-Pure arithmetic: knows no frame and no bus.
+Pure arithmetic, without frames or a bus.
 """
 
 from __future__ import annotations
@@ -27,14 +28,14 @@ _NOT_FOR_PDOS = ((0x000, 0x180), (0x581, 0x5FF), (0x601, 0x67F), (0x6E0, 0x7FF))
 
 
 def check_node(node: int) -> int:
-    """`node` when it is a node id, 1 to 127; raises `UsageError`."""
+    """Return `node` if it is a node ID, 1 to 127; otherwise raise `UsageError`."""
     if not 1 <= node <= NODE_MAX:
         raise UsageError("not a CANopen node id", expected="1 to 127", got=str(node))
     return node
 
 
 def check_pdo_cob_id(cob_id: int) -> int:
-    """`cob_id` when a PDO may use it (11 bits, not restricted); raises `UsageError`."""
+    """Return `cob_id` if a PDO may use it (11 bits, not restricted); otherwise raise `UsageError`."""
     if not 0 <= cob_id <= 0x7FF or any(low <= cob_id <= high for low, high in _NOT_FOR_PDOS):
         raise UsageError(
             "not a CAN-ID for a PDO", expected="11 bits, 181h to 6DFh and not reserved", got=f"{cob_id:X}h"

@@ -1,7 +1,8 @@
-"""The concise DCF (CiA 302-3, object 1F22h): a node's configuration as one block of bytes, and from a DCF to that.
+"""The concise DCF (CiA 302-3, object 1F22h): a node's configuration as one block of bytes, and its conversion from a
+DCF.
 
-Format, all little-endian: UNSIGNED32 number of entries; then of each UNSIGNED16 index, UNSIGNED8 subindex, UNSIGNED32
-size in bytes, the data. Pure; sends nothing.
+Format, all little-endian: UNSIGNED32 number of entries; then for each entry UNSIGNED16 index, UNSIGNED8 subindex,
+UNSIGNED32 size in bytes, and the data. Pure; sends nothing.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ MAX_SETTINGS = 65_535
 
 CONFIGURATION_DATE = 0x1020
 _NEVER = frozenset({0x1003, 0x1010, 0x1011, CONFIGURATION_DATE, *range(0x1F50, 0x1F58)})
-"""Histories, commands, program control, and the date, which is written last and by itself."""
+"""Objects that are never written: histories, commands, program control, and the date, which is written last and separately."""
 
 _PDO_COMMUNICATION = (range(0x1400, 0x1600), range(0x1800, 0x1A00))
 _TO_MAPPING = 0x200
@@ -40,7 +41,7 @@ class Setting:
 
 
 def encode_concise(settings: Iterable[Setting]) -> bytes:
-    """The block of bytes as 1F22h holds it."""
+    """Return the block of bytes as 1F22h holds it."""
     listed = list(settings)
     if len(listed) > MAX_SETTINGS:
         raise UsageError("a concise DCF", expected=f"at most {MAX_SETTINGS} entries", got=str(len(listed)))
@@ -51,7 +52,7 @@ def encode_concise(settings: Iterable[Setting]) -> bytes:
 
 
 def decode_concise(data: bytes) -> tuple[Setting, ...]:
-    """The settings in a block. Raises `Desync` when it ends too early, goes on too long, or announces too much."""
+    """Return the settings in a block. Raises `Desync` if it is too short, too long, or announces too many entries."""
     if len(data) < _COUNT.size:
         raise Desync("a concise DCF", expected="at least 4 bytes", got=str(len(data)))
     (count,) = _COUNT.unpack_from(data)
@@ -77,10 +78,11 @@ def decode_concise(data: bytes) -> tuple[Setting, ...]:
 
 
 def settings_of(dictionary: ObjectDictionary) -> tuple[Setting, ...]:
-    """What a DCF sets (its ParameterValues), in an order in which a node takes it.
+    """Return the settings of a DCF (its ParameterValues), in an order that a node accepts.
 
-    PDOs go by the procedure of CiA 301, 7.5.2.36 and 7.5.2.38: first invalid, no objects mapped; then the objects, their
-    number, the other parameters; the COB-ID last. Raises `FileInvalid` for a value that its type cannot hold.
+    PDOs follow the procedure of CiA 301, 7.5.2.36 and 7.5.2.38: first the PDO is made invalid, with no objects mapped;
+    then come the objects, their number, and the other parameters; the COB-ID is last. Raises `FileInvalid` for a value
+    that its type cannot hold.
     """
     wanted = {
         (entry.index, entry.subindex): Setting(entry.index, entry.subindex, _bytes_of(entry, dictionary.path))
@@ -98,9 +100,9 @@ def settings_of(dictionary: ObjectDictionary) -> tuple[Setting, ...]:
 
 
 def configuration_date(dictionary: ObjectDictionary) -> tuple[int, int] | None:
-    """Expected configuration date and time (1F26h, 1F27h): the DCF's values for 1020h:01 and :02; None without them.
+    """Return the expected configuration date and time (1F26h, 1F27h): the DCF's values for 1020h:01 and :02, or None.
 
-    Days since 1984-01-01 and milliseconds since midnight.
+    They are days since 1984-01-01 and milliseconds since midnight.
     """
     entries = [dictionary.get(CONFIGURATION_DATE, sub) for sub in (1, 2)]
     values = [e.default for e in entries if e is not None and e.configured and isinstance(e.default, int)]
@@ -116,11 +118,11 @@ def _is_pdo(index: int) -> bool:
 
 
 def _pdo(index: int, wanted: dict[tuple[int, int], Setting], dictionary: ObjectDictionary) -> list[Setting]:
-    """One PDO's settings in order."""
+    """Return one PDO's settings in order."""
     mapping = index + _TO_MAPPING
     cob_id = wanted.get((index, 1))
     held = dictionary.get(index, 1)
-    if cob_id is None and held is not None and isinstance(held.default, int):  # it needs one to be switched off and on
+    if cob_id is None and held is not None and isinstance(held.default, int):  # needed to switch it off and on
         cob_id = Setting(index, 1, held.default.to_bytes(4, "little"))
     mapped = [s for (i, sub), s in wanted.items() if i == mapping and sub]
     number = wanted.get((mapping, 0))

@@ -1,6 +1,6 @@
-"""Configuring a node over SDO at start, as CiA 301 prescribes, and reading back what it then holds.
+"""Configure a node over SDO at start, as CiA 301 prescribes, and read back what it then holds.
 
-Procedures over a master; they know object numbers of CiA 301 and nothing of any device.
+The procedures use a master; they know object numbers of CiA 301 but no particular device.
 """
 
 from __future__ import annotations
@@ -47,7 +47,9 @@ PARAMETERS = {2: DataType.UNSIGNED8, 3: DataType.UNSIGNED16, 5: DataType.UNSIGNE
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """What a node says that it is (1000h, 1018h). Vendor, product, revision, serial: None where it has no such entry."""
+    """The identity that a node reports (1000h, 1018h): vendor, product, revision, serial; None for an entry that it
+    does not have.
+    """
 
     device_type: int
     vendor: int | None
@@ -58,8 +60,11 @@ class Identity:
 
 @dataclass(frozen=True, slots=True)
 class PdoConfig:
-    """A PDO as the node holds it. `cob_id` is the CAN-ID alone; `event_ms` is 0 when off, None when not supported: a TPDO's
-    event timer, an RPDO's deadline."""
+    """The configuration of a PDO in the node.
+
+    `cob_id` is the CAN-ID alone. `event_ms` is a TPDO's event timer or an RPDO's deadline; 0 when off, None when not
+    supported.
+    """
 
     number: int
     cob_id: int
@@ -70,17 +75,17 @@ class PdoConfig:
 
     @property
     def synchronous(self) -> bool:
-        """Whether it goes by SYNC (types 0 to 240); an RPDO's values then count from the next SYNC on."""
+        """Return whether the PDO is synchronous (types 0 to 240); an RPDO's values then take effect at the next SYNC."""
         return self.transmission_type <= SYNCHRONOUS_MAX
 
     @property
     def cyclic(self) -> bool:
-        """Whether a TPDO comes again and again although nothing changed: each nth SYNC, or by its event timer."""
+        """Return whether a TPDO is also sent when nothing has changed: at each nth SYNC, or by its event timer."""
         return 1 <= self.transmission_type <= SYNCHRONOUS_MAX or bool(not self.synchronous and self.event_ms)
 
 
 async def read_number(master: CanopenMaster, node: int, index: int, subindex: int, data_type: DataType) -> int:
-    """Read an integer object. Raises what `sdo_upload` raises, and `LengthMismatch` when it has another size."""
+    """Read an integer object. Raises the errors of `sdo_upload`, and `LengthMismatch` if it has a different size."""
     data = await master.sdo_upload(node, index, subindex, length=size_of(data_type))
     return int(decode(data_type, data))
 
@@ -88,14 +93,14 @@ async def read_number(master: CanopenMaster, node: int, index: int, subindex: in
 async def write_number(
     master: CanopenMaster, node: int, index: int, subindex: int, data_type: DataType, value: int
 ) -> None:
-    """Write an integer object. Raises what `sdo_download` raises, and `UsageError` when `value` does not fit."""
+    """Write an integer object. Raises the errors of `sdo_download`, and `UsageError` if `value` does not fit."""
     await master.sdo_download(node, index, subindex, encode(data_type, value))
 
 
 async def verify_number(
     master: CanopenMaster, node: int, index: int, subindex: int, data_type: DataType, value: int
 ) -> None:
-    """Read an integer object back; raises `VerifyFailed` when the node holds another value."""
+    """Read an integer object back. Raises `VerifyFailed` if the node holds a different value."""
     held = await read_number(master, node, index, subindex, data_type)
     if held != value:
         where = f"node {node} {index:04X}h:{subindex:02X}"
@@ -111,7 +116,7 @@ async def set_heartbeat_producer(master: CanopenMaster, node: int, ms: int) -> N
 
 
 async def read_identity(master: CanopenMaster, node: int) -> Identity:
-    """Read device type and identity. Entries beyond the highest sub-index that the node has are None."""
+    """Read device type and identity. Entries beyond the node's highest sub-index are None."""
     u32 = DataType.UNSIGNED32
     device_type = await read_number(master, node, DEVICE_TYPE, 0, u32)
     highest = await read_number(master, node, IDENTITY, 0, DataType.UNSIGNED8)
@@ -120,17 +125,17 @@ async def read_identity(master: CanopenMaster, node: int) -> Identity:
 
 
 async def read_tpdo(master: CanopenMaster, node: int, number: int) -> PdoConfig:
-    """Read TPDO `number` (from 1) with its mapping, for a driver that takes the node as it is."""
+    """Read TPDO `number` (from 1) with its mapping, for a driver that uses the node's existing configuration."""
     return await _read_pdo(master, node, number, _tpdo(number))
 
 
 async def read_tpdos(master: CanopenMaster, node: int, up_to: int = TPDO_MAX) -> tuple[PdoConfig, ...]:
-    """Read TPDO 1, 2 and so on with their mappings, as far as the node has them without a gap."""
+    """Read TPDO 1, 2 and so on with their mappings, up to the first one that the node does not have."""
     return await _read_pdos(master, node, up_to, _tpdo)
 
 
 async def read_rpdos(master: CanopenMaster, node: int, up_to: int = TPDO_MAX) -> tuple[PdoConfig, ...]:
-    """Read RPDO 1, 2 and so on with their mappings, as far as the node has them without a gap."""
+    """Read RPDO 1, 2 and so on with their mappings, up to the first one that the node does not have."""
     return await _read_pdos(master, node, up_to, _rpdo)
 
 
@@ -159,12 +164,12 @@ async def _read_pdo(master: CanopenMaster, node: int, number: int, records: Reco
 
 
 def tpdos_of(dictionary: ObjectDictionary) -> tuple[PdoConfig, ...]:
-    """The TPDOs as an EDS or DCF has them. Raises `FileInvalid` for a mapping that is none."""
+    """Return the TPDOs of an EDS or DCF. Raises `FileInvalid` for an invalid mapping."""
     return _pdos_of(dictionary, _tpdo)
 
 
 def rpdos_of(dictionary: ObjectDictionary) -> tuple[PdoConfig, ...]:
-    """The RPDOs as an EDS or DCF has them. Raises `FileInvalid` for a mapping that is none."""
+    """Return the RPDOs of an EDS or DCF. Raises `FileInvalid` for an invalid mapping."""
     return _pdos_of(dictionary, _rpdo)
 
 
@@ -206,11 +211,11 @@ async def configure_tpdo(
 ) -> PdoMapping:
     """Configure TPDO `number` (from 1) by the procedure of 7.5.2.38, verify it, and return its mapping.
 
-    `mapping` is (index, subindex, bits) in order, at most 64 bits. `cob_id` is the CAN-ID; whether remote frames are
-    allowed stays as the node has it. `event_ms` 0 switches the event timer off; None leaves event timer and inhibit time
-    alone, which a node need not have. Call it in PRE-OPERATIONAL. Raises `UsageError` before anything is sent,
-    `SdoAborted` where the node refuses a step (the TPDO is then left disabled), `VerifyFailed` where it holds something
-    else in the end.
+    `mapping` is (index, subindex, bits) in order, at most 64 bits. `cob_id` is the CAN-ID; the node's setting for
+    remote frames is not changed. `event_ms` 0 switches the event timer off; None does not write event timer and inhibit
+    time, which a node need not have. Call it in PRE-OPERATIONAL. Raises `UsageError` before anything is sent,
+    `SdoAborted` if the node refuses a step (the TPDO is then left disabled), `VerifyFailed` if it finally holds
+    different values.
     """
     parameters = ((2, transmission_type), (3, inhibit_100us), (5, event_ms))
     return await _configure_pdo(master, node, _tpdo(number), mapping, cob_id, parameters)
@@ -226,7 +231,7 @@ async def configure_rpdo(
 ) -> PdoMapping:
     """Configure RPDO `number` (from 1) by the procedure of 7.5.2.36, verify it, and return its mapping.
 
-    As `configure_tpdo`. With `transmission_type` 0 to 240 the node takes the values at the SYNC that follows.
+    Otherwise as `configure_tpdo`. With `transmission_type` 0 to 240 the node takes the values at the SYNC that follows.
     """
     return await _configure_pdo(master, node, _rpdo(number), mapping, cob_id, ((2, transmission_type),))
 
@@ -239,7 +244,7 @@ async def _configure_pdo(
     cob_id: int,
     optional: Iterable[tuple[int, int | None]],
 ) -> PdoMapping:
-    """`optional` are sub-indices of the communication record, and what they shall hold; None is left alone."""
+    """Configure a PDO. `optional` are sub-indices of the communication record and their values; None is not written."""
     name, communication, mapped = records
     wanted = PdoMapping.of(mapping)
     cob_ids.check_pdo_cob_id(cob_id)
@@ -250,7 +255,7 @@ async def _configure_pdo(
     for _, data_type, value in parameters:
         encode(data_type, value)  # a value that does not fit is refused before anything is sent
 
-    # Bits 0 to 29 must not change while the PDO exists: first the old CAN-ID with bit 31, the new one at the end.
+    # Bits 0 to 29 must not change while the PDO exists: first write the old CAN-ID with bit 31, at the end the new one.
     held = await read_number(master, node, communication, 1, u32)
     final = cob_id | held & NO_RTR
     await write_number(master, node, communication, 1, u32, held | PDO_INVALID)
@@ -273,7 +278,7 @@ async def _configure_pdo(
 
 async def _read_mapping(master: CanopenMaster, node: int, index: int) -> PdoMapping:
     count = await read_number(master, node, index, 0, DataType.UNSIGNED8)
-    if count > MAX_ENTRIES:  # 254 and 255 announce a multiplexed PDO, which has no mapping to read
+    if count > MAX_ENTRIES:  # 254 and 255 mean a multiplexed PDO, which has no mapping to read
         raise VerifyFailed("not the mapping of a plain PDO", expected="at most 64 objects", got=str(count)).at(
             f"node {node} {index:04X}h"
         )

@@ -1,6 +1,6 @@
-"""The basic data types of CiA 301 (7.1.6, codes of table 44): bytes on the wire and Python values.
+"""The basic data types of CiA 301 (7.1.6, codes of table 44): conversion between transmitted bytes and Python values.
 
-All numbers are little-endian (7.1.3). Pure; knows no object and no transfer.
+All numbers are little-endian (7.1.3). Pure; knows no objects and no transfers.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from fieldtwin.gateway.core.values import Scalar
 
 
 class DataType(IntEnum):
-    """Type codes as they stand in an EDS and in the object dictionary (0001h to 001Bh)."""
+    """Type codes as in an EDS and in the object dictionary (0001h to 001Bh)."""
 
     BOOLEAN = 0x01
     INTEGER8 = 0x02
@@ -49,18 +49,18 @@ _INTEGERS: dict[DataType, tuple[int, bool]] = {
     for kind in DataType
     if kind.name.startswith(("INTEGER", "UNSIGNED"))
 }
-"""Integer types: bytes, and whether signed."""
+"""Integer types: number of bytes, and whether signed."""
 
 _REALS = {DataType.REAL32: struct.Struct("<f"), DataType.REAL64: struct.Struct("<d")}
 _SIX_BYTES = (DataType.TIME_OF_DAY, DataType.TIME_DIFFERENCE)
 
 
 class LengthMismatch(WireError):
-    """The bytes that a device sent for an object are more or fewer than its data type has."""
+    """A device sent more or fewer bytes for an object than its data type has."""
 
 
 def size_of(data_type: int) -> int | None:
-    """Bytes that a value of this type takes; None where that varies (strings, DOMAIN) or the type is unknown."""
+    """Return the size of a value of this type in bytes, or None if it varies (strings, DOMAIN) or the type is unknown."""
     kind = _KINDS.get(data_type)
     if kind is None:
         return None
@@ -74,16 +74,16 @@ def size_of(data_type: int) -> int | None:
 
 
 def is_signed(data_type: int) -> bool:
-    """Whether it is one of the INTEGER types."""
+    """Return whether it is one of the INTEGER types."""
     kind = _KINDS.get(data_type)
     return kind is not None and _INTEGERS.get(kind, (0, False))[1]
 
 
 def decode(data_type: int, data: bytes) -> Scalar:
-    """The value in `data`. Raises `LengthMismatch` when it has another length than its type.
+    """Return the value in `data`. Raises `LengthMismatch` if its length differs from that of the type.
 
-    VISIBLE_STRING loses trailing NULs (devices pad with them) and shows what is no ASCII as ``\\xNN``. OCTET_STRING,
-    DOMAIN, the two times and unknown types stay bytes.
+    VISIBLE_STRING loses trailing NULs (devices pad with them), and its non-ASCII bytes are written as ``\\xNN``.
+    OCTET_STRING, DOMAIN, the two time types and unknown types stay bytes.
     """
     size = size_of(data_type)
     if size is not None and len(data) != size:
@@ -106,7 +106,7 @@ def decode(data_type: int, data: bytes) -> Scalar:
 
 
 def encode(data_type: int, value: Scalar) -> bytes:
-    """The bytes of `value`. Raises `UsageError` when it is of another kind or does not fit; nothing is rounded or cut."""
+    """Return the bytes of `value`. Raises `UsageError` if it has a wrong type or does not fit; nothing is rounded or cut."""
     kind = _KINDS.get(data_type, DataType.DOMAIN)
     try:
         return _encode(kind, value)

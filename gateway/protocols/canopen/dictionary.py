@@ -1,8 +1,8 @@
-"""The object dictionary of a node as its EDS or DCF describes it, in our own frozen form.
+"""The object dictionary of a node as its EDS or DCF describes it, in immutable form.
 
-The one file on this side that imports the `canopen` package, whose reader turns text into objects. It forgives little and
-names no line: `eds_text` mends the text before, `eds_values` reads the values, and errors of the package end here. Nothing here
-talks to a node.
+This is the only file of the gateway that imports the `canopen` package, whose reader turns text into objects. That
+reader tolerates few errors and reports no line numbers: `eds_text` repairs the text before, `eds_values` reads the
+values, and errors of the package are translated here. This module does not communicate with a node.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from fieldtwin.gateway.protocols.canopen.eds_text import EdsText, Section, decod
 from fieldtwin.gateway.protocols.canopen.eds_values import read_limit, read_value
 
 MAX_EDS_BYTES = 8 * 1024 * 1024
-"""An EDS or DCF file that is larger is a mistake; the largest one known has 2 MB."""
+"""A larger EDS or DCF file is treated as a mistake; the largest known one has 2 MB."""
 MAX_DOMAIN_BYTES = 16 * 1024 * 1024
-"""Of a file that a DOMAIN object names as its content."""
+"""The largest file that a DOMAIN object may name as its content."""
 _TYPE_AREA = range(0x1000)
-"""Indices that define data types (7.4.1): no objects of the device."""
+"""Indices that define data types (7.4.1) and are not objects of the device."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,10 +39,10 @@ class DictionaryEntry:
     """One object (or sub-object) of the dictionary.
 
     `name` is ``Parent.Child`` for a sub-object. `type_code` is that of CiA 301 (see `datatypes.DataType`). `access` is
-    ro, wo, rw, rwr, rww or const. `default` is the DCF's ParameterValue where it has one, else the DefaultValue, with
-    $NODEID filled in when a node id was given; None when the file has none, or none that can be read. `low` and
-    `high` are inclusive limits of numbers, None where there is none. `configured` says that a DCF sets it: `default` is then its
-    ParameterValue, None where that cannot be read.
+    ro, wo, rw, rwr, rww or const. `default` is the DCF's ParameterValue if it has one, else the DefaultValue, with
+    $NODEID filled in if a node ID was given; None if the file has no readable value. `low` and `high` are inclusive
+    limits of numbers, None if there is no limit. `configured` says that a DCF sets the object: `default` is then its
+    ParameterValue, or None if that cannot be read.
     """
 
     index: int
@@ -67,7 +67,7 @@ class DictionaryEntry:
 
 @dataclass(frozen=True, slots=True)
 class ObjectDictionary:
-    """All entries by (index, subindex), in order. `mended` says what the file had to be forgiven."""
+    """All entries by (index, subindex), in order. `mended` lists the repairs that the file needed."""
 
     entries: Mapping[tuple[int, int], DictionaryEntry]
     vendor_name: str = ""
@@ -86,11 +86,14 @@ class ObjectDictionary:
         return len(self.entries)
 
     def get(self, index: int, subindex: int = 0) -> DictionaryEntry | None:
-        """The entry, or None where the file has none."""
+        """Return the entry, or None if the file does not have it."""
         return self.entries.get((index, subindex))
 
     def find(self, name: str) -> DictionaryEntry:
-        """The entry of that name, full or of the sub-object alone if that is unique. `UsageError` names the nearest."""
+        """Return the entry with that name: its full name, or the sub-object's name alone if that is unique.
+
+        Raises `UsageError` with the most similar name if there is none.
+        """
         exact = [entry for entry in self if entry.name == name]
         found = exact or [entry for entry in self if entry.name.endswith(f".{name}")]
         if len(found) == 1:
@@ -105,7 +108,8 @@ class ObjectDictionary:
 def load_dictionary(path: Path, node_id: int | None = None) -> ObjectDictionary:
     """Read an EDS or DCF file. Raises `FileInvalid` with file, line, section and key.
 
-    A DOMAIN's DownloadFile (CiA 306, 4.7.3) is read from the file's own folder: its bytes are what the DCF sets.
+    A DOMAIN's DownloadFile (CiA 306, 4.7.3) is read from the file's own folder: its bytes are the value that the DCF
+    sets.
     """
     try:
         raw = read_input(path, MAX_EDS_BYTES)
@@ -123,8 +127,11 @@ def parse_dictionary(
     mended: tuple[str, ...] = (),
     folder: Path | None = None,
 ) -> ObjectDictionary:
-    """Read the text of an EDS or DCF. `node_id` fills in $NODEID; without it the DCF's own, if it has one. Files that it
-    names are looked for in `folder`; None: they are not read."""
+    """Read the text of an EDS or DCF.
+
+    `node_id` replaces $NODEID; without it, the DCF's own node ID does, if it has one. Files that the text names are
+    read from `folder`; with None they are not read.
+    """
     if node_id is not None:
         check_node(node_id)
     eds = read_eds_text(text, path)
@@ -152,7 +159,7 @@ def parse_dictionary(
 def _entries(
     objects: Iterable[ODVariable | ODArray | ODRecord], eds: EdsText, values: _Values
 ) -> dict[tuple[int, int], DictionaryEntry]:
-    """Every variable of theirs as an entry of ours, in order of index and subindex."""
+    """Return every variable of the package as an entry, in order of index and subindex."""
     entries: dict[tuple[int, int], DictionaryEntry] = {}
     for item in objects:
         if item.index in _TYPE_AREA:
@@ -171,7 +178,7 @@ def _entries(
 def _downloads(
     entries: Mapping[tuple[int, int], DictionaryEntry], values: _Values, folder: Path | None
 ) -> dict[tuple[int, int], DictionaryEntry]:
-    """The DOMAINs that name a DownloadFile, set to its content; None where it cannot be read, which is noted."""
+    """Set the DOMAINs that name a DownloadFile to its content; one that cannot be read becomes None and is noted."""
     found: dict[tuple[int, int], DictionaryEntry] = {}
     for key, entry in entries.items():
         section = values.section(*key)
@@ -192,7 +199,7 @@ def _downloads(
 
 
 def _expand(array: ODArray, members: list[DictionaryEntry], count: int) -> list[DictionaryEntry]:
-    """A compact array (CiA 306, 4.6.3.2.3) with all its entries; `canopen` makes the first and those with names."""
+    """Return all entries of a compact array (CiA 306, 4.6.3.2.3); `canopen` makes only the first one and those with names."""
     known = {entry.subindex: entry for entry in members}
     template = known[1]
     known[0] = replace(known[0], access="ro", default=count)
@@ -202,7 +209,7 @@ def _expand(array: ODArray, members: list[DictionaryEntry], count: int) -> list[
 
 
 class _Values:
-    """What the sections say of each value. `mended` says which could not be read."""
+    """The values in the sections of the file. `mended` lists those that could not be read."""
 
     def __init__(self, eds: EdsText, node_id: int | None) -> None:
         self._sections = eds.sections
@@ -210,11 +217,11 @@ class _Values:
         self.mended: list[str] = []
 
     def section(self, index: int, subindex: int) -> Section:
-        """Where a value is described: in its own section, or in that of its object."""
+        """Return the section that describes a value: its own section, or that of its object."""
         return self._sections.get(f"{index:04X}sub{subindex:X}") or self._sections[f"{index:04X}"]
 
     def entry(self, var: ODVariable, name: str) -> DictionaryEntry:
-        """An entry of ours from a variable of the package."""
+        """Return the entry for a variable of the package."""
         section, kind = self.section(var.index, var.subindex), int(var.data_type or DataType.DOMAIN)
         configured = bool(section.values.get("ParameterValue", ""))
         default = self._value(section, "ParameterValue", kind) if configured else None

@@ -1,8 +1,8 @@
-"""EDS and DCF files as text (CiA 306): sections and keys with their lines, and what has to be mended in real ones.
+"""EDS and DCF files as text (CiA 306): sections and keys with their lines, and the repairs that real files need.
 
-Vendors' files leave numbers empty, write octal, spell keys in any case, put sub-objects before their object and use
-whatever encoding their editor had. This module reads all that, says what it mended, and refuses what cannot be
-guessed with file, section and key. It writes the text that remains; it knows no data type and no node.
+Vendors' files leave numbers empty, write octal, vary the case of keys, put sub-objects before their object and use the
+encoding of the vendor's editor. This module reads all that, lists its repairs, and refuses ambiguous content with file,
+section and key. It produces the repaired text; it knows no data types and no nodes.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.protocols.canopen.datatypes import DataType
 
 MAX_BYTES = 16 * 1024 * 1024
-"""No EDS comes near; whatever does is another kind of file."""
+"""No EDS is nearly this large; a larger file is not an EDS."""
 
 _OBJECT = re.compile(r"^([0-9A-F]{4})(?:(SUB)([0-9A-F]{1,2})|(NAME|VALUE|DENOTATION))?$", re.IGNORECASE)
 _DOMAIN = "0xF"
-"""CANFestival's editor writes ``[A0sub1]``: of which basic type the type A0h of its own is."""
+"""The type code of DOMAIN. (CANFestival's editor defines its type A0h in ``[A0sub1]``, which names the basic data type.)"""
 _COMMENT = re.compile(r"\s;.*$")
 _HEADING = re.compile(r"\[([^\]]+)\]")
 _OCTAL = re.compile(r"^0[0-7]+$")
@@ -27,9 +27,9 @@ _NUMBER = re.compile(r"^(0x[0-9a-f]+|[0-9]+)$", re.IGNORECASE)
 _TEXT_KEYS = ("ParameterName", "AccessType", "DefaultValue", "ParameterValue", "LowLimit", "HighLimit")
 _MORE_TEXT_KEYS = ("Factor", "Description", "Unit", "StorageLocation", "DownloadFile")
 _VALUE_KEYS = frozenset({"DefaultValue", "ParameterValue", "LowLimit", "HighLimit", "DownloadFile"})
-"""Read by `eds_values`; the reader of the text is not given them."""
+"""Keys that `eds_values` reads; they are not passed to the `canopen` reader."""
 _NUMBER_KEYS = {"ObjectType": "0x7", "DataType": "", "PDOMapping": "0", "CompactSubObj": "0", "NrOfEntries": "0"}
-"""Keys that hold a number, and what an empty one stands for (CiA 306, 4.6.3.2); nothing for those that must be there."""
+"""Keys that hold a number, and the default for an empty one (CiA 306, 4.6.3.2); no default if the key is required."""
 
 _DEVICE_TEXT = ("VendorName", "ProductName", "OrderCode")
 _DEVICE_NUMBERS = ("VendorNumber", "ProductNumber", "RevisionNumber", "NrOfRXPDO", "NrOfTXPDO")
@@ -63,13 +63,13 @@ class Section:
 
 @dataclass(frozen=True, slots=True)
 class EdsText:
-    """A mended file: its sections by canonical name (``DeviceInfo``, ``1018``, ``1018sub1``, ``3004Name``)."""
+    """A repaired file: its sections by canonical name (``DeviceInfo``, ``1018``, ``1018sub1``, ``3004Name``)."""
 
     sections: dict[str, Section]
     mended: tuple[str, ...]
 
     def __str__(self) -> str:
-        """The mended file, objects before their sub-objects, without what says nothing about objects."""
+        """Return the repaired file, objects before their sub-objects, without content that does not concern objects."""
         blocks = []
         for name, section in self.sections.items():
             lines = [f"{key}={value}" for key, value in section.values.items() if key not in _VALUE_KEYS]
@@ -78,7 +78,7 @@ class EdsText:
 
 
 def decode_eds(raw: bytes, path: str = "") -> tuple[str, tuple[str, ...]]:
-    """The text of a file, and what had to be assumed: UTF-8 or UTF-16 (by their marks), else Windows-1252."""
+    """Return the text of a file, and the assumptions made: UTF-8 or UTF-16 (by their marks), else Windows-1252."""
     if len(raw) > MAX_BYTES:
         raise FileInvalid("not an EDS", path=path, expected=f"at most {MAX_BYTES} bytes", got=str(len(raw)))
     if raw[:2] in (b"\xff\xfe", b"\xfe\xff"):
@@ -91,7 +91,7 @@ def decode_eds(raw: bytes, path: str = "") -> tuple[str, tuple[str, ...]]:
 
 
 def read_eds_text(text: str, path: str = "") -> EdsText:
-    """Read and mend. Raises `FileInvalid` with file, line, section and key for what cannot be mended."""
+    """Read and repair. Raises `FileInvalid` with file, line, section and key for errors that cannot be repaired."""
     mended: list[str] = []
     sections = _split(text, path, mended)
     if not any(_OBJECT.match(name) for name in sections):
@@ -119,7 +119,7 @@ def read_eds_text(text: str, path: str = "") -> EdsText:
 
 
 def invalid(message: str, section: Section, key: str, path: str, *, expected: str, got: str = "") -> FileInvalid:
-    """The error for a key of a section."""
+    """Return the error for a key of a section."""
     line = section.lines.get(key, section.line)
     return FileInvalid(f"[{section.name}] {key}: {message}", path=path, line=line, expected=expected, got=got)
 
@@ -129,7 +129,7 @@ def _commissioning() -> tuple[tuple[str, ...], tuple[str, ...]]:
 
 
 def _order(name: str) -> tuple[int, int, int]:
-    """Objects, then their sub-objects, then their names, then their values."""
+    """Return the sort key: objects, then their sub-objects, then their names, then their values."""
     rank = {"Name": 1, "Value": 2}.get(name[4:], 0)
     return int(name[:4], 16), rank, -1 if rank or len(name) == 4 else int(name[7:], 16)
 
@@ -147,7 +147,7 @@ def _canonical_section(name: str) -> str:
 
 
 def _split(text: str, path: str, mended: list[str]) -> dict[str, Section]:
-    """Sections and keys; a key or an object twice is refused unless both say the same."""
+    """Return sections and keys; a repeated key or object is refused unless both are the same."""
     sections: dict[str, Section] = {}
     current: Section | None = None
     for number, raw in enumerate(text.replace("\r\n", "\n").replace("\r", "\n").split("\n"), 1):
@@ -189,7 +189,7 @@ def _put(section: Section, written: str, value: str, line: int, path: str, mende
 
 
 def _number(section: Section, key: str, if_empty: str, path: str, mended: list[str]) -> str:
-    """A number as `canopen` reads it: decimal or 0x; octal (a leading 0 in CiA 306) rewritten, empty filled in."""
+    """Return a number as `canopen` reads it: decimal or 0x. Octal (a leading 0 in CiA 306) is rewritten, empty filled in."""
     value = section.values[key].replace(" ", "")
     if not value:
         if not if_empty:
@@ -206,7 +206,7 @@ def _number(section: Section, key: str, if_empty: str, path: str, mended: list[s
 def _mend_information(
     section: Section, allowed: tuple[tuple[str, ...], tuple[str, ...]], path: str, mended: list[str]
 ) -> Section:
-    """The keys of [DeviceInfo] or [DeviceComissioning] that are of use."""
+    """Return the keys of [DeviceInfo] or [DeviceComissioning] that are needed."""
     texts, numbers = allowed
     kept = Section(section.name, section.line)
     for key in section.values:
@@ -220,7 +220,7 @@ def _mend_information(
 
 
 def _mend_count(section: Section, key: str, kept: Section, path: str, mended: list[str]) -> None:
-    """A number that describes the device as a whole: one that cannot be is left out, since no object depends on it."""
+    """Take a number that describes the whole device; an impossible one is left out, since no object depends on it."""
     try:
         number = int(_number(section, key, "0", path, mended), 0)
     except FileInvalid:
@@ -233,17 +233,17 @@ def _mend_count(section: Section, key: str, kept: Section, path: str, mended: li
 
 
 def _kind(section: Section, path: str) -> int:
-    """The ObjectType: 7 (VAR) where the section does not say."""
+    """Return the ObjectType, which is 7 (VAR) if the section does not have one."""
     return int(_number(section, "ObjectType", "0x7", path, []), 0) if "ObjectType" in section.values else 7
 
 
 def _holds_values(section: Section, path: str) -> bool:
-    """Whether the object is a DOMAIN, VAR, ARRAY or RECORD (CiA 306-1, 4.6.3.2)."""
+    """Return whether the object is a DOMAIN, VAR, ARRAY or RECORD (CiA 306-1, 4.6.3.2)."""
     return _kind(section, path) in (0x2, 0x7, 0x8, 0x9)
 
 
 def _data_type(section: Section, kept: Section, sections: dict[str, Section], path: str, mended: list[str]) -> str:
-    """The basic data type of a value, as the text is to say it; a type that no one describes is taken as DOMAIN."""
+    """Return the basic data type of a value, as written into the text; a type that is not defined is read as DOMAIN."""
     if _kind(section, path) == 0x2:
         return _DOMAIN
     if not kept.values.get("DataType"):
@@ -260,19 +260,19 @@ def _data_type(section: Section, kept: Section, sections: dict[str, Section], pa
 
 
 def _mend_object(section: Section, sections: dict[str, Section], path: str, mended: list[str]) -> Section:
-    """The keys of an object or sub-object, complete enough for a reader that forgives nothing."""
+    """Return the keys of an object or sub-object, complete enough for the strict reader of `canopen`."""
     kept = Section(section.name, section.line, lines=section.lines)
     for key, value in section.values.items():
         if key in _NUMBER_KEYS:
             if key == "DataType" and not value and (_kind(section, path) == 0x2 or not _is_variable(section, path)):
-                continue  # a record's own data type means nothing, and a DOMAIN needs none
+                continue  # the data type of a record means nothing, and a DOMAIN needs none
             kept.values[key] = _number(section, key, _NUMBER_KEYS[key], path, mended)
         elif key in _TEXT_KEYS or key in _MORE_TEXT_KEYS:
             kept.values[key] = value
         elif key == "UploadFile" and value:
             mended.append(f"[{section.name}] UploadFile: nothing is stored there")
     if not int(kept.values.get("CompactSubObj", "0"), 0):
-        kept.values.pop("CompactSubObj", None)  # `canopen` takes its mere presence for a compact array
+        kept.values.pop("CompactSubObj", None)  # `canopen` takes an object that has this key for a compact array
     if not kept.values.get("ParameterName"):
         kept.values["ParameterName"] = f"{section.name[:4]}h"
         mended.append(f"[{section.name}] ParameterName: missing")
@@ -302,7 +302,7 @@ def _access(section: Section, path: str, mended: list[str]) -> str:
 
 
 def _is_variable(section: Section, path: str) -> bool:
-    """Whether the section describes a value, rather than an array or record of others."""
+    """Return whether the section describes a value, rather than an array or record of values."""
     if "ObjectType" not in section.values:
         return True
     kind = _kind(section, path)
@@ -311,8 +311,10 @@ def _is_variable(section: Section, path: str) -> bool:
 
 
 def _spell_out(values: Section, parent: Section, kept: dict[str, Section], path: str, mended: list[str]) -> None:
-    """[xxxxValue] holds what a DCF sets in a compact array (CiA 306, 4.7.3): all its entries become sub-objects of their own,
-    since the reader of the text knows no such section."""
+    """Write the entries of a compact array as separate sub-objects with the values of [xxxxValue] (CiA 306, 4.7.3).
+
+    [xxxxValue] holds the values that a DCF sets in a compact array; the `canopen` reader does not know that section.
+    """
     array = kept[parent.name]
     if "CompactSubObj" not in array.values:
         mended.append(f"[{values.name}]: left out, [{parent.name}] is no compact array")
@@ -332,7 +334,7 @@ def _spell_out(values: Section, parent: Section, kept: dict[str, Section], path:
 
 
 def _mend_names(names: Section, parent: Section, kept: dict[str, Section], path: str, mended: list[str]) -> None:
-    """[xxxxName] lists the names of a compact array's entries, those that differ only: fill in the others."""
+    """Complete [xxxxName], which lists the names of a compact array's entries only where they differ from the default."""
     array = kept[parent.name]
     if "CompactSubObj" not in array.values:
         mended.append(f"[{names.name}]: left out, [{parent.name}] is no compact array")

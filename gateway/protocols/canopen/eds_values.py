@@ -1,7 +1,7 @@
 """Values as an electronic data sheet writes them (CiA 306-1, 4.6.3.2): text to a number, a string or bytes.
 
-The `canopen` package reads these texts too, but it passes over octal numbers, limits of real types and signed numbers that are
-written by their bits, and it does not report a value that it cannot read. Pure; knows no section and no node.
+The `canopen` package reads these texts too, but it ignores octal numbers, limits of real types and signed numbers that
+are written as their bits, and it does not report a value that it cannot read. Pure; knows no sections and no nodes.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ _WITH_NODE_ID = re.compile(r"\$NODEID(?:\+(?P<after>[0-9A-FX]+))?|(?P<before>[0-
 
 
 def read_value(data_type: int, text: str, node_id: int | None = None) -> Scalar | None:
-    """The value that `text` means in an object of `data_type`; None for one that needs a node id where none is given.
+    """Return the value of `text` for an object of `data_type`; None if it needs a node ID and none is given.
 
-    Raises `ValueError` for a text that is no value of the type, or that the type has no room for. A signed type also takes the
-    unsigned reading of its bits (FFh for -1). A time is its six octets, or a number of 48 bits.
+    Raises `ValueError` for a text that is not a value of the type, or is outside its range. A signed type also accepts
+    the unsigned reading of its bits (FFh for -1). A time is its six octets, or a number of 48 bits.
     """
     text = text.strip()
     if data_type in _TEXTS:
@@ -51,9 +51,9 @@ def read_value(data_type: int, text: str, node_id: int | None = None) -> Scalar 
 
 
 def read_limit(data_type: int, text: str) -> int | float | None:
-    """The limit that `text` means; None where values of the type have no order, and where it depends on the node id.
+    """Return the limit in `text`; None if values of the type have no order, or if it depends on the node ID.
 
-    Raises `ValueError` for a text that is no number of the type.
+    Raises `ValueError` for a text that is not a number of the type.
     """
     ordered = size_of(data_type) is not None and data_type not in _TIMES
     if not text.strip() or not ordered or "$NODEID" in text.upper():
@@ -68,7 +68,7 @@ def read_limit(data_type: int, text: str) -> int | float | None:
 
 
 def _whole(text: str) -> int:
-    """Decimal, hexadecimal with 0x, or octal with a leading zero."""
+    """Read a decimal number, a hexadecimal one with 0x, or an octal one with a leading zero."""
     text = text.strip()
     if _OCTAL.fullmatch(text):
         return int(text, 8)
@@ -76,7 +76,7 @@ def _whole(text: str) -> int:
 
 
 def _held(value: int, size: int, *, signed: bool) -> int:
-    """The number that the type holds. Raises `ValueError` where it has no room."""
+    """Return the number as the type holds it. Raises `ValueError` if it does not fit."""
     bits = 8 * size
     if not (-(1 << bits - 1) if signed else 0) <= value < 1 << bits:
         raise ValueError("the type has no room for it")
@@ -84,7 +84,7 @@ def _held(value: int, size: int, *, signed: bool) -> int:
 
 
 def _real(form: str, text: str, size: int) -> float:
-    """As the type holds it; a hexadecimal number is its bits."""
+    """Return the number as the type holds it; a hexadecimal number gives its bits."""
     try:
         raw = _whole(text).to_bytes(size, "little") if text[:2].lower() == "0x" else struct.pack(form, float(text))
     except OverflowError as e:

@@ -1,4 +1,4 @@
-"""Emergency messages (CiA 301, 7.2.7): what a node says is wrong with it. Pure parsing; keeps no history."""
+"""Emergency messages (CiA 301, 7.2.7), by which a node reports its errors. Parsing only; keeps no history."""
 
 from __future__ import annotations
 
@@ -51,8 +51,8 @@ _CODES = {
 class Emcy:
     """An emergency message. `code` 0000h means that an error is gone. `vendor` is up to 5 manufacturer bytes.
 
-    `register` is the error register (1001h), or None when the message was too short to carry it; `length` is what
-    really came (8 by the standard).
+    `register` is the error register (1001h), or None if the message was too short to carry it; `length` is the number
+    of bytes received (8 by the standard).
     """
 
     code: int
@@ -66,15 +66,16 @@ class Emcy:
 
     @property
     def meaning(self) -> str:
-        """The standard's words for the code, or for its class (tables 26 and following of 7.2.7.1)."""
+        """Return the standard's text for the code, or for its class (tables 26 and following of 7.2.7.1)."""
         by_class = _CLASSES.get(self.code >> 8) or _CLASSES.get(self.code >> 8 & 0xF0, "unknown")
         return _CODES.get(self.code, by_class)
 
 
 def parse_emcy(data: bytes) -> Emcy:
-    """Read the data of an EMCY frame; 2 to 7 bytes are tolerated (CO-053). Raises `Desync` when there is not even a code.
+    """Read the data of an EMCY frame; 2 to 7 bytes are tolerated (CO-053). Raises `Desync` if it is too short for a
+    code.
 
-    An empty frame must not pass for code 0000h: that would clear an error.
+    An empty frame must not be taken for code 0000h, which would clear an error.
     """
     if len(data) < 2:
         raise Desync("an emergency message without a code", expected="8 bytes", got=f"{len(data)}")

@@ -1,4 +1,4 @@
-"""What a node has said is wrong with it: the last emergency messages and the errors that are still there. Pure, bounded."""
+"""The errors that a node has reported: the last emergency messages and the errors that are still active. Pure, bounded."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ MAX_ACTIVE = 32
 
 @dataclass(frozen=True, slots=True)
 class EmcyEntry:
-    """An emergency message and when it came (monotonic, ns)."""
+    """An emergency message and its time of reception (monotonic, ns)."""
 
     t_ns: int
     emcy: Emcy
 
 
 class EmcyLog:
-    """One node's. `total` counts all messages, `forgotten` those that the log has no more room for."""
+    """The log of one node. `total` counts all messages, `forgotten` those that were removed because the log was full."""
 
     def __init__(self) -> None:
         self._entries: deque[EmcyEntry] = deque(maxlen=MAX_ENTRIES)
@@ -29,9 +29,9 @@ class EmcyLog:
         self.total = 0
 
     def add(self, emcy: Emcy, t_ns: int) -> None:
-        """A message came. An error reset ends all errors, unless its error register says that some are left (CO-054).
+        """Add a message. An error reset ends all errors, unless its error register says that some are left (CO-054).
 
-        Which of them ended is not in the message: then all are kept, until the register is clear.
+        The message does not say which of them ended, so all are kept until the register is clear.
         """
         self.total += 1
         self._entries.append(EmcyEntry(t_ns, emcy))
@@ -43,7 +43,7 @@ class EmcyLog:
             self._active.clear()
 
     def restarted(self) -> None:
-        """The node booted: what is wrong with it now, it will say again. The history stays."""
+        """Forget the active errors because the node booted: it will report its present errors again. The history stays."""
         self._active.clear()
 
     @property
@@ -52,11 +52,11 @@ class EmcyLog:
 
     @property
     def entries(self) -> tuple[EmcyEntry, ...]:
-        """Newest first, as in 1003h."""
+        """Return the entries, newest first, as in 1003h."""
         return tuple(reversed(self._entries))
 
     def describe(self, now_ns: int) -> list[dict[str, object]]:
-        """The entries as plain data, newest first."""
+        """Return the entries as plain data, newest first."""
         return [
             {
                 "age_ms": (now_ns - entry.t_ns) // NS_PER_MS,
@@ -70,5 +70,5 @@ class EmcyLog:
 
     @property
     def active(self) -> tuple[int, ...]:
-        """Codes of the errors that are there, in the order in which they came."""
+        """Return the codes of the active errors, in the order in which they were reported."""
         return tuple(self._active)

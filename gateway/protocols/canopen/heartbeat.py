@@ -1,8 +1,9 @@
-"""The heartbeat consumer (CiA 301, 7.2.8.2.2.2 and 7.2.8.3.2.2): who is alive, in which state, since when not.
+"""The heartbeat consumer (CiA 301, 7.2.8.2.2.2 and 7.2.8.3.2.2): which nodes are alive, their states, and lost
+heartbeats.
 
 A pure object: heartbeats and `now` in, events out. Monitoring of a node starts at its first heartbeat (CO-036). A late
-heartbeat inside the consumer time is no event (CO-037). A boot-up counts as a sign of life of a node that is being
-monitored, and ends no time-out: only a heartbeat brings a lost node back (CO-038).
+heartbeat within the consumer time is not an event (CO-037). A boot-up counts as a sign of life of a node that is being
+monitored, but does not end a heartbeat loss: only a heartbeat does (CO-038).
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from fieldtwin.gateway.protocols.canopen import cob_id
 from fieldtwin.gateway.protocols.canopen.nmt import NmtState, NodeEvent, NodeEventKind, heartbeat_state
 
 TWIN_BOOT_NS = 100 * NS_PER_MS
-"""No node boots twice within this time; two nodes with one id do (CO-042)."""
+"""One node does not boot twice within this time; two nodes with the same ID do (CO-042)."""
 
 
 _INITIALISING = NmtState.INITIALISING
@@ -37,51 +38,51 @@ class _Node:
 
 
 class HeartbeatConsumer:
-    """States of up to 127 nodes. `ignored` counts messages that are no heartbeat."""
+    """The states of up to 127 nodes. `ignored` counts messages that are not heartbeats."""
 
     def __init__(self) -> None:
         self._nodes: dict[int, _Node] = {}
         self.ignored = 0
 
     def monitor(self, node: int, consumer_ms: int) -> None:
-        """Watch `node` from its next heartbeat on, or no longer (0). A node that is being watched stays so."""
+        """Monitor `node` from its next heartbeat on, or stop monitoring it (0). A node that is already monitored stays so."""
         known = self._node(cob_id.check_node(node))
         if not known.consumer_ns or not consumer_ms:
             known.monitored = known.lost = False
         known.consumer_ns = consumer_ms * NS_PER_MS
 
     def state(self, node: int) -> NmtState | None:
-        """The last state heard, None if none was. A lost node keeps it: see `is_lost`."""
+        """Return the last received state, or None if none was received. A lost node keeps its state: see `is_lost`."""
         known = self._nodes.get(node)
         return None if known is None else known.state
 
     def is_watched(self, node: int) -> bool:
-        """Whether the node has a consumer time and its first heartbeat came (CO-036); a lost node stays watched."""
+        """Return whether the node has a consumer time and has sent a heartbeat (CO-036); a lost node stays watched."""
         known = self._nodes.get(node)
         return known is not None and known.consumer_ns > 0 and known.monitored
 
     def is_lost(self, node: int) -> bool:
-        """Whether the node's heartbeat is overdue."""
+        """Return whether the node's heartbeat is overdue."""
         known = self._nodes.get(node)
         return known is not None and known.lost
 
     def expect_boot_up(self, node: int) -> None:
-        """The next boot-up of `node` (0: of every node) was asked for."""
+        """Note that the next boot-up of `node` (0: of every node) was requested."""
         for known in self._nodes.values() if node == cob_id.ALL_NODES else [self._node(node)]:
             known.boot_expected = True
 
     def observe(self, node: int, data: bytes, t_ns: int) -> tuple[NodeEvent, ...]:
-        """A message of `node` on 700h + node id came at `t_ns`."""
+        """Handle a message of `node` on 700h + node ID, received at `t_ns`."""
         state = heartbeat_state(data)
         if state is None:
             self.ignored += 1
             return ()
         known = self._node(node)
         same = state is known.state and known.monitored and not known.lost and state is not _INITIALISING
-        if same and (not known.consumer_ns or t_ns <= known.heard_ns + known.consumer_ns):  # as a rule
+        if same and (not known.consumer_ns or t_ns <= known.heard_ns + known.consumer_ns):  # the usual case
             known.heard_ns = max(known.heard_ns, t_ns)
             return ()
-        events = list(self._overdue(node, known, t_ns))  # nobody may have checked in between
+        events = list(self._overdue(node, known, t_ns))  # `check` may not have been called in between
         if state is NmtState.INITIALISING:
             events += self._booted(node, known, data, t_ns)
             return tuple(events)
@@ -96,16 +97,16 @@ class HeartbeatConsumer:
         return tuple(events)
 
     def check(self, now_ns: int) -> tuple[NodeEvent, ...]:
-        """Who became overdue by `now_ns`; each is told once."""
+        """Return an event for each node that became overdue by `now_ns`; each is reported once."""
         return tuple(event for node, known in self._nodes.items() for event in self._overdue(node, known, now_ns))
 
     def deadline_ns(self, node: int) -> int | None:
-        """When the node's heartbeat is overdue, None while it is not watched."""
+        """Return when the node's heartbeat is overdue, or None while it is not watched."""
         known = self._nodes.get(node)
         return None if known is None else known.deadline_ns
 
     def next_deadline_ns(self) -> int | None:
-        """When `check` is due next, None while nobody is watched."""
+        """Return when `check` is due next, or None while no node is watched."""
         deadlines = [d for known in self._nodes.values() if (d := known.deadline_ns) is not None]
         return min(deadlines, default=None)
 

@@ -1,18 +1,18 @@
-"""Which replies may still be on their way after an SDO request went unanswered, and how to get past them.
+"""Track which replies may still arrive after an SDO request was not answered, and decide how to get past them.
 
-An SDO reply names index and subindex, no request. When a request timed out and the same object is asked for again,
-a late reply to the first would pass for a reply to the second: an old value, delivered as a new one. Waiting "long
-enough" only makes that rarer. What settles it is order: a server handles one request at a time on a channel and its
-replies share one CAN-ID, so they come in the order of the requests. A reply to a *later* request for *another* object
-therefore proves that nothing before it can still come. So:
+An SDO reply names index and subindex, but not the request. If a request timed out and the same object is requested
+again, a late reply to the first request could be taken for a reply to the second: an old value would be delivered as a
+new one. Waiting "long enough" only makes that rarer. The order of replies solves it: a server handles one request at a
+time on a channel and its replies share one CAN-ID, so they arrive in the order of the requests. A reply to a *later*
+request for a *different* object therefore proves that no reply to an earlier request can still arrive. So:
 
-- A request for an object that nothing is outstanding for goes out at once: its multiplexor tells its reply from every
-  late one, and that reply, when it comes, settles all that was outstanding before.
-- A request for an object with a reply outstanding is preceded by a probe: a read of a mandatory object that none is
-  outstanding for. A reply to it (an abort will do) settles the rest. A dead node so costs one time-out a request, as
-  before, and a boot-up settles everything.
+- A request for an object without an outstanding reply is sent immediately: its multiplexor distinguishes its reply
+  from every late one, and when that reply arrives, it settles all earlier requests.
+- A request for an object with an outstanding reply is preceded by a probe: a read of a mandatory object without an
+  outstanding reply. A reply to the probe (an abort is enough) settles the earlier requests. A dead node thus costs one
+  timeout per request, as before, and a boot-up settles everything.
 
-Pure; knows no frame and no time.
+Pure; knows no frames and no time.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Multiplexor = tuple[int, int]
 """Index and subindex."""
 
 MAX_OUTSTANDING = 64
-"""A reply that is late by more than so many unanswered requests is held impossible."""
+"""The largest number of unanswered requests that are tracked; a later reply than that is considered impossible."""
 
 PROBES: tuple[Multiplexor, ...] = ((0x1000, 0), (0x1001, 0), (0x1018, 0), (0x1018, 1))
 """Objects that every node must have (7.5.2.1, 7.5.2.2, 7.5.2.19), read without effect."""
@@ -36,27 +36,30 @@ class LateReplies:
         self._outstanding: deque[Multiplexor] = deque(maxlen=MAX_OUTSTANDING)
 
     def unanswered(self, request: Multiplexor) -> None:
-        """A request was given up on (time-out, cancellation, protocol error): its reply may come later, or never."""
+        """Note that a request was given up (timeout, cancellation, protocol error): its reply may arrive later, or never."""
         self._outstanding.append(request)
 
     def answered(self, request: Multiplexor) -> bool:
-        """A reply for `request` came. If one was outstanding for it, this may be that one: only what is older is settled, and
-        it is True: who asked for it now has to go on expecting the other reply."""
+        """Note that a reply for `request` arrived, and return whether one more reply for it may still arrive.
+
+        If an earlier request for the same object is unanswered, the reply may belong to that one: only older requests
+        are then settled, the result is True, and the caller has to expect one more reply.
+        """
         while self._outstanding:
             if self._outstanding.popleft() == request:
                 return True
         return False
 
     def settle(self) -> None:
-        """Nothing can be on its way any more: the node has booted."""
+        """Forget all requests because the node has booted: no reply can arrive any more."""
         self._outstanding.clear()
 
     def is_ambiguous(self, request: Multiplexor) -> bool:
-        """Whether a late reply could pass for the reply to `request`."""
+        """Return whether a late reply could be taken for the reply to `request`."""
         return request in self._outstanding
 
     def probe(self) -> Multiplexor:
-        """What to read to settle things: nothing outstanding for it, or, for a node long dead, the longest ago."""
+        """Return the object to probe: one without an outstanding reply, or, if all have one, that of the oldest request."""
         for candidate in PROBES:
             if candidate not in self._outstanding:
                 return candidate

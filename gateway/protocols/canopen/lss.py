@@ -1,4 +1,4 @@
-"""LSS frames (CiA 305): requests of the master on 7E5h, replies of slaves on 7E4h. Pure; waits for nothing."""
+"""LSS frames (CiA 305): requests of the master on 7E5h, replies of slaves on 7E4h. Pure; it does not wait."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ INQUIRE = (0x5A, 0x5B, 0x5C, 0x5D)
 INQUIRE_NODE_ID = 0x5E
 
 ANYBODY = 0x80
-"""The bit number of a fastscan request that every non-configured slave answers, and by which it starts afresh."""
+"""The bit number of a fastscan request that every unconfigured slave answers, and that restarts its scan."""
 
 UNCONFIGURED = 0xFF
-"""The node id of a slave that has none."""
+"""The node ID of a slave that has none."""
 
 BIT_RATES = {1_000_000: 0, 800_000: 1, 500_000: 2, 250_000: 3, 125_000: 4, 50_000: 6, 20_000: 7, 10_000: 8}
 """Bit rates (bit/s) and their index in the standard table 0."""
@@ -40,7 +40,7 @@ _ERRORS = {
 
 
 class LssRefused(DeviceRefused):
-    """An LSS slave answered with an error code. `code` is the standard's, `specific` the maker's (code 255)."""
+    """An LSS slave answered with an error code. `code` is that of the standard, `specific` that of the vendor (code 255)."""
 
     def __init__(self, what: str, code: int, specific: int, meaning: str) -> None:
         super().__init__(f"LSS {what}: {meaning}", got=f"error {code}" + (f", specific {specific}" if specific else ""))
@@ -50,7 +50,7 @@ class LssRefused(DeviceRefused):
 
 @dataclass(frozen=True, slots=True)
 class LssAddress:
-    """What tells one LSS slave from all others: the four numbers of 1018h."""
+    """The identity of one LSS slave: the four numbers of 1018h."""
 
     vendor: int
     product: int
@@ -70,24 +70,24 @@ class LssAddress:
 
 
 def request(command: int, data: bytes = b"") -> CanFrame:
-    """A request: command specifier, then up to 7 bytes, zeros behind."""
+    """Return a request: command specifier, then up to 7 bytes, padded with zeros."""
     return CanFrame(cob_id.LSS_REQUEST, bytes([command]) + data.ljust(7, b"\0"))
 
 
 def fastscan(number: int, bit: int, part: int, following: int) -> CanFrame:
-    """A fastscan request: does any slave's `part` (0 vendor to 3 serial) agree with `number` down to `bit`?"""
+    """Return a fastscan request: does any slave's `part` (0 vendor to 3 serial) agree with `number` down to `bit`?"""
     return request(FASTSCAN, number.to_bytes(4, "little") + bytes([bit, part, following]))
 
 
 def check_node_id(node: int) -> int:
-    """`node` when LSS can give it: 1 to 127, or 255 to take a node id away (CO-058)."""
+    """Return `node` if LSS can assign it: 1 to 127, or 255 to remove a node ID (CO-058)."""
     if not (1 <= node <= cob_id.NODE_MAX or node == UNCONFIGURED):
         raise UsageError("not a node id that LSS gives", expected="1 to 127, or 255 for none", got=str(node))
     return node
 
 
 def check_result(what: str, reply: bytes) -> None:
-    """Raise `LssRefused` when a configuration or store reply carries an error code."""
+    """Raise `LssRefused` if a configuration or store reply carries an error code."""
     code, specific = reply[1], reply[2]
     if code:
         meaning = _ERRORS.get((reply[0], code), "specific to the maker" if code == 0xFF else "reserved error code")

@@ -1,9 +1,9 @@
-"""The LSS master (CiA 305): gives node ids and bit rates to slaves that are told apart by their identity.
+"""The LSS master (CiA 305): gives node IDs and bit rates to slaves that are addressed by their identity.
 
-Asynchronous around `lss`; sends over the CANopen master and is told what comes on 7E4h. One request at a time. Replies
-of several slaves at once look like one (they are the same bits), and one may come later than another: wherever more than one
-slave may answer, the whole time for replies is waited for, so that no late one passes for the answer to the next
-request (CO-056, CO-059).
+It is the asynchronous part around `lss`; it sends over the CANopen master and receives the frames on 7E4h. One request
+at a time. Simultaneous replies of several slaves look like one (they have the same bits), and one may arrive later than
+another. So where more than one slave may answer, the master waits for the whole reply time; otherwise a late reply
+could be taken for the answer to the next request (CO-056, CO-059).
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from fieldtwin.gateway.protocols.canopen.lss import LssAddress
 
 MAX_INBOX = 64
 REPLY_S = 0.1
-"""How long a slave may take; the time in which all have answered."""
+"""The reply time of a slave in seconds, in which all slaves have answered."""
 STORE_S = 2.0
-"""Non-volatile memory is slow."""
+"""Non-volatile memory is slow, so storing gets a longer timeout, in seconds."""
 
 
 class LssMaster:
-    """`send` puts a frame on the bus; `on_reply` is to be called with the data of each frame on 7E4h.
+    """An LSS master. `send` puts a frame on the bus; call `on_reply` with the data of each frame on 7E4h.
 
-    `ignored` counts replies that answered nothing. Raises `ReplyTimeout` where nobody answers, `LssRefused` where a slave
-    says no, `Desync` where what answers makes no sense.
+    `ignored` counts replies that answered no request. Raises `ReplyTimeout` if no slave answers, `LssRefused` if a
+    slave refuses, and `Desync` if a reply is invalid.
     """
 
     def __init__(self, send: Callable[[CanFrame], Awaitable[None]], clock: Clock, *, reply_s: float = REPLY_S) -> None:
@@ -44,7 +44,7 @@ class LssMaster:
         self.ignored = 0
 
     def on_reply(self, data: bytes, t_ns: int) -> None:
-        """A frame came on 7E4h."""
+        """Handle a frame that arrived on 7E4h."""
         if self._waiting and len(data) == 8:
             self._inbox.append(data)
             self._arrived.set()
@@ -54,15 +54,15 @@ class LssMaster:
     # -- states ---------------------------------------------------------------------------------------------------
 
     async def switch_all(self, *, configuration: bool) -> None:
-        """Switch every slave to configuration or to waiting. Unconfirmed.
+        """Switch every slave to the configuration or the waiting state. Unconfirmed.
 
-        A slave that was given a node id and had none boots on the way to waiting.
+        A slave that had no node ID and was given one boots when it enters the waiting state.
         """
         async with self._turn:
             await self._send(lss.request(lss.SWITCH_GLOBAL, bytes([configuration])))
 
     async def select(self, address: LssAddress) -> None:
-        """Switch the one slave with `address` to configuration; `ReplyTimeout` when there is none."""
+        """Switch the one slave with `address` to the configuration state. Raises `ReplyTimeout` if there is no such slave."""
         async with self._turn:
             frames = [
                 lss.request(command, part.to_bytes(4, "little"))
@@ -73,14 +73,14 @@ class LssMaster:
     # -- the slave in configuration ---------------------------------------------------------------------------------
 
     async def configure_node_id(self, node: int) -> None:
-        """Give the slave in configuration its node id (255: none). It counts from the next reset or switch to waiting."""
+        """Give the slave in configuration its node ID (255: none). It takes effect at the next reset or switch to waiting."""
         lss.check_node_id(node)
         async with self._turn:
             reply = await self._ask([lss.request(lss.CONFIGURE_NODE_ID, bytes([node]))], lss.CONFIGURE_NODE_ID)
         lss.check_result(f"node id {node}", reply)
 
     async def configure_bit_rate(self, bit_rate: int) -> None:
-        """Give the slave in configuration a bit rate of the standard table; it counts from `activate_bit_rate`."""
+        """Give the slave in configuration a bit rate of the standard table; it takes effect with `activate_bit_rate`."""
         if bit_rate not in lss.BIT_RATES:
             known = ", ".join(str(rate) for rate in lss.BIT_RATES)
             raise UsageError("not a bit rate of LSS", expected=known, got=str(bit_rate))
@@ -90,14 +90,14 @@ class LssMaster:
         lss.check_result(f"bit rate {bit_rate}", reply)
 
     async def activate_bit_rate(self, delay_ms: int) -> None:
-        """All slaves in configuration: silence for `delay_ms`, the new bit rate, silence again. Unconfirmed."""
+        """Make all slaves in configuration pause for `delay_ms`, change the bit rate, and pause again. Unconfirmed."""
         if not 0 <= delay_ms <= 0xFFFF:
             raise UsageError("the switch delay", expected="0 to 65535 ms", got=str(delay_ms))
         async with self._turn:
             await self._send(lss.request(lss.ACTIVATE_BIT_TIMING, delay_ms.to_bytes(2, "little")))
 
     async def store(self) -> None:
-        """Let the slave in configuration keep node id and bit rate over a power cycle."""
+        """Make the slave in configuration save node ID and bit rate for the next power cycle."""
         async with self._turn:
             reply = await self._ask([lss.request(lss.STORE)], lss.STORE, wait_s=STORE_S)
         lss.check_result("store", reply)
@@ -112,23 +112,24 @@ class LssMaster:
         return LssAddress(*parts)
 
     async def inquire_node_id(self) -> int:
-        """Read the node id of the slave in configuration: 1 to 127, 255 where it has none."""
+        """Read the node ID of the slave in configuration: 1 to 127, or 255 if it has none."""
         async with self._turn:
             return (await self._ask([lss.request(lss.INQUIRE_NODE_ID)], lss.INQUIRE_NODE_ID))[1]
 
     # -- who is there -----------------------------------------------------------------------------------------------
 
     async def any_unconfigured(self) -> bool:
-        """Whether a slave without a node id is on the bus (those with one keep quiet: CO-057)."""
+        """Return whether a slave without a node ID is on the bus (slaves with one do not answer: CO-057)."""
         async with self._turn:
             return await self._anybody(lss.request(lss.IDENTIFY_NON_CONFIGURED), lss.NON_CONFIGURED_FOUND)
 
     async def fastscan(self, *, verify: bool = True) -> LssAddress | None:
-        """Find one slave without a node id and leave it in configuration; None when there is none.
+        """Find one slave without a node ID and leave it in configuration; return None if there is no such slave.
 
-        Of several the one with the smallest numbers is found; the next scan finds the next, but without `verify`: a slave
-        found before is in configuration and would answer too. 133 requests, each as long as a reply may take. Raises
-        `Desync` when the answers contradict each other, or the slave that was found says that it is another.
+        If there are several, it finds the one with the smallest numbers; the next scan finds the next one, except
+        without `verify`: a slave found before is in configuration and would answer too. A scan takes 133 requests, each
+        as long as a reply may take. Raises `Desync` if the answers contradict each other, or if the slave that was
+        found reports a different identity.
         """
         async with self._turn:
             if not await self._anybody(lss.fastscan(0, lss.ANYBODY, 0, 0), lss.SLAVE_FOUND):
@@ -148,10 +149,10 @@ class LssMaster:
         return number
 
     async def assign(self, address: LssAddress, node: int, *, store: bool = True) -> int:
-        """Give the slave with `address` the node id `node` and switch it to waiting; the node id that it had.
+        """Give the slave with `address` the node ID `node` and switch it to waiting; return its previous node ID.
 
-        One that had none (255) boots under the new one at once, another when its communication is reset. Nobody else's
-        `assign` comes in between: a slave that another call selected would get the node id too.
+        A slave that had none (255) boots immediately with the new node ID, any other when its communication is reset.
+        Calls of `assign` do not overlap: a slave that a different call selected would get the node ID too.
         """
         lss.check_node_id(node)
         async with self._procedure:
@@ -169,7 +170,7 @@ class LssMaster:
     # -- asking -----------------------------------------------------------------------------------------------------
 
     async def _ask(self, frames: list[CanFrame], expected: int, why: str = "", wait_s: float = 0.0) -> bytes:
-        """Send and return the reply with that specifier; others are passed over and counted."""
+        """Send, and return the reply with that specifier; other replies are skipped and counted."""
         self._begin()
         try:
             for frame in frames:
@@ -184,7 +185,7 @@ class LssMaster:
         raise ReplyTimeout(why or "no LSS slave answers", hint="is one in configuration state?" if not why else "")
 
     async def _anybody(self, frame: CanFrame, expected: int) -> bool:
-        """Whether at least one slave answers. The whole time is waited for: the next question must not meet a late one."""
+        """Return whether at least one slave answers, after the whole reply time, so that no late reply meets the next request."""
         self._begin()
         heard = False
         try:

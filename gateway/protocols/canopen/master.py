@@ -1,7 +1,7 @@
-"""The CANopen master on one bus: the one reader of a CanConnection, and what drivers ask of it.
+"""The CANopen master on one bus: the only reader of a CanConnection, and the services that drivers use.
 
-Thin asyncio around the pure parts (`sdo`, `heartbeat`, `nmt`, `emcy`). It knows no object of any device and no bus
-hardware; standard clauses stand where the parts are.
+Thin asyncio around the pure parts (`sdo`, `heartbeat`, `nmt`, `emcy`). It knows no particular device and no bus
+hardware; the parts quote the clauses of the standard.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from fieldtwin.gateway.protocols.canopen.sdo_block import SdoBlockDownload, SdoB
 from fieldtwin.gateway.protocols.canopen.sdo_channel import Counters, SdoChannel
 
 PdoCallback = Callable[[bytes, int], None]
-"""Called with the frame's data and when it came (monotonic, ns)."""
+"""A callback with the frame's data and its time of reception (monotonic, ns)."""
 
 EventCallback = Callable[[NodeEvent], None]
 
@@ -46,11 +46,12 @@ def _no_one(data: bytes, t_ns: int) -> None:
 class CanopenMaster:
     """SDO client, NMT master, heartbeat consumer, PDO and EMCY receiver for the nodes of one bus.
 
-    `run` must be running for anything to be received. `on_event` may be set at any time; it and PDO callbacks are called
-    from `run`, must be quick, and end it with whatever they raise: an error of a callback is a bug and is not hidden.
+    Nothing is received unless `run` is running. `on_event` may be set at any time. `run` calls it and the PDO
+    callbacks; they must be quick, and an exception that they raise ends `run`: an error of a callback is a bug and is
+    not hidden.
 
-    `sdo_timeout_s` is for each SDO reply of a node that has no time of its own; `sdo_retries` is how often an upload
-    that got no good reply is repeated; `short_sdo` takes SDO replies of fewer than 8 bytes too (CO-026).
+    `sdo_timeout_s` is the timeout for each SDO reply of a node without its own setting. `sdo_retries` is how often an
+    upload without a valid reply is repeated. `short_sdo` also accepts SDO replies of fewer than 8 bytes (CO-026).
     """
 
     def __init__(
@@ -64,12 +65,12 @@ class CanopenMaster:
         on_event: EventCallback | None = None,
     ) -> None:
         self.counters = Counters()
-        self.latency = Latencies()  # of SDO transfers that were done
+        self.latency = Latencies()  # of completed SDO transfers
         self.on_event: EventCallback = on_event or _nobody
         self.on_sync: PdoCallback = _no_one
-        """Called with each SYNC that this master did not send. It may be set at any time, as `on_event`."""
+        """Called with each SYNC that this master did not send. Like `on_event`, it may be set at any time."""
         self.conflicts: dict[int, str] = {}
-        """By node id, in words: the last two replies to one request."""
+        """Detected node ID conflicts by node ID, as text: the last two replies to one request."""
         self._connection = connection
         self._clock = clock
         self._sdo_timeout_s = sdo_timeout_s
@@ -96,9 +97,9 @@ class CanopenMaster:
         sdo_timeout_s: float | None = None,
         sdo_retries: int | None = None,
     ) -> None:
-        """Make `node` known; with a consumer time it is watched from its first heartbeat on.
+        """Register `node`; with a consumer time its heartbeat is monitored from the first one on.
 
-        `sdo_timeout_s` and `sdo_retries` None: as the master.
+        If `sdo_timeout_s` and `sdo_retries` are None, the settings of the master apply.
         """
         self._channel(cob_id.check_node(node))
         if sdo_timeout_s is not None:
@@ -109,15 +110,15 @@ class CanopenMaster:
         self._arm()
 
     def node_state(self, node: int) -> NmtState | None:
-        """The NMT state that the node last told, None if it never did."""
+        """Return the NMT state that the node reported last, or None if it never did."""
         return self._heartbeat.state(node)
 
     def heartbeat_watched(self, node: int) -> bool:
-        """Whether the node's heartbeat has a limit and was heard, so that its loss is an event."""
+        """Return whether the node has a heartbeat consumer time and has sent a heartbeat, so that its loss is an event."""
         return self._heartbeat.is_watched(node)
 
     def heartbeat_lost(self, node: int) -> bool:
-        """Whether the node is watched and its heartbeat is overdue."""
+        """Return whether the node is monitored and its heartbeat is overdue."""
         return self._heartbeat.is_lost(node)
 
     async def sdo_upload(
@@ -131,12 +132,13 @@ class CanopenMaster:
         block: bool = False,
         retries: int | None = None,
     ) -> bytes:
-        """Read an object. `timeout_s` is for each reply; `length` is the object's size where known (CO-029).
+        """Read an object. `timeout_s` is for each reply; `length` is the object's size if known (CO-029).
 
-        One transfer a node at a time, in the order asked; nodes in parallel. A late reply is never taken for the reply
-        to a later request, for the same object neither (`late_replies` tells how). What got no good reply is asked for
-        again `retries` times. `block` is for long objects; a node that knows no block transfer is asked again without.
-        Raises `SdoAborted`, `ReplyTimeout`, `Desync` or `ConnectionLost`.
+        Each node has one transfer at a time, in the order of the calls; nodes are served in parallel. A late reply is
+        never taken for the reply to a later request, even for the same object (see `late_replies`). A transfer without
+        a valid reply is repeated `retries` times. `block` is for long objects; if a node does not support block
+        transfer, the transfer is repeated without it. Raises `SdoAborted`, `ReplyTimeout`, `Desync` or
+        `ConnectionLost`.
         """
         timeout_ns = self._ns(node, timeout_s)
         again = self._retries.get(node, self._sdo_retries) if retries is None else retries
@@ -161,9 +163,10 @@ class CanopenMaster:
         block: bool = False,
         retries: int = 0,
     ) -> None:
-        """Write an object. As `sdo_upload`; after a `ReplyTimeout` the node may have taken the value or not.
+        """Write an object, with parameters and errors as `sdo_upload`.
 
-        So a write is repeated only where the caller says so: it may be a command.
+        After a `ReplyTimeout` the node may or may not have taken the value. A write may be a command, so it is repeated
+        only if the caller asks for it.
         """
         timeout_ns = self._ns(node, timeout_s)
         if block:
@@ -176,7 +179,7 @@ class CanopenMaster:
         await self._transfer(lambda: SdoDownload(node, index, subindex, timeout_ns, data), retries)
 
     async def nmt(self, command: NmtCommand, node: int) -> None:
-        """Send an NMT command to `node`, or to all (0). Unconfirmed: the node's heartbeat tells what came of it."""
+        """Send an NMT command to `node`, or to all (0). It is not confirmed: the node's heartbeat shows the result."""
         frame = nmt.command_frame(command, node)
         if command.boots:
             self._heartbeat.expect_boot_up(node)
@@ -188,17 +191,17 @@ class CanopenMaster:
         self.counters.frames_out += 1
 
     def listen(self, can_id: int, callback: PdoCallback) -> None:
-        """Call `callback` for each data frame of a service that is no node's: 7E4h (LSS). One callback an identifier."""
+        """Call `callback` for each data frame of a service that belongs to no node: 7E4h (LSS). One callback per identifier."""
         if can_id in self._services:
             raise UsageError("somebody listens to this identifier already", got=f"{can_id:X}h")
         self._services[can_id] = callback
 
     def subscribe_pdo(self, cob_id_: int, callback: PdoCallback) -> None:
-        """Call `callback` for each data frame with that CAN-ID. Raises `UsageError` for one that no PDO may have."""
+        """Call `callback` for each data frame with that CAN-ID. Raises `UsageError` for one that a PDO must not use."""
         self._pdos.setdefault(cob_id.check_pdo_cob_id(cob_id_), []).append(callback)
 
     def unsubscribe_pdo(self, cob_id_: int, callback: PdoCallback) -> None:
-        """Call `callback` no longer; nothing happens when it was not subscribed."""
+        """Stop calling `callback`. Nothing happens if it was not subscribed."""
         callbacks = [known for known in self._pdos.pop(cob_id_, []) if known != callback]
         if callbacks:
             self._pdos[cob_id_] = callbacks
@@ -208,7 +211,8 @@ class CanopenMaster:
     async def run(self) -> None:
         """Receive and dispatch until cancelled or until the connection is lost; raises `ConnectionLost` then.
 
-        Heartbeats are checked here too, at their deadlines. Transfers that wait when it ends fail with `ConnectionLost`.
+        Heartbeats are also checked here, at their deadlines. Transfers that wait when it ends fail with
+        `ConnectionLost`.
         """
         self._loop = asyncio.get_running_loop()
         self._stop(None)
@@ -226,7 +230,7 @@ class CanopenMaster:
             self._stop(reason)
 
     def _dispatch(self, frame: CanFrame) -> None:
-        """Give a frame to whom it concerns. Extended, remote and error frames are no CANopen of ours (CO-060)."""
+        """Pass a frame to its service. Extended, remote and error frames are not used by CANopen here (CO-060)."""
         self.counters.frames_in += 1
         if frame.extended or frame.remote or frame.error:
             self.counters.ignored += 1
@@ -244,7 +248,7 @@ class CanopenMaster:
             service(frame.data, t_ns)
         elif can_id == cob_id.SYNC:
             self.counters.ignored += 1
-            self.counters.foreign_syncs += 1  # our own are not received
+            self.counters.foreign_syncs += 1  # a node does not receive its own SYNCs
             self.on_sync(frame.data, t_ns)
         elif node == 0:
             self.counters.ignored += 1  # NMT and other broadcasts of another master
@@ -283,12 +287,12 @@ class CanopenMaster:
             if event.kind == "conflict":
                 self.conflicts[node] = conflict_text(event)
             self.on_event(event)
-        due_ns = self._heartbeat.deadline_ns(node)  # no other's is another than it was
+        due_ns = self._heartbeat.deadline_ns(node)  # the deadlines of other nodes have not changed
         if due_ns is not None and (self._timer is None or due_ns < self._timer_due_ns):
             self._arm()
 
     def _on_emcy(self, node: int, data: bytes, t_ns: int) -> None:
-        if len(data) < 2:  # not even a code (CO-053)
+        if len(data) < 2:  # too short for a code (CO-053)
             self.counters.ignored += 1
             return
         self.counters.emcys += 1
@@ -297,7 +301,7 @@ class CanopenMaster:
     # -- heartbeats that do not come ------------------------------------------------------------------------------
 
     def _arm(self) -> None:
-        """See to it that somebody looks at the next deadline, or earlier."""
+        """Set the timer so that the next heartbeat deadline is checked when it is due."""
         due_ns = self._heartbeat.next_deadline_ns()
         if self._loop is None or due_ns is None or (self._timer is not None and self._timer_due_ns <= due_ns):
             return
@@ -312,7 +316,7 @@ class CanopenMaster:
             self._timer = None
 
     def _on_deadline(self) -> None:
-        """Check as of what has been read: a heartbeat that waits unread behind others is not late."""
+        """Check heartbeats up to the time of the oldest unread frame: a heartbeat that waits to be read is not late."""
         self._timer = None
         unread = self._connection.inbound.data_stream
         now_ns = self._clock.monotonic_ns()

@@ -1,6 +1,6 @@
-"""NMT: commands, states, and the events that a master tells about its nodes (CiA 301, 7.2.8 and 7.3.2).
+"""NMT: commands, states, and the events that a master reports about its nodes (CiA 301, 7.2.8 and 7.3.2).
 
-Pure values; who sends and who receives is not known here.
+Pure values, without sending or receiving.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class NmtCommand(IntEnum):
 
     @property
     def boots(self) -> bool:
-        """Whether the node boots, and says so, after this command."""
+        """Return whether the node boots after this command and sends a boot-up message."""
         return self in (NmtCommand.RESET_NODE, NmtCommand.RESET_COMMUNICATION)
 
 
@@ -42,12 +42,12 @@ NodeEventKind = Literal["boot-up", "heartbeat-lost", "heartbeat-back", "state", 
 
 @dataclass(frozen=True, slots=True)
 class NodeEvent:
-    """Something happened to `node`.
+    """An event concerning `node`.
 
-    `state` is what is known after it (None: never heard). `data` is the frame's data where a frame caused it. `t_ns`
-    is monotonic. `unexpected` marks a boot-up that this master did not ask for, of a node that it had heard before:
-    the node restarted and has lost its configuration (CO-035). A ``conflict`` means that two nodes seem to share this
-    node id (CO-042): `data` is the second reply to one request, or the second boot-up; `first` the first reply, where known.
+    `state` is the state after it (None: never received). `data` is the frame's data if a frame caused it. `t_ns` is
+    monotonic. `unexpected` marks a boot-up that this master did not request, of a node that it had received before: the
+    node restarted and has lost its configuration (CO-035). A ``conflict`` means that two nodes seem to share this node
+    ID (CO-042): `data` is the second reply to one request, or the second boot-up; `first` is the first reply, if known.
     """
 
     node: int
@@ -60,7 +60,7 @@ class NodeEvent:
 
 
 def conflict_text(event: NodeEvent) -> str:
-    """A conflict in words: what came twice, and what that means."""
+    """Describe a conflict: which message was received twice, and what that means."""
     end = f"two nodes seem to have the id {event.node}"
     if len(event.data) != 8:
         return f"two boot-ups in a row: {end}"
@@ -73,16 +73,16 @@ def conflict_text(event: NodeEvent) -> str:
 
 
 def command_frame(command: NmtCommand, node: int) -> CanFrame:
-    """The NMT frame that tells `node` (0: all nodes) to do `command`."""
+    """Return the NMT frame with `command` for `node` (0: all nodes)."""
     if node != cob_id.ALL_NODES:
         cob_id.check_node(node)
     return CanFrame(cob_id.NMT, bytes([command, node]))
 
 
 def heartbeat_state(data: bytes) -> NmtState | None:
-    """The state in a heartbeat or boot-up message, or None where it is neither (CO-039).
+    """Return the state in a heartbeat or boot-up message, or None if it is neither (CO-039).
 
-    Bit 7 set is a node guarding reply or nothing known; a length other than 1 is not a heartbeat.
+    With bit 7 set it is a node guarding reply or unknown; with a length other than 1 it is not a heartbeat.
     """
     return _STATES.get(data[0]) if len(data) == 1 else None
 

@@ -1,6 +1,7 @@
-"""PDO mappings (CiA 301, 7.5.2.36 and 7.5.2.38): which objects lie where in the 8 bytes of a PDO.
+"""PDO mappings (CiA 301, 7.5.2.36 and 7.5.2.38): the positions of objects in the 8 bytes of a PDO.
 
-Pure: takes mapping entries as 1A00h-style values, cuts data into objects. Knows no data type: `datatypes` reads each.
+Pure: takes mapping entries as 1A00h-style values, cuts data into objects. It knows no data types; `datatypes` reads
+each object.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ MAX_ENTRIES = 64
 
 
 class PdoLengthMismatch(WireError):
-    """A PDO came with other than the number of bytes that its mapping says."""
+    """The number of bytes of a received PDO differs from that of its mapping."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +30,9 @@ class PdoEntry:
 
     @classmethod
     def from_word(cls, word: int) -> PdoEntry:
-        """From the UNSIGNED32 in the node: index in bits 31 to 16, subindex in 15 to 8, length in bits in 7 to 0."""
+        """Return the entry of an UNSIGNED32 in the node: index in bits 31 to 16, subindex in 15 to 8, length in bits in
+        7 to 0.
+        """
         return cls(word >> 16 & 0xFFFF, word >> 8 & 0xFF, word & 0xFF)
 
     @property
@@ -42,14 +45,16 @@ class PdoEntry:
 
 @dataclass(frozen=True, slots=True)
 class PdoMapping:
-    """Mapped objects in their order. At most 64 bits together; `UsageError` otherwise. `bits` are those of all of them, `length`
-    the bytes that the PDO has."""
+    """Mapped objects in order, at most 64 bits together; otherwise `UsageError`.
+
+    `bits` is the total number of bits, `length` the number of bytes of the PDO.
+    """
 
     entries: tuple[PdoEntry, ...]
     bits: int = field(init=False, repr=False, compare=False)
     length: int = field(init=False, repr=False, compare=False)
     _cuts: tuple[tuple[int, int, int], ...] = field(init=False, repr=False, compare=False)
-    """Where each object's bits begin, a mask of as many, and the bytes that they take."""
+    """For each object, the position of its first bit, a mask of its bits, and the number of bytes that it takes."""
 
     def __post_init__(self) -> None:
         starts = tuple(accumulate((entry.bits for entry in self.entries), initial=0))
@@ -65,7 +70,9 @@ class PdoMapping:
 
     @classmethod
     def from_words(cls, words: Iterable[int]) -> PdoMapping:
-        """From the entries 1 to n of a mapping record (1600h, 1A00h...). Raises `Desync`: it is the node that said so."""
+        """Return the mapping of entries 1 to n of a mapping record (1600h, 1A00h...). Raises `Desync`, since the node
+        supplied them.
+        """
         try:
             return cls(tuple(PdoEntry.from_word(word) for word in words))
         except UsageError as e:
@@ -73,14 +80,14 @@ class PdoMapping:
 
     @classmethod
     def of(cls, objects: Iterable[tuple[int, int, int]]) -> PdoMapping:
-        """From (index, subindex, bits)."""
+        """Return the mapping of (index, subindex, bits) tuples."""
         return cls(tuple(PdoEntry(*triple) for triple in objects))
 
     def unpack(self, data: bytes, *, exact: bool = False) -> tuple[bytes, ...]:
-        """The bytes of each object in order, little-endian, the last one padded with zero bits.
+        """Return the bytes of each object in order, little-endian, the last one padded with zero bits.
 
-        Raises `PdoLengthMismatch` when `data` is too short: nothing of it may be used (CO-043). Of one that is too
-        long the first bytes are used, as the standard says for receivers; `exact` refuses it too.
+        Raises `PdoLengthMismatch` if `data` is too short: none of it may be used (CO-043). If it is too long, the first
+        bytes are used, as the standard requires of receivers; `exact` refuses it too.
         """
         if len(data) < self.length or (exact and len(data) > self.length):
             raise PdoLengthMismatch(
@@ -90,7 +97,7 @@ class PdoMapping:
         return tuple([(word >> at & mask).to_bytes(size, "little") for at, mask, size in self._cuts])
 
     def pack(self, values: Sequence[bytes]) -> bytes:
-        """The PDO's data from the bytes of each object: the inverse of `unpack`."""
+        """Return the PDO's data from the bytes of each object: the inverse of `unpack`."""
         if len(values) != len(self.entries):
             raise UsageError(f"values for a PDO of {self}", expected=f"{len(self.entries)}", got=f"{len(values)}")
         word = shift = 0

@@ -1,6 +1,6 @@
-"""Who is on this bus: first listening for heartbeats, then asking every node id for its device type. Reads only.
+"""Scan the bus for nodes: first listen for heartbeats, then ask every node ID for its device type. Reads only.
 
-Paced, so that a plant that runs does not feel it: one request at a time, a pause between two.
+It sends one request at a time, with a pause in between, so that a running plant is not disturbed.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from fieldtwin.gateway.protocols.canopen.nmt import NmtState
 
 @dataclass(frozen=True, slots=True)
 class FoundNode:
-    """A node that is there.
+    """A node that was found.
 
-    `state` is from its heartbeat or boot-up, None where it sent none. `identity` is None where it gave none; `answers`
-    says whether it answers SDOs at all (a stopped node does not: CO-028).
+    `state` is from its heartbeat or boot-up, None if it sent none. `identity` is None if the node did not report one;
+    `answers` says whether it answers SDOs at all (a stopped node does not: CO-028).
     """
 
     node: int
@@ -41,9 +41,9 @@ async def scan_nodes(
     timeout_s: float = 0.1,
     on_progress: Callable[[int], None] | None = None,
 ) -> tuple[FoundNode, ...]:
-    """The nodes of the bus, by node id. `on_progress` is told each node id before it is asked.
+    """Return the nodes of the bus, by node ID. `on_progress` is called with each node ID before it is asked.
 
-    Takes `listen_s` and, of each node id that is not there, `timeout_s` and `pause_s`: 17 s for all with these defaults.
+    The scan takes `listen_s`, and `timeout_s` and `pause_s` for each absent node ID: 17 s for all with these defaults.
     Raises `ConnectionLost`.
     """
     await _pause(clock, listen_s)
@@ -60,7 +60,7 @@ async def scan_nodes(
 
 
 async def _ask(master: CanopenMaster, node: int, timeout_s: float) -> tuple[bool, Identity | None]:
-    """Whether the node answers, and its identity."""
+    """Return whether the node answers, and its identity."""
     try:
         await master.sdo_upload(node, DEVICE_TYPE, 0, timeout_s, retries=0)
     except ReplyTimeout:
@@ -68,7 +68,7 @@ async def _ask(master: CanopenMaster, node: int, timeout_s: float) -> tuple[bool
     except SdoAborted:
         return True, None
     except Desync:
-        return True, None  # it answers, and nonsense
+        return True, None  # it answers, but with an invalid reply
     try:
         return True, await read_identity(master, node)
     except (SdoAborted, ReplyTimeout, Desync, LengthMismatch):

@@ -1,13 +1,13 @@
 """The SDO client's transfers, expedited and segmented (CiA 301, 7.2.4.3.1 to 7.2.4.3.8 and 7.2.4.3.17).
 
-A transfer is a pure object: `start` gives the request, `feed` takes what came and gives what to do next, `expire` ends
-it when its time is over. It knows no bus, no clock and no other transfer; which replies may belong to an *earlier*
-transfer is the business of `late_replies`. Block transfers are in `sdo_block`.
+A transfer is a pure object: `start` returns the request, `feed` takes a received frame and returns the next step,
+`expire` ends the transfer when its time is over. It knows no bus, no clock and no other transfer; `late_replies`
+decides which replies may belong to an *earlier* transfer. Block transfers are in `sdo_block`.
 
-What is never paired with a request: a frame that is not 8 bytes (`tolerate_short` pads it: CO-026), of another COB-ID,
-remote, extended, or with another multiplexor (index and subindex). Such strays are counted, do not prolong the
-transfer, and end it when there are too many. Segments carry no multiplexor: there, anything that breaks the protocol
-aborts the transfer.
+These frames are never accepted as a reply: a frame that is not 8 bytes (`tolerate_short` pads it: CO-026), of another
+COB-ID, remote, extended, or with another multiplexor (index and subindex). Such strays are counted, do not prolong the
+transfer, and end it if there are too many. Segments carry no multiplexor, so during them any protocol violation aborts
+the transfer.
 """
 
 from __future__ import annotations
@@ -21,31 +21,31 @@ from fieldtwin.gateway.core.errors import Bug, Desync, FieldtwinError, ReplyTime
 from fieldtwin.gateway.protocols.canopen import abort_codes, cob_id
 
 MAX_BYTES = 1 << 20
-"""No object that a gateway reads is larger; a node that sends segments for ever is stopped here."""
+"""The largest object that a gateway reads; a node that never stops sending segments is stopped here."""
 
 WHOLE_TIMEOUTS = 10
 WHOLE_NS_PER_BYTE = 50_000_000
-"""A whole transfer takes at most this many of its timeouts, and this long for each byte that was moved. Without this limit
-a node that sends one byte just before each timeout would hold the client for days. A segment of 7 bytes takes 26 ms at
-10 kbit/s.
+"""Limit of a whole transfer: this many of its timeouts, and this many nanoseconds for each transferred byte. Without
+this limit a node that sends one byte just before each timeout would occupy the client for days. A segment of 7 bytes
+takes 26 ms at 10 kbit/s.
 """
 
 KNOWN_MAX_BYTES = 64
-"""Where the caller knows the size of the object: a reply that is too long is still told by its length up to here."""
+"""If the caller knows the object's size, a reply of up to this size is read, so that the error can report its length."""
 
 MAX_STRAYS = 64
-"""A node that floods its SDO channel with something else is given up on (CO-025)."""
+"""The number of stray frames on the SDO channel after which a transfer is given up (CO-025)."""
 
 _DOWNLOAD_SEGMENT_REPLY, _UPLOAD_SEGMENT_REPLY = 1, 0
 _UPLOAD_REPLY, _DOWNLOAD_REPLY = 2, 3
 
 ABORT = 0x80
-"""The whole first byte of an abort: its other bits are always 0 (7.2.4.3.17). 81h and more are last segments of blocks."""
+"""The whole first byte of an abort: its other bits are always 0 (7.2.4.3.17). 81h and above are last segments of blocks."""
 
 
 @dataclass(frozen=True, slots=True)
 class Send:
-    """The transfer goes on: send this. With `more`, `SdoTransfer.more` gives the next one to send at once."""
+    """Send this frame; the transfer continues. With `more`, `SdoTransfer.more` returns the next frame to send immediately."""
 
     frame: CanFrame
     more: bool = False
@@ -53,7 +53,7 @@ class Send:
 
 @dataclass(frozen=True, slots=True)
 class Wait:
-    """The frame carried the transfer on; nothing is to be sent yet."""
+    """The frame advanced the transfer; nothing is to be sent yet."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +66,7 @@ class Done:
 
 @dataclass(frozen=True, slots=True)
 class Failed:
-    """The transfer is over. `abort` is to be sent first, unless it was the node that aborted."""
+    """The transfer failed. `abort` is to be sent first, unless the node itself aborted."""
 
     error: FieldtwinError
     abort: CanFrame | None
@@ -83,15 +83,15 @@ Step = Send | Wait | Done | Failed | Stray
 
 
 class SdoTransfer(ABC):
-    """One transfer of one object with one node. Once it is over, everything that is fed is a stray.
+    """One transfer of one object with one node. After its end, every frame is a stray.
 
-    `timeout_ns` is for each reply and starts again with every reply that carries the transfer on (CO-022). The whole transfer is
-    limited by `WHOLE_TIMEOUTS` and `WHOLE_NS_PER_BYTE`.
-    `answered` tells whether the node has replied to the initiate request (or aborted).
+    `timeout_ns` is for each reply and starts again with every reply that advances the transfer (CO-022). The whole
+    transfer is limited by `WHOLE_TIMEOUTS` and `WHOLE_NS_PER_BYTE`. `answered` says whether the node has replied to the
+    initiate request (or aborted).
     """
 
     tolerate_short = False
-    """Whether a reply of fewer than 8 bytes is one that lacks zeros at its end, as old PLCs send them (CO-026)."""
+    """Whether a reply of fewer than 8 bytes is accepted and padded with zeros, because old PLCs omit them (CO-026)."""
 
     _reply: ClassVar[int]
     _segment_reply: ClassVar[int]
@@ -116,18 +116,18 @@ class SdoTransfer(ABC):
 
     @property
     def name(self) -> str:
-        """The object as people write it."""
+        """Return the object's name in the usual notation."""
         return f"SDO {self.index:04X}h:{self.subindex:02X}"
 
     def start(self, now_ns: int) -> CanFrame:
-        """The initiate request."""
+        """Return the initiate request."""
         self.deadline_ns = now_ns + self.timeout_ns
         self._started_ns = now_ns
         self.started = True
         return self._frame(self._request())
 
     def feed(self, frame: CanFrame, now_ns: int) -> Step:
-        """Take a frame that came at `now_ns`."""
+        """Handle a frame that arrived at `now_ns`, and return the next step."""
         if frame.can_id != cob_id.SDO_RESPONSE_BASE + self.node or frame.extended or frame.remote or frame.error:
             return self._stray("another identifier or kind of frame")
         data = frame.data.ljust(8, b"\0") if self.tolerate_short and frame.data else frame.data
@@ -146,21 +146,21 @@ class SdoTransfer(ABC):
         return self._go_on(self._on_next(data), now_ns)
 
     def more(self, now_ns: int) -> Send | None:
-        """What to send next without waiting for a reply, where the last `Send` said that there is more."""
+        """Return the next frame to send without waiting for a reply, if the last `Send` announced more."""
         return None
 
     @property
     def unmarked(self) -> bool:
-        """Whether what the node sends now may look like a reply that carries a multiplexor, and carries none."""
+        """Return whether frames of the node may now look like a reply with a multiplexor without having one."""
         return False
 
     @property
     def to_abort(self) -> bool:
-        """Whether the node has to be told when this transfer is left as it is: it may take the next request for a segment."""
+        """Return whether the node needs an abort if this transfer is abandoned: it may take the next request for a segment."""
         return self.answered and not self.over
 
     def expire(self, now_ns: int) -> Send | Failed | None:
-        """What to do when its reply is overdue at `now_ns`: as a rule, to end the transfer. None before that."""
+        """Return the step for a reply that is overdue at `now_ns`, which usually ends the transfer; None before that."""
         if self.over or now_ns < self.deadline_ns:
             return None
         if now_ns >= self._limit_ns:
@@ -168,7 +168,7 @@ class SdoTransfer(ABC):
         return self._recover(now_ns) or self._timed_out()
 
     def _recover(self, now_ns: int) -> Send | None:
-        """What may still help when nothing comes any more; None where nothing does."""
+        """Return a frame that may restart a stalled transfer, or None if there is no such frame."""
         return None
 
     def _timed_out(self) -> Failed:
@@ -182,7 +182,7 @@ class SdoTransfer(ABC):
         return Failed(error, self.abort_frame(abort_codes.TIMED_OUT))
 
     def abort_frame(self, code: int) -> CanFrame:
-        """The frame by which this client aborts the transfer."""
+        """Return the frame by which this client aborts the transfer."""
         return self._frame(b"\x80" + self._multiplexor + code.to_bytes(4, "little"))
 
     @abstractmethod
@@ -198,11 +198,11 @@ class SdoTransfer(ABC):
         return data[0] == ABORT
 
     def _is_reply(self, data: bytes) -> bool:
-        """Whether it is the reply to the initiate request, by its specifier; its multiplexor is ours."""
+        """Return whether `data`, whose multiplexor matches, is the reply to the initiate request, by its specifier."""
         return data[0] >> 5 == self._reply
 
     def _on_next(self, data: bytes) -> Step:
-        """Take what came after the reply to the initiate request."""
+        """Handle a frame after the reply to the initiate request."""
         specifier = data[0] >> 5
         if specifier == self._segment_reply:
             return self._on_segment_reply(data)
@@ -212,18 +212,18 @@ class SdoTransfer(ABC):
         return self._stray("a reply to another request")
 
     def _patience_ns(self) -> int:
-        """How long the next frame may take."""
+        """Return how long the next frame may take."""
         return self.timeout_ns
 
     @property
     def _limit_ns(self) -> int:
-        """When the whole transfer is given up."""
+        """Return when the whole transfer is given up."""
         return self._started_ns + WHOLE_TIMEOUTS * self.timeout_ns + self._moved * WHOLE_NS_PER_BYTE
 
     @property
     @abstractmethod
     def _moved(self) -> int:
-        """Bytes of the object that were moved so far."""
+        """Return the number of bytes of the object that were transferred so far."""
 
     def _frame(self, data: bytes) -> CanFrame:
         return CanFrame(cob_id.SDO_REQUEST_BASE + self.node, data.ljust(8, b"\0"))
@@ -247,13 +247,13 @@ class SdoTransfer(ABC):
         return Failed(SdoAborted(self.index, self.subindex, code, abort_codes.meaning(code)), None)
 
     def _break(self, code: int, why: str, data: bytes) -> Failed:
-        """Give up because of what the node sent; the abort tells it why."""
+        """Give up because of what the node sent; the abort tells it the reason."""
         self.over = True
         error = Desync(f"{self.name}: {why}; {abort_codes.meaning(code)}", got=data.hex(" "))
         return Failed(error, self.abort_frame(code))
 
     def _toggled(self, data: bytes) -> bool:
-        """Whether the toggle bit is the one that is due (7.2.4.3.3, CO-001); if so the next one is the other."""
+        """Return whether the toggle bit is as expected (7.2.4.3.3, CO-001); if so, expect the other one next."""
         if (data[0] >> 4) & 1 != self._toggle:
             return False
         self._toggle ^= 1
@@ -261,7 +261,7 @@ class SdoTransfer(ABC):
 
 
 class SdoUpload(SdoTransfer):
-    """Read an object. `length` is its size where the caller knows it: an expedited reply may leave it out (CO-029).
+    """Read an object. `length` is its size if the caller knows it: an expedited reply may omit it (CO-029).
 
     Without `length` such a reply gives all 4 bytes.
     """
@@ -307,7 +307,7 @@ class SdoUpload(SdoTransfer):
             return self._break(abort_codes.TOGGLE_NOT_ALTERNATED, "a segment twice or out of turn", data)
         last = data[0] & 0x01
         segment = data[1 : 8 - ((data[0] >> 1) & 7)]
-        if not segment and not last:  # would never come to an end
+        if not segment and not last:  # the transfer would never end
             return self._break(abort_codes.UNKNOWN_SPECIFIER, "a segment without data that is not the last", data)
         self._received += segment
         total, indicated = len(self._received), self._indicated
@@ -323,7 +323,7 @@ class SdoUpload(SdoTransfer):
 
 
 class SdoDownload(SdoTransfer):
-    """Write an object: 1 to 4 bytes expedited, anything else segmented (nothing at all is one empty segment, CO-030)."""
+    """Write an object: 1 to 4 bytes expedited, anything else segmented (an empty value is one empty segment, CO-030)."""
 
     _reply = _DOWNLOAD_REPLY
     _segment_reply = _DOWNLOAD_SEGMENT_REPLY

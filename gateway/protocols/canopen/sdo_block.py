@@ -1,17 +1,17 @@
 """SDO block transfers, both ways (CiA 301, 7.2.4.3.9 to 7.2.4.3.16): up to 127 segments for one acknowledgement.
 
-Pure, as `sdo`. Segments carry a sequence number and nothing else, so that a lost one is asked for again: the receiver
-acknowledges the last good one, and the rest is resent, renumbered from 1 (CO-016). Two things follow for what must never
-happen, a wrong object:
+Pure, as `sdo`. Segments carry only a sequence number, so that a lost one can be sent again: the receiver acknowledges
+the last good one, and the rest is resent, renumbered from 1 (CO-016). Two rules ensure that the result is never a wrong
+object:
 
-- When nothing more comes, what there is of a sub-block is acknowledged. Where that is nothing, the node may take it for
-  the answer to the sub-block before and send that again: only done once, and where the size that was announced
-  settles in the end whether it did.
-- We ask for at most 63 segments a block. Their first bytes then differ from those of a reply to an upload or of an
-  abort (01h to 3Fh and 81h to BFh against 40h to 7Fh and 80h), so that segments that come late, after the transfer was
-  given up, pass for no reply to a later request.
+- When no more segments arrive, the received part of a sub-block is acknowledged. If nothing was received, the node may
+  take that for the acknowledgement of the previous sub-block and send that again. So this is done only once, and only
+  if the announced size shows in the end whether the node did so.
+- The client requests at most 63 segments per block. Their first bytes then differ from those of a reply to an upload
+  or of an abort (01h to 3Fh and 81h to BFh against 40h to 7Fh and 80h), so that segments that arrive late, after the
+  transfer was given up, cannot be taken for a reply to a later request.
 
-Size and CRC settle the rest in the end.
+Finally, size and CRC are checked.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from fieldtwin.gateway.protocols.canopen.sdo import MAX_BYTES, Done, SdoDownload
 UPLOAD_BLOCK = 63
 BLOCK_MAX = 127
 MAX_REPEATS = 8
-"""So often in a row a sub-block may bring nothing before the transfer is given up."""
+"""The number of consecutive sub-blocks without a new segment after which the transfer is given up."""
 
 _LAST = 0x80
 _UPLOAD_REPLY, _DOWNLOAD_REPLY = 6, 5
@@ -35,15 +35,15 @@ _SEGMENT = 7
 
 
 def crc16(data: bytes) -> int:
-    """The CRC of a block transfer (7.2.4.3.16): x^16 + x^12 + x^5 + 1, from 0. 31C3h for ``123456789``."""
+    """Return the CRC of a block transfer (7.2.4.3.16): x^16 + x^12 + x^5 + 1, from 0. 31C3h for ``123456789``."""
     return crc_hqx(data, 0)
 
 
 class SdoBlockUpload(SdoUpload):
-    """Read an object in blocks. A node that answers with a plain upload instead is followed (CO-021).
+    """Read an object in blocks. If a node answers with a plain upload instead, that is used (CO-021).
 
-    `block` segments a block (1 to 127; more than 63 gives up what the module says of late segments). `switch_bytes`
-    is the protocol switch threshold, 0 where the node shall not switch.
+    `block` is the number of segments per block (1 to 127; with more than 63, late segments may be mistaken for replies,
+    see the module). `switch_bytes` is the protocol switch threshold, 0 if the node must not switch.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class SdoBlockUpload(SdoUpload):
         self._in_blocks = False
         self._crc = False
         self._good = 0  # of the present sub-block
-        self._surplus = 0  # segments in a row that were not the one due
+        self._surplus = 0  # consecutive segments that were not the one expected
         self._repeats = 0
         self._nudged = False
         self._last_seen = False
@@ -103,7 +103,7 @@ class SdoBlockUpload(SdoUpload):
         number, last = data[0] & 0x7F, bool(data[0] & _LAST)
         if not 1 <= number <= self._block:
             return self._break(abort_codes.INVALID_SEQUENCE, f"segment {number} of {self._block}", data)
-        if number != self._good + 1:  # one was lost, or an old one comes again: nothing is taken before the one due
+        if number != self._good + 1:  # one was lost, or an old one is repeated: only the expected segment is taken
             self._surplus += 1
             if self._surplus > 2 * BLOCK_MAX:
                 return self._break(abort_codes.INVALID_SEQUENCE, "segments, and never the one that is due", data)
@@ -116,7 +116,7 @@ class SdoBlockUpload(SdoUpload):
         return self._acknowledge() if last or number == self._block else Wait()
 
     def _again(self, data: bytes) -> Step:
-        """The sub-block is at its end and something of it is missing."""
+        """Acknowledge at the end of a sub-block of which a part is missing."""
         self._repeats += not self._good
         if self._repeats > MAX_REPEATS:
             return self._break(abort_codes.INVALID_SEQUENCE, "blocks that bring nothing", data)
@@ -141,7 +141,7 @@ class SdoBlockUpload(SdoUpload):
         return Done(value, self._frame(bytes([0xA0 | _END])))
 
     def _patience_ns(self) -> int:
-        """Among segments half the time: what was lost is asked for before the node gives up on us."""
+        """Return half the timeout among segments, so that lost segments are requested before the node gives up."""
         return self.timeout_ns // 2 if self._may_recover() else self.timeout_ns
 
     def _may_recover(self) -> bool:
@@ -149,7 +149,7 @@ class SdoBlockUpload(SdoUpload):
         return self._in_blocks and not self._last_seen and safe
 
     def _recover(self, now_ns: int) -> Send | None:
-        """The last segments of a sub-block were lost (CO-017): acknowledge what there is."""
+        """Acknowledge what has arrived, because the last segments of a sub-block were lost (CO-017)."""
         if not self._may_recover():
             return None
         self._nudged = not self._good
@@ -159,13 +159,13 @@ class SdoBlockUpload(SdoUpload):
 
 
 class SdoBlockDownload(SdoDownload):
-    """Write an object in blocks, of the size that the node asks for. An early acknowledgement is taken (CO-018)."""
+    """Write an object in blocks of the size that the node requests. An early acknowledgement is accepted (CO-018)."""
 
     def __init__(self, node: int, index: int, subindex: int, timeout_ns: int, data: bytes) -> None:
         super().__init__(node, index, subindex, timeout_ns, data)
         self._segments = max(1, -(-len(self._data) // _SEGMENT))
         self._block = 0
-        self._done = 0  # segments of sub-blocks before this one
+        self._done = 0  # segments of earlier sub-blocks
         self._in_block = 0  # segments of this sub-block that were sent
         self._crc = False
         self._repeats = 0
@@ -238,7 +238,7 @@ class SdoBlockDownload(SdoDownload):
         return Send(self._frame(bytes([0xC0 | unused << 2 | _END]) + crc.to_bytes(2, "little")))
 
     def _recover(self, now_ns: int) -> Send | None:
-        """The last segment of the sub-block may be lost, and the node waits for it (CO-017): once more, once."""
+        """Send the last segment of the sub-block again, once: it may be lost, and the node waits for it (CO-017)."""
         if not self.answered or self._done == self._segments or self._resent:
             return None
         self._resent = True

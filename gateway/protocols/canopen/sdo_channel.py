@@ -1,7 +1,8 @@
-"""One node's default SDO channel: one transfer at a time, and no reply paired with a request that it does not answer.
+"""One node's default SDO channel: one transfer at a time, and a reply is never paired with a request that it does not
+answer.
 
-Between the pure transfers (`sdo`), the bookkeeping of late replies (`late_replies`) and the master, which owns the bus
-and delivers what comes on 580h + node id. It decides nothing about objects.
+It connects the pure transfers (`sdo`), the tracking of late replies (`late_replies`) and the master, which owns the bus
+and delivers the frames on 580h + node ID. It knows nothing about the objects transferred.
 """
 
 from __future__ import annotations
@@ -21,25 +22,26 @@ from fieldtwin.gateway.protocols.canopen.late_replies import LateReplies, Multip
 from fieldtwin.gateway.protocols.canopen.sdo import ABORT, Done, Failed, SdoTransfer, SdoUpload, Send, Step, Stray, Wait
 
 MAX_ANSWERS = 16
-"""Answered requests of one node that a second reply is compared with."""
+"""The number of answered requests of one node whose replies are kept, to detect a second reply."""
 
 MAX_INBOX = 128
-"""Frames that wait for the transfer's task; a flood beyond that is dropped and counted."""
+"""The number of frames that may wait for the transfer's task; more are dropped and counted."""
 
 
 class NodeRestarted(ReplyTimeout):
-    """The node booted during a transfer: its reply will never come. What is to be done again can be done at once."""
+    """The node booted during a transfer, so its reply will never arrive. The transfer may be repeated immediately."""
 
 
 @dataclass(slots=True)
 class Counters:
-    """What a master has seen and done since it was made.
+    """Counters of a master since it was created.
 
     Requests and replies are counted in frames, as a bus analyser would: each initiate and each segment that is sent,
-    each reply that carried a transfer on or ended it. Aborts that the node sent are in `sdo_aborts` only, aborts that
-    the master sent in `frames_out` only. `sdo_timeouts` are requests that got no reply, `sdo_retries` transfers that
-    were begun again; `sdo_probes` are the transfers made to get past late replies. `ignored` are frames that were for nobody.
-    `foreign_sdo_requests` are the SDO requests of other clients on the bus, and `foreign_syncs` the SYNCs of other producers.
+    each reply that advanced or ended a transfer. Aborts sent by the node count in `sdo_aborts` only, aborts sent by the
+    master in `frames_out` only. `sdo_timeouts` counts requests without a reply, `sdo_retries` repeated transfers,
+    `sdo_probes` the transfers made to get past late replies, and `ignored` frames that no service used.
+    `foreign_sdo_requests` counts SDO requests of other clients on the bus, and `foreign_syncs` the SYNCs of other
+    producers.
     """
 
     frames_in: int = 0
@@ -59,22 +61,24 @@ class Counters:
 
 
 def is_final(data: bytes) -> bool:
-    """Whether an SDO reply leaves no transfer open in the node: an abort, or an expedited upload's reply."""
+    """Return whether an SDO reply leaves no transfer open in the node: an abort, or an expedited upload's reply."""
     return len(data) == 8 and (data[0] == ABORT or (data[0] >> 5 == 2 and bool(data[0] & 0x02)))
 
 
 def has_multiplexor(data: bytes) -> bool:
-    """Whether an SDO reply carries one: replies to initiate requests and aborts. Segments look like anything."""
+    """Return whether an SDO reply carries a multiplexor: replies to initiate requests and aborts do. Segments may look
+    like either.
+    """
     return data[0] == ABORT or data[0] >> 5 in (2, 3) or (data[0] >> 5 in (5, 6) and not data[0] & 3)
 
 
 def multiplexor_of(data: bytes) -> Multiplexor:
-    """Index and subindex of an SDO that carries them."""
+    """Return index and subindex of an SDO that carries them."""
     return int.from_bytes(data[1:3], "little"), data[3]
 
 
 class SdoChannel:
-    """The client's end of one channel. `deliver` is called by the bus's reader, `run` by whoever wants an object."""
+    """The client's end of one channel. The bus's reader calls `deliver`; code that accesses an object calls `run`."""
 
     def __init__(
         self,
@@ -96,21 +100,22 @@ class SdoChannel:
         self._arrived = asyncio.Event()
         self._lost: ConnectionLost | None = None
         self._answers: dict[Multiplexor, bytes] = {}
-        """The last reply to each of the last requests, oldest first: a second reply to one of them is another node's."""
+        """The last reply to each of the last requests, oldest first: a second reply to one of them comes from another node."""
         self._foreign: dict[Multiplexor, None] = {}
-        """What other clients asked this node for: the replies are theirs."""
+        """Requests of other clients to this node, whose replies are not for this client."""
         self._reply = b""
         self.first_reply = b""
-        """The reply that the last repeated one was compared with; 8 bytes, or none where it is not known."""
+        """The first of two conflicting replies, with 8 bytes; empty if it is not known."""
         self._owed: CanFrame | None = None
         self._rebooted = False
         self._began_ambiguous = False
-        """Whether replies to earlier requests for the same object could still come when the present transfer began."""
+        """Whether replies to earlier requests for the same object could still arrive when the present transfer began."""
 
     def deliver(self, frame: CanFrame) -> bool:
-        """A frame came from the node. True when it answers what was answered before (CO-042): two nodes share the id.
+        """Take a frame of the node. Return True if it repeats an answer (CO-042): two nodes then share the node ID.
 
-        The reply to another client on the same SDO channel is no such answer, since its request was seen (`foreign_request`).
+        A reply to another client on the same SDO channel is not a repeated answer if that client's request was seen
+        (`foreign_request`).
         """
         active = self._active
         repeated = self._is_foreign(frame, active)
@@ -122,7 +127,7 @@ class SdoChannel:
         return repeated
 
     def foreign_request(self, frame: CanFrame) -> None:
-        """Another client asked the node for something: its reply is not a second one to a request of ours."""
+        """Note a request of another client to the node: its reply is not a second reply to one of our requests."""
         self._counters.foreign_sdo_requests += 1
         if len(frame.data) == 8 and frame.data[0] >> 5 in (1, 2, 5, 6):  # not the segments of a transfer
             if len(self._foreign) >= MAX_ANSWERS:
@@ -130,12 +135,14 @@ class SdoChannel:
             self._foreign[multiplexor_of(frame.data)] = None
 
     def lose(self, error: ConnectionLost | None) -> None:
-        """Nobody reads the bus any more (None: again): what waits fails now, what comes later at once."""
+        """Note that the bus is no longer read (None: that it is read again). Waiting transfers, and later ones, fail
+        immediately.
+        """
         self._lost = error
         self._arrived.set()
 
     def on_boot_up(self) -> None:
-        """The node booted: what it owed, it will never send, and a transfer under way ends now."""
+        """Note that the node booted: no outstanding reply will arrive, and a transfer in progress ends now."""
         self._late.settle()
         self._answers.clear()
         self._foreign.clear()
@@ -145,13 +152,13 @@ class SdoChannel:
             self._arrived.set()
 
     async def run(self, transfer: SdoTransfer) -> bytes:
-        """Do `transfer` when its turn comes. Raises `SdoAborted`, `ReplyTimeout`, `Desync` or `ConnectionLost`."""
+        """Do `transfer` after those before it. Raises `SdoAborted`, `ReplyTimeout`, `Desync` or `ConnectionLost`."""
         async with self._turn:
             await self._settle(transfer)
             return await self._run(transfer)
 
     async def _settle(self, transfer: SdoTransfer) -> None:
-        """Make sure that no late reply can pass for one to `transfer` (see `late_replies`)."""
+        """Make sure that no late reply can be taken for one to `transfer` (see `late_replies`)."""
         wanted = (transfer.index, transfer.subindex)
         if not self._late.is_ambiguous(wanted):
             return
@@ -160,7 +167,7 @@ class SdoChannel:
         try:
             await self._run(SdoUpload(self._node, index, subindex, transfer.timeout_ns))
         except (SdoAborted, NodeRestarted):
-            pass  # an answer, which is all that was wanted, or nothing to wait for any more
+            pass  # an answer, which is all that is needed, or no reply can arrive any more
         except ReplyTimeout as e:
             hint = (
                 f"an earlier request for {transfer.name} is unanswered, so {index:04X}h:{subindex:02X} was asked first"
@@ -170,7 +177,7 @@ class SdoChannel:
             raise ReplyTimeout(f"{transfer.name}: an earlier reply is still outstanding")
 
     async def _run(self, transfer: SdoTransfer) -> bytes:
-        """Drive one transfer to its end, leaving on record whether its answer may still come."""
+        """Drive one transfer to its end, and note whether its reply may still arrive."""
         if self._lost is not None:
             raise self._again(self._lost)
         request, complete = (transfer.index, transfer.subindex), False
@@ -193,7 +200,7 @@ class SdoChannel:
             self._active = None
             self._counters.ignored += len(self._inbox)
             self._inbox.clear()
-            if not self._rebooted:  # else nothing can be on its way, and there is nothing to abort
+            if not self._rebooted:  # after a reboot no reply can arrive, and there is nothing to abort
                 other_expected = transfer.answered and self._late.answered(request)
                 if not complete or other_expected:
                     self._late.unanswered(request)
@@ -205,12 +212,12 @@ class SdoChannel:
         self._answers[request] = self._reply
 
     def _owe(self, transfer: SdoTransfer) -> None:
-        """`transfer` is left as it is (cancelled, or the bus takes no frames): the node has to be told later."""
+        """Keep the abort of an abandoned `transfer` (cancelled, or the bus accepts no frames), to send it later."""
         if transfer.to_abort:
             self._owed = transfer.abort_frame(abort_codes.GENERAL_ERROR)
 
     async def _tell_owed(self, transfer: SdoTransfer) -> None:
-        """An earlier transfer was left as it was: the node might take our request for one of its segments."""
+        """Send the abort of an earlier abandoned transfer; else the node might take our request for one of its segments."""
         if self._owed is not None:
             try:
                 async with asyncio.timeout(transfer.timeout_ns / NS_PER_S):
@@ -238,8 +245,8 @@ class SdoChannel:
             step = await self._next_step(transfer)
 
     async def _after_send(self, transfer: SdoTransfer) -> Step | None:
-        """The next frame of several, unless the node has something to say meanwhile (CO-018)."""
-        await asyncio.sleep(0)  # a bus that takes frames at once would otherwise let nobody read
+        """Return the next frame of several, unless a frame of the node waits to be handled (CO-018)."""
+        await asyncio.sleep(0)  # else a bus that accepts frames immediately would never let the reader run
         return None if self._inbox else transfer.more(self._clock.monotonic_ns())
 
     async def _next_step(self, transfer: SdoTransfer) -> Step | None:
@@ -252,13 +259,13 @@ class SdoChannel:
             self._reply = frame.data
         if isinstance(step, Send | Wait | Done):
             self._counters.sdo_replies += 1
-        if isinstance(step, Stray):  # no answer: what was being sent goes on
+        if isinstance(step, Stray):  # not a reply: continue sending
             self._counters.ignored += 1
             return transfer.more(self._clock.monotonic_ns())
         return step
 
     async def _request(self, frame: CanFrame, transfer: SdoTransfer) -> None:
-        """Send within the time of the reply: a transmit queue that never empties must not block for ever (CO-063)."""
+        """Send within the reply timeout: a transmit queue that never empties must not block forever (CO-063)."""
         self._counters.sdo_requests += 1
         try:
             async with asyncio.timeout(self._left_s(transfer)):
@@ -270,14 +277,14 @@ class SdoChannel:
             raise ReplyTimeout(f"{transfer.name}: the request could not be sent", hint="the bus takes no frames") from e
 
     async def _confirm(self, last: CanFrame | None, transfer: SdoTransfer) -> None:
-        """The node has said all; that it hears so is a courtesy, and the value is good without it."""
+        """Send the final confirmation. The node has sent everything, so the value is valid even if this fails."""
         if last is not None:
             with suppress(TimeoutError):
                 async with asyncio.timeout(transfer.timeout_ns / NS_PER_S):
                     await self._send(last)
 
     async def _fail(self, failed: Failed, transfer: SdoTransfer) -> None:
-        """Tell the node why, if it was us who gave up, and raise."""
+        """Send the abort, unless the node aborted, and raise the error."""
         if isinstance(failed.error, SdoAborted):
             self._counters.sdo_aborts += 1
         if failed.abort is not None:
@@ -285,11 +292,11 @@ class SdoChannel:
                 async with asyncio.timeout(transfer.timeout_ns / NS_PER_S):
                     await self._send(failed.abort)
             except TimeoutError:
-                self._owed = failed.abort  # before the next request
+                self._owed = failed.abort  # sent before the next request
         raise failed.error
 
     async def _next_frame(self, transfer: SdoTransfer) -> CanFrame | None:
-        """The next frame for the transfer, None when its reply is overdue."""
+        """Return the next frame for the transfer, or None if its reply is overdue."""
         while not self._inbox:
             if self._lost is not None:
                 raise self._again(self._lost)
@@ -311,13 +318,13 @@ class SdoChannel:
         return (transfer.deadline_ns - self._clock.monotonic_ns()) / NS_PER_S
 
     def _is_foreign(self, frame: CanFrame, active: SdoTransfer | None) -> bool:
-        """Put a reply that answers no present request on record; True when it answers once more what was answered."""
+        """Note a reply that does not answer the present request; return True if it answers an answered request again."""
         if len(frame.data) != 8 or not has_multiplexor(frame.data) or (active is not None and active.unmarked):
             return False
         request = multiplexor_of(frame.data)
         if active is not None and (active.index, active.subindex) == request:
             if self._began_ambiguous:
-                return False  # after a stall the replies to earlier requests come all at once
+                return False  # after a stall, the replies to earlier requests arrive together
             waiting = next((f for f in self._inbox if f.data[:4] == frame.data[:4]), None)
             self.first_reply = b"" if waiting is None else waiting.data
             return waiting is not None
@@ -328,10 +335,10 @@ class SdoChannel:
             if is_final(frame.data):
                 self._late.answered(request)
             return False
-        first = self._answers.pop(request, None)  # told once an answer
+        first = self._answers.pop(request, None)  # reported once per answer
         self.first_reply = first or b""
         return first is not None
 
     def _again(self, lost: ConnectionLost) -> ConnectionLost:
-        """A fresh error for each caller: one instance would collect all their tracebacks."""
+        """Return a new error for each caller: one instance would collect all their tracebacks."""
         return ConnectionLost(lost.message, where=lost.where)

@@ -1,7 +1,7 @@
-"""The SYNC and TIME producers (CiA 301, 7.2.5 and 7.2.6): when which frame is due.
+"""The SYNC and TIME producers (CiA 301, 7.2.5 and 7.2.6), which say when each frame is due.
 
-Pure: `now` in, frames out. A period is kept on the average however late somebody looks; what was missed is skipped and
-counted, never made up for in a burst.
+Pure: `now` in, frames out. The average period is kept even if `due` is called late; missed frames are skipped and
+counted, never sent in a burst.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from fieldtwin.gateway.protocols.canopen import cob_id
 NS_PER_US = 1_000
 _DAY_NS = 24 * 3600 * NS_PER_S
 _DAYS_TO_1984 = 5113
-"""1970-01-01 to 1984-01-01, the first day of TIME_OF_DAY (7.1.6.5)."""
+"""Days from 1970-01-01 to 1984-01-01, the first day of TIME_OF_DAY (7.1.6.5)."""
 COUNTER_MAX = 240
 
 
 class Producer(Protocol):
-    """Something that is due again and again."""
+    """A producer of periodic frames."""
 
     name: str
     period_ns: int
@@ -29,7 +29,7 @@ class Producer(Protocol):
     missed: int
 
     def due(self, now_ns: int, utc_ns: int) -> CanFrame | None:
-        """The frame to send at `now_ns`, None when it is too early."""
+        """Return the frame to send at `now_ns`, or None if it is too early."""
         ...
 
 
@@ -57,7 +57,7 @@ class _Periodic:
 class SyncProducer(_Periodic):
     """SYNC each `period_us` (1006h). `overflow` is the counter's highest value (1019h): 2 to 240, 0 for no counter.
 
-    The counter begins with 1 and goes by SYNCs that were sent.
+    The counter begins with 1 and counts the SYNCs that were sent.
     """
 
     name = "SYNC"
@@ -93,13 +93,13 @@ class TimeProducer(_Periodic):
             return None
         try:
             return CanFrame(self._can_id, time_of_day(utc_ns))
-        except UsageError:  # a computer that woke up in 1970: a bus must not end with that
+        except UsageError:  # the host's clock starts in 1970: that must not stop the bus
             self.sent, self.missed = self.sent - 1, self.missed + 1
             return None
 
 
 def time_of_day(utc_ns: int) -> bytes:
-    """TIME_OF_DAY (7.1.6.5): milliseconds since midnight in 28 bits, four reserved, days since 1984-01-01 in 16."""
+    """Return TIME_OF_DAY (7.1.6.5): milliseconds since midnight in 28 bits, four reserved, days since 1984-01-01 in 16."""
     days, rest_ns = divmod(utc_ns, _DAY_NS)
     since = days - _DAYS_TO_1984
     if not 0 <= since <= 0xFFFF:

@@ -1,9 +1,10 @@
-"""Whether more than one producer sends SYNC on a bus (CiA 301, 7.2.5: there is one).
+"""Detect whether more than one producer sends SYNC on a bus (CiA 301, 7.2.5 allows one).
 
-All SYNCs have one identifier, so that nothing in a frame names its producer. A second one shows by a SYNC that arrives while we
-produce it ourselves, by counters (1019h) that are out of order, by intervals that are short and long in turn, or by SYNCs that
-come more often than the communication cycle period (1006h) says. Where that period is not known, two producers without counters
-whose SYNCs are evenly spaced look like one producer with half the period; listening cannot tell them apart. Pure.
+All SYNCs have one identifier, so a frame does not name its producer. A second producer is detected by a SYNC that
+arrives while this master produces SYNC, by counters (1019h) that are out of order, by intervals that are alternately
+short and long, or by SYNCs that are more frequent than the communication cycle period (1006h) allows. If that period is
+not known, two producers without counters whose SYNCs are evenly spaced look like one producer with half the period;
+listening cannot tell them apart. Pure.
 """
 
 from __future__ import annotations
@@ -13,18 +14,21 @@ from collections import deque
 from fieldtwin.gateway.core.clock import NS_PER_MS
 
 _INTERVALS = 16
-"""Intervals that are compared: enough that a few late frames do not matter."""
+"""The number of intervals that are compared: enough that a few late frames do not matter."""
 _APART = 2.0
-"""How much longer the long quarter of the intervals is than the short one, of two producers."""
+"""With two producers, the ratio of the long to the short quarter of the intervals."""
 _TOO_OFTEN = 1.5
-"""How many SYNCs come in one communication cycle, of two producers: 2, less what clocks and a busy bus take away."""
+"""With two producers, the SYNCs in one communication cycle: 2, with a margin for clocks and a busy bus."""
 _OUT_OF_ORDER = 3
-"""Counters out of order: a producer that restarted makes one."""
+"""The number of counters out of order that prove a second producer: a producer that restarted causes one."""
 
 
 class SyncWatch:
-    """Feed it each SYNC that was received. `own`: this master produces SYNC, so that any other producer is one too many.
-    `period_ns`: the communication cycle period, 0 where it is not known."""
+    """Detects a second SYNC producer; `feed` it each received SYNC.
+
+    `own` says that this master produces SYNC, so that any other producer is a second one. `period_ns` is the
+    communication cycle period, 0 if it is not known.
+    """
 
     def __init__(self, *, own: bool = False, period_ns: int = 0) -> None:
         self._own = own
@@ -35,16 +39,16 @@ class SyncWatch:
         self._intervals: deque[int] = deque(maxlen=_INTERVALS)
         self.seen = 0
         self.verdict = ""
-        """Why there is more than one producer, in words; empty while there is no sign of a second one. It stays once found."""
+        """Why there seems to be a second producer, as text; empty while there is no sign of one. Once set, it stays."""
 
     def feed(self, data: bytes, t_ns: int) -> None:
-        """A SYNC came at `t_ns`; `data` is empty, or its counter."""
+        """Note a SYNC that arrived at `t_ns`; `data` is empty, or its counter."""
         self.seen += 1
         if self._last_ns is not None:
             self._intervals.append(t_ns - self._last_ns)
         self._last_ns = t_ns
         if len(data) == 1:
-            expected = (0, self._last_counter + 1, 1)  # unknown, next, or begun again
+            expected = (0, self._last_counter + 1, 1)  # unknown, next, or restarted
             if self._last_counter and data[0] not in expected:
                 self._jumps += 1
             self._last_counter = data[0]
@@ -65,7 +69,7 @@ class SyncWatch:
         return f"SYNC comes at intervals of {times} in turn: there seem to be two producers"
 
     def _too_often(self) -> str:
-        """SYNC comes at even intervals; whether they are shorter than the cycle."""
+        """Check whether SYNCs at even intervals are more frequent than the cycle period allows."""
         mean_ns = sum(self._intervals) / len(self._intervals)
         if not self._period_ns or mean_ns <= 0 or self._period_ns / mean_ns < _TOO_OFTEN:
             return ""

@@ -1,4 +1,4 @@
-"""Frames of a trace as words: what was asked of whom, what was answered, and which tags it moved.
+"""Decode the frames of a trace into words: the requests, the replies, and the tags that they carried.
 
-Reads traces and names; it must never know how a run is made, and it opens nothing. `Decoder` is the door.
+It reads traces and names; it must not depend on how a run is made, and it opens nothing. `Decoder` is the entry point.
 """

@@ -1,6 +1,7 @@
-"""One CAN bus of a trace as CANopen: frames in, words and exchanges out (CiA 301, CiA 305).
+"""Decode one CAN bus of a trace as CANopen: frames in, words and exchanges out (CiA 301, CiA 305).
 
-Identifiers are those of the pre-defined connection set, but for PDOs, whose are learnt (see `node_map`). No clock.
+Identifiers are those of the pre-defined connection set, except for PDOs, whose identifiers are learnt (see `node_map`).
+No clock.
 """
 
 from __future__ import annotations
@@ -72,7 +73,7 @@ class CanopenWire:
         return f"{frame}: no identifier of CANopen", []
 
     def finish(self) -> list[Exchange]:
-        """Nothing follows: what is still awaited has no answer."""
+        """Conclude the trace: requests that still wait have no answer."""
         dropped = [(node, watch.drop()) for node, watch in self._sdo.items()]
         return [self._transferred(node, t, t.t_ns, "no reply") for node, t in dropped if t] + self._lss.finish()
 
@@ -81,7 +82,7 @@ class CanopenWire:
         open_ = [(node, watch.open) for node, watch in self._sdo.items()]
         return [self._transferred(node, t, t.t_ns, "pending") for node, t in open_ if t] + self._lss.pending()
 
-    # -- what nobody answers --------------------------------------------------------------------------------------------
+    # -- unanswered messages -------------------------------------------------------------------------------------------
 
     def _message(
         self,
@@ -177,7 +178,7 @@ class CanopenWire:
         if seen.stray:
             done.append(self._stray(node, seen.text, data, t_ns))
             return done[-1].text, done
-        opened = watch.open  # of its segments nothing is said but that they came, and of a secret's not even which
+        opened = watch.open  # its segments are only reported as received, and those of a secret without their content
         hidden = opened is not None and self._secrets(node, (_span(opened),))
         return f"{self._called(node)}: {seen.text}" + (f" {SECRET}" if hidden else ""), done
 

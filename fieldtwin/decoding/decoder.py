@@ -28,8 +28,11 @@ from fieldtwin.twin.site.system import System
 
 
 class Decoder:
-    """Decodes one trace, whose events are fed in order. `served` are buses on which the far end asks. `framings` says what is
-    spoken on wires that are no bus of `system`: rtu, ascii, mbap, udp or can; nothing there has a name."""
+    """A decoder of one trace, whose events are fed in order.
+
+    `served` are buses on which the remote client sends requests. `framings` states the protocol on endpoints that are
+    not a bus of `system`: rtu, ascii, mbap, udp or can; nothing there has a name.
+    """
 
     def __init__(
         self, system: System | None, served: Collection[str] = (), framings: Mapping[str, str] | None = None
@@ -56,7 +59,7 @@ class Decoder:
         return self._frame(event)[1] if event.kind is Kind.FRAME else []
 
     def finish(self) -> list[Exchange]:
-        """Nothing follows: what is still awaited has no answer."""
+        """Conclude the trace: requests that still wait have no answer."""
         wires: list[ModbusWire | CanopenWire] = [*self._modbus.values(), *self._canopen.values()]
         return sorted((e for wire in wires for e in wire.finish()), key=lambda e: e.t_ns)
 
@@ -141,9 +144,9 @@ def exchanges(system: System, events: Iterable[Event], served: Collection[str] =
 
 
 def frame_events(captured: Iterable[Captured], system: System, start_ns: int = 0) -> list[Event]:
-    """What a tap saw (`fieldtwin run --capture`) as FRAME events; `start_ns` is the tap's time of the run's start.
+    """Return the content of a tap (`fieldtwin run --capture`) as FRAME events.
 
-    Endpoints that are no bus's of the system are left out.
+    `start_ns` is the tap's time of the run's start. Endpoints that do not belong to a bus of the system are omitted.
     """
     buses = {str(bus.endpoint): name for name, bus in system.buses.items()}
     found = []

@@ -12,7 +12,7 @@ from fieldtwin.gateway.core.profile import RegisterRange, Table
 from fieldtwin.gateway.core.values import Scalar
 
 SECRET = "(secret)"
-"""What is shown of a tag that nobody is to see."""
+"""The replacement for a secret tag's value."""
 
 Access = Literal["read", "write"]
 
@@ -43,19 +43,20 @@ class Span:
 
 @dataclass(frozen=True, slots=True)
 class Exchange:
-    """A request and its answer on a bus, or a message that nobody answers (broadcast, heartbeat, PDO).
+    """A request and its answer on a bus, or a message that has no answer (broadcast, heartbeat, PDO).
 
-    `unit` is the Modbus unit or CANopen node id (0: all), `device` the system's name of it, "" where it has none.
-    `function` is the Modbus function code, 0 on CANopen; `service` is what is done, in words, and the same for all of a
+    `unit` is the Modbus unit ID or CANopen node ID (0: all), `device` the system's name of it, "" where it has none.
+    `function` is the Modbus function code, 0 on CANopen; `service` is the operation in words, the same for all of a
     kind: ``read holding registers``, ``SDO upload``, ``TPDO1``. `tags` are the values that the exchange carried, in
-    engineering units, None for those that were only asked for; `registers` the words, or for bits 0 and 1.
+    engineering units, None for those that were requested but not returned; `registers` the words, or for bits 0 and 1.
 
-    `problem` says why there is no good answer, "" where there is: ``no reply``, ``check sum``, ``exception``, ``abort``,
-    ``stray`` (a frame that answers nothing), ``malformed``; ``pending`` while the answer may still come, which only
-    `Decoder.pending` gives. `transaction` is the transaction id on Modbus TCP, None elsewhere. `latency_ns` is from the request
-    to the last byte of the answer, None without one. `t_ns` is when the request was seen, `end_ns` when the last byte of all
-    was. `text` says what was asked, `reply_text` what was answered. `value` is what an SDO transfer moved (engineering units
-    where it is a tag, hex where its type is not known), an EMCY's code, a heartbeat's state.
+    `problem` is the reason why there is no good answer, "" for a good one: ``no reply``, ``check sum``, ``exception``,
+    ``abort``, ``stray`` (a frame that answers no request), ``malformed``; ``pending`` while the answer may still come,
+    which only `Decoder.pending` gives. `transaction` is the transaction ID on Modbus TCP, None elsewhere. `latency_ns`
+    is from the request to the last byte of the answer, None without one. `t_ns` is when the request was seen, `end_ns`
+    when the last byte of all was. `text` describes the request, `reply_text` the answer. `value` is the value of an SDO
+    transfer (engineering units where it is a tag, hex where its type is not known), an EMCY's code, a heartbeat's
+    state.
     """
 
     t_ns: int
@@ -78,7 +79,7 @@ class Exchange:
     reply_text: str = ""
     value: Scalar | None = None
     secrets: frozenset[str] = frozenset()
-    """Tags of it that nobody is to see; with "" among them, no raw word of it either. Checks still know the values."""
+    """Its secret tags; if "" is among them, its raw words are secret too. Checks still know the values."""
     transaction: int | None = None
 
     @property
@@ -111,7 +112,7 @@ class Exchange:
         return any(s.access == "read" for s in self.spans) and (not tag or tag in self.tags)
 
     def describe(self) -> dict[str, Any]:
-        """As plain data, for JSON. Of secrets there is no value."""
+        """Return plain data for JSON, without the values of secrets."""
         return {
             "device": self.device,
             "unit": self.unit,

@@ -1,4 +1,4 @@
-"""LSS as somebody sees it who only listens (CiA 305): requests on 7E5h, replies on 7E4h. Pure; keeps one request."""
+"""Decode LSS as a passive listener (CiA 305): requests on 7E5h, replies on 7E4h. Pure; keeps one request."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _ANSWERED = {
 }
 """Requests that are answered, and by what."""
 _MAY_BE_SILENT = (lss.FASTSCAN, lss.IDENTIFY_NON_CONFIGURED, lss.SWITCH_SELECTIVE[3])
-"""No answer is an answer: nobody is like that."""
+"""Services for which silence is an answer: no node matches."""
 
 
 class LssWatch:

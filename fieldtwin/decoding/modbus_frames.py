@@ -1,7 +1,8 @@
-"""Bytes as the medium cut them, put together to Modbus frames again: RTU, ASCII and MBAP, one direction of a wire each.
+"""Reassemble chunks of bytes into Modbus frames: RTU, ASCII and MBAP, one direction of a connection each.
 
-Told apart by length and check sum, as a bus analyser does; what is neither is noise and given back as such. Independent of
-the gateway's framers on purpose: it judges them. Holds at most one frame; times come with the bytes.
+Frames are found by length and check sum, as a bus analyser does; other bytes are noise and returned as such.
+Independent of the gateway's framers on purpose, because it checks them. Holds at most one frame; times come with the
+bytes.
 """
 
 from __future__ import annotations
@@ -20,9 +21,9 @@ _LAST_UNIT = 247
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """A frame of unit `unit` (-1: none to be seen), its last byte at `t_ns`. `bad` says why it is none, "" where it is good.
+    """A frame of unit ID `unit` (-1: not readable), whose last byte came at `t_ns`.
 
-    `transaction` is MBAP's, -1 elsewhere.
+    `bad` is its fault, "" for a good frame. `transaction` is MBAP's, -1 elsewhere.
     """
 
     t_ns: int
@@ -68,7 +69,7 @@ class Splitter(ABC):
         return self._split(expected, False)
 
     def flush(self, expected: Expected | None = None) -> list[Frame]:
-        """Nothing that belongs to this will follow: what is left is a frame, or noise."""
+        """Conclude the frame: no further bytes belong to it, and the remaining ones are a frame, or noise."""
         return self._split(expected, True) if self._buffer else []
 
     @abstractmethod
@@ -117,7 +118,7 @@ class RtuSplitter(Splitter):
         return found
 
     def _frame_at(self, at: int, expected: Expected | None, settled: bool) -> tuple[int, str]:
-        """The size of the frame at `at` and what is wrong with it; 0: there is none; -1: more has to come."""
+        """Return the size of the frame at `at` and its fault; 0: no frame; -1: more bytes are needed."""
         head = self._buffer[at:]
         if head[0] > _LAST_UNIT:
             return 0, ""
@@ -136,7 +137,7 @@ class RtuSplitter(Splitter):
             if MIN_FRAME <= size <= min(len(head), MAX_FRAME) and crc16(head[:size]) == 0:
                 return size, ""
         whole = MIN_FRAME <= len(head) <= MAX_FRAME and crc16(head) == 0
-        if whole and (settled or not (lengths or more)):  # a function that nobody knows has no length
+        if whole and (settled or not (lengths or more)):  # an unknown function has no known length
             return len(head), ""
         grows = len(head) < MAX_FRAME and (more or not lengths or any(n > len(head) for n in lengths))
         return (-1, "") if grows and not settled else (0, "")
@@ -153,7 +154,7 @@ class RtuSplitter(Splitter):
 
 
 def _by_its_byte_count(head: bytearray, size: int, expected: Expected | None) -> int:
-    """The size of a reply to a read whose byte count is not the one that was asked for, and whose check sum is right; else 0."""
+    """Return the size of a reply to a read with an unexpected byte count and a right check sum; else 0."""
     if (
         expected is None
         or expected.function not in _READS

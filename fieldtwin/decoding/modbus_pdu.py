@@ -1,6 +1,6 @@
-"""Modbus protocol data units as words: what a request asks for, and what its reply says (AP 6).
+"""Decode Modbus protocol data units into words: the content of a request, and that of its reply (AP 6).
 
-Read by position and nothing else; a PDU that is too short is malformed and never an error. No framing, no device.
+PDUs are read by position alone; a PDU that is too short is malformed and never an error. No framing, no device.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ assert set(_TABLES.values()) <= set(get_args(Table))
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """A request. `written` is what it writes: register bytes, or a byte (0 or 1) for each bit.
+    """A request. `written` is the data to write: register bytes, or a byte (0 or 1) for each bit.
 
-    `reply_bytes` is the length of a normal reply PDU, 0 where the reply itself tells. `echoes`: its reply repeats so many
-    bytes of the request.
+    `reply_bytes` is the length of a normal reply PDU, 0 where the reply itself states it. `echoes` is the number of
+    bytes of the request that its reply repeats.
     """
 
     function: int
@@ -55,7 +55,7 @@ class Asked:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """A reply, judged by its request. `read`: as `Asked.written`. `detail` is what it says besides values."""
+    """A reply, decoded with its request. `read`: as `Asked.written`. `detail` describes the rest of the reply."""
 
     read: bytes = b""
     exception: int | None = None
@@ -74,7 +74,7 @@ def exception_text(code: int) -> str:
 
 
 def parse_request(pdu: bytes) -> Asked:
-    """What a request PDU (function code first) asks for."""
+    """Decode a request PDU (function code first)."""
     function = pdu[0] if pdu else 0
     malformed = Asked(function, service_of(function), problem="malformed")
     if function in (0x01, 0x02, 0x03, 0x04) and len(pdu) == 5:
@@ -109,7 +109,7 @@ def _write(function: int, address: int, count: int, written: bytes, echoes: int)
 
 
 def _other(function: int, pdu: bytes) -> Asked:
-    """What touches no register by number, or is nobody's standard."""
+    """Decode a request that addresses no register by number, or is not in the standard."""
     spans: tuple[Span, ...] = ()
     if function == 0x18 and len(pdu) == 3:
         spans = (Span("read", "holding", int.from_bytes(pdu[1:3])),)
@@ -134,7 +134,7 @@ def _file_spans(pdu: bytes) -> list[Span]:
 
 
 def parse_reply(asked: Asked, request: bytes, pdu: bytes) -> Answer:
-    """What a reply PDU says to that request. A reply to another function, or of another size, is malformed."""
+    """Decode a reply PDU to that request. A reply to another function, or of another size, is malformed."""
     if len(pdu) == 2 and pdu[0] == asked.function | 0x80:
         return Answer(exception=pdu[1], problem="exception", detail=f"exception {exception_text(pdu[1])}")
     if not pdu or pdu[0] != asked.function or (asked.reply_bytes and len(pdu) != asked.reply_bytes):

@@ -1,7 +1,7 @@
-"""One Modbus wire of a trace: chunks both ways in, words and exchanges out.
+"""Decode one Modbus connection of a trace: chunks both ways in, words and exchanges out.
 
-On a serial line one request is awaited at a time, and the next one ends it; on MBAP replies are told by their
-transaction id. What answers nothing is a stray. No clock: times come with the chunks.
+On a serial line one request is awaited at a time, and the next one ends it; on MBAP replies are matched by their
+transaction ID. A frame that answers no request is a stray. No clock: times come with the chunks.
 """
 
 from __future__ import annotations
@@ -41,7 +41,10 @@ class _Open:
 
 
 class ModbusWire:
-    """`framing` is rtu, ascii, mbap or udp. `echo`: what was sent comes back first. `served`: the far end is the master."""
+    """One Modbus connection.
+
+    `framing` is rtu, ascii, mbap or udp. `echo`: sent bytes come back first. `served`: the remote side is the client.
+    """
 
     def __init__(
         self, bus: str, framing: str, units: dict[int, Unit], *, echo: bool = False, served: bool = False
@@ -63,7 +66,7 @@ class ModbusWire:
         return self._take_requests(data, t_ns) if sent != self._served else self._take_replies(data, t_ns)
 
     def finish(self) -> list[Exchange]:
-        """Nothing follows: what is still awaited has no answer."""
+        """Conclude the trace: requests that still wait have no answer."""
         texts: list[str] = []
         done: list[Exchange] = []
         self._settle(texts, done)
@@ -162,7 +165,7 @@ class ModbusWire:
         return Expected(opened.frame.unit, opened.asked.function, opened.asked.reply_bytes)
 
     def _settle(self, texts: list[str], done: list[Exchange]) -> None:
-        """A new request is there: what is left of replies is complete, or noise."""
+        """Conclude the reply at a new request: remaining bytes are a complete reply, or noise."""
         self._judge(self._replies.flush(self._expected()), texts, done)
 
     def _judge(self, frames: Iterable[Frame], texts: list[str], done: list[Exchange]) -> None:
@@ -182,7 +185,7 @@ class ModbusWire:
             texts.append(f"{opened.device or f'unit {frame.unit}'}: {done[-1].reply_text}")
 
     def _older(self, answered: _Open) -> list[Exchange]:
-        """What was asked before: we ask one thing at a time, so that it was given up."""
+        """End older requests: the gateway sends one request at a time, so it gave them up."""
         older = [t for t, o in self._open.items() if o.frame.t_ns <= answered.frame.t_ns]
         self._given_up.extend(older)
         return [self._unanswered(self._open.pop(t)) for t in older]

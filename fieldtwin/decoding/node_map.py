@@ -1,7 +1,7 @@
-"""What is known of a CANopen node without asking it: its tags, its objects' types, and what its PDOs carry.
+"""The knowledge about a CANopen node without querying it: its tags, its objects' types, and the content of its PDOs.
 
-From the profile, its EDS and the system file at first; then from what the node is seen to be told or to answer, so that a mapping
-written over SDO counts from then on. Pure but for reading the EDS.
+It comes from the profile, its EDS and the system file at first; then from the observed transfers, so that a mapping
+written over SDO applies from then on. Pure except for reading the EDS.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ class NodeMap:
         return text.removeprefix(f"{next(iter(tags))} ")
 
     def _configured(self, config: DeviceConfig) -> None:
-        """What the system file makes of it counts more than what it is delivered with."""
+        """Apply the system file's configuration, which overrides the factory settings."""
         boot = config.canopen
         for pdo in boot.tpdos or ():
             self._set(TPDO_COMMUNICATION, TPDO_MAPPING, pdo)
@@ -134,7 +134,7 @@ class NodeMap:
             self._held[mapping + at, sub] = entry.word
 
     def _find(self) -> dict[int, Pdo]:
-        """The PDOs that there are, by COB-ID."""
+        """Return the existing PDOs by COB-ID."""
         found = {}
         for kind, communication, mapping in _KINDS:
             for (index, sub), cob in self._held.items():

@@ -1,7 +1,7 @@
-"""SDO transfers of one node, as somebody sees them who only listens (CiA 301, 7.2.4.3).
+"""Decode the SDO transfers of one node as a passive listener (CiA 301, 7.2.4.3).
 
-Expedited, segmented and in blocks, both ways. The first eight bits of a frame say what it is, but inside a block, where they
-number its segments: so the state is followed. What fits nothing is a stray. Pure; keeps one transfer.
+Expedited, segmented and in blocks, both ways. The first eight bits of a frame identify it, except inside a block, where
+they number its segments: therefore the state is tracked. Other frames are strays. Pure; keeps one transfer.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from fieldtwin.gateway.protocols.canopen.abort_codes import meaning
 
 MAX_BYTES = 1 << 20
-"""What is kept of one object's value."""
+"""Maximum number of bytes that are kept of one object's value."""
 
 _ABORT = 0x80
 
@@ -50,8 +50,11 @@ class Transfer:
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """What a frame was. `done`: the transfer that it ended. `dropped`: one that a new request left without an answer. `stray`:
-    a frame of the server that answers no request."""
+    """The meaning of a frame.
+
+    `done`: the transfer that it ended. `dropped`: one that a new request left without an answer. `stray`: a frame of
+    the server that answers no request.
+    """
 
     text: str
     done: Transfer | None = None
@@ -66,7 +69,7 @@ class SdoWatch:
         self.open: Transfer | None = None
 
     def drop(self) -> Transfer | None:
-        """Nothing follows: what is open has no answer."""
+        """Return the open transfer at the end of the trace; it has no answer."""
         now, self.open = self.open, None
         return now
 

@@ -1,6 +1,7 @@
-"""Which tags of a profile stand in a piece of a device, and what they say there, in engineering units.
+"""Find the tags of a profile in a range of registers or in an object, and decode their values in engineering units.
 
-Values are the driver's (fieldtwin.gateway.devices.codec): a report says what the gateway made of the bytes. Pure.
+Values are decoded with the driver's codec (fieldtwin.gateway.devices.codec): a report shows how the gateway read the
+bytes. Pure.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ _KEPT_PLANS = 1024
 
 @dataclass(frozen=True, slots=True)
 class _Plan:
-    """What a span holds: tags with their offset and size in registers (or bits), blocks passed on, mailboxes."""
+    """The content of a span: tags with their offset and size in registers (or bits), blocks passed on, mailboxes."""
 
     tags: tuple[tuple[Tag, int, int], ...]
     blocks: tuple[tuple[str, int, int], ...]
@@ -52,7 +53,7 @@ class TagMap:
         return bool(self._secrets)
 
     def secret(self, span: Span) -> bool:
-        """Whether any part of `span` is nobody's business."""
+        """Return whether any part of `span` is secret."""
         return any(_touches(tag, span) for tag in self._secrets)
 
     def secrets(self, spans: Iterable[Span]) -> frozenset[str]:
@@ -63,9 +64,10 @@ class TagMap:
         return frozenset(found | {""}) if found else frozenset()
 
     def of_registers(self, span: Span, data: bytes, t_ns: int) -> dict[str, Scalar | None]:
-        """Values by name from the register bytes of `span`, as on the wire; bits as one byte each (0 or 1).
+        """Return values by name from the register bytes of `span`, as on the bus; bits as one byte each (0 or 1).
 
-        Messages and the payloads of mailboxes are shown in hex. What is no number, or is a sentinel, is None.
+        Messages and the payloads of mailboxes are shown in hex. A value that is not a number, or is a sentinel, is
+        None.
         """
         plan, size = self._plan(span), 1 if span.table in ("coil", "discrete") else 2
         read = {tag.name: decode(tag, data[at * size : (at + n) * size], t_ns) for tag, at, n in plan.tags}
@@ -78,7 +80,7 @@ class TagMap:
         return values
 
     def of_object(self, index: int, subindex: int, data: bytes, t_ns: int) -> dict[str, Scalar | None]:
-        """The value of a CANopen object that is a tag, by name; nothing where it is none or its size is another."""
+        """Return the value of a CANopen object by its tag's name; nothing if it is not a tag or its size is wrong."""
         tag = self.by_object.get((index, subindex))
         if tag is None or (not tag.is_text and len(data) != _OBJECT_BYTES.get(tag.type, len(data))):
             return {}
@@ -143,7 +145,7 @@ _OBJECT_BYTES = {
 
 
 def show_value(value: object, digits: int = 7) -> str:
-    """A value for people: numbers to `digits` places, text in quotes, ``none`` where there is no value."""
+    """Format a value: numbers to `digits` places, text in quotes, ``none`` for a missing value."""
     if value is None:
         return "none"
     if isinstance(value, float):

@@ -1,8 +1,9 @@
-"""CAN logs of other programs (Vector's .asc and .blf, PEAK's .trc) through python-can's readers, as frames with times.
+"""Read CAN logs of other programs (Vector's .asc and .blf, PEAK's .trc) through python-can's readers, as frames with times.
 
-One of the files that know python-can, and only its readers: no interface is opened. They trust a file: so lines and packed blocks
-are checked for their size before, frames afterwards, and what is wrong is `FileInvalid`, whatever they raise. CAN FD and error
-frames are counted and left out. These formats lose things: .trc has no error frames, .asc and .blf have times of their writers.
+One of the files that use python-can, and it uses only its readers: no interface is opened. The readers trust a file:
+therefore lines and packed blocks are checked for their size before, frames afterwards, and any error becomes
+`FileInvalid`, whatever the readers raise. CAN FD and error frames are counted and omitted. These formats lose data:
+.trc has no error frames, .asc and .blf have the times of their writers.
 """
 
 from __future__ import annotations
@@ -58,7 +59,10 @@ def read_can_file(path: Path, left: LeftOut) -> Iterator[tuple[int, str, CanFram
 
 
 def _guarded(reader: Any, file: IO[Any], path: Path) -> Iterator[Any]:
-    """What python-can makes of a file. Whatever it raises is said of the file: its readers raise whatever their parsing does."""
+    """Yield python-can's messages of a file.
+
+    Any exception is reported as a fault of the file: the readers raise parsing errors.
+    """
     number = 0
     try:
         messages = iter(reader(file))
@@ -125,7 +129,10 @@ def _check_blocks(path: Path) -> None:
 
 
 def _check_objects(data: bytes, path: Path, container_at: int) -> bytes:
-    """Objects of a size that lets a reader go on, and end; what is left of one that goes on in the next container."""
+    """Check that objects have a size with which a reader advances and ends.
+
+    Returns the bytes of an object that continues in the next container.
+    """
     at = 0
     while (found := data.find(b"LOBJ", at, at + 8)) >= 0 and found + 16 <= len(data):
         (size,) = struct.unpack_from("<I", data, found + 8)

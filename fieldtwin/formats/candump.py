@@ -26,7 +26,7 @@ MAX_LINE = 1024
 
 @dataclass(slots=True)
 class LeftOut:
-    """What a log holds besides classic data and remote frames."""
+    """The content of a log apart from classic data and remote frames."""
 
     fd: int = 0
     errors: int = 0

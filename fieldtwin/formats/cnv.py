@@ -96,7 +96,7 @@ class ImportSummary:
 
 @dataclass(slots=True)
 class CnvHeader:
-    """What the header says, as far as an import needs it. `lines` is the number of the line ``*END*``."""
+    """The fields of the header that an import needs. `lines` is the number of the line ``*END*``."""
 
     names: dict[int, str] = field(default_factory=dict)
     nquan: int = 0
@@ -119,7 +119,7 @@ class _Plan:
 def import_cnv(
     path: Path, out: Path, *, progress: Progress | None = None, columns: Mapping[str, str] | None = None
 ) -> ImportSummary:
-    """Write the cast `path` as a recording `out`; `out` appears only when it is whole, and is replaced if it is there.
+    """Write the cast `path` as a recording `out`, which appears only when it is complete and replaces an existing file.
 
     `columns` picks a column by name for a signal (``{"temperature": "t190C"}``) where the file has several. Pressure is
     in dbar, temperature in degC (ITS-90), conductivity in S/m, converted where the file has other units. Time starts at
@@ -217,7 +217,7 @@ def read_header(lines: _Lines) -> CnvHeader:
 
 
 def _read_header_line(header: CnvHeader, text: str, lines: _Lines) -> None:
-    """One ``# key = value`` line; what is of no use here is skipped."""
+    """Read one ``# key = value`` line; keys that an import does not need are skipped."""
     if match := _NAME.match(text):
         header.names[int(match[1])] = match[2].strip()
         return

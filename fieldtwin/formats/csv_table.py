@@ -1,7 +1,8 @@
-"""Tables of measurements as CSV: a time column and signals, as a recording of signals; and back.
+"""Tables of measurements as CSV: a time column and signals, read as a recording of signals, and written from one.
 
-The first row names the columns (``pressure (dbar)``: the unit in brackets); commas, semicolons or tabs between them, and behind
-semicolons a decimal comma too. Times are seconds, milliseconds or ISO 8601. Reads a line at a time; a flaw is told with its line.
+The first row names the columns (``pressure (dbar)``: the unit in brackets). Columns are separated by commas, semicolons
+or tabs; with semicolons the numbers may have a decimal comma. Times are seconds, milliseconds or ISO 8601. Reads a line
+at a time; an error states its line.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ _NAME = re.compile(r"\s*(.*?)\s*(?:[\[(]\s*([^\])]*?)\s*[\])])?\s*")
 
 @dataclass(frozen=True, slots=True)
 class TableSummary:
-    """What came of a table. `columns` is signal: column; `bad_values` had no number and stay without a value."""
+    """The result of reading a table. `columns` maps signal to column; `bad_values` counts cells without a number."""
 
     rows: int
     seconds: float
@@ -155,7 +156,7 @@ def _chosen(names: list[str], columns: Mapping[str, str], time_at: int) -> dict[
 
 
 class _Clock:
-    """Seconds since the first row, whatever the time column is written in."""
+    """Seconds since the first row, for any format of the time column."""
 
     def __init__(self, path: Path, name: str, line: int, row: list[str], at: int) -> None:
         self._path, self._at = path, at
@@ -193,7 +194,10 @@ class _Clock:
 
 
 def _value(text: str) -> float:
-    """A number; NaN where there is none. A comma is a decimal comma: where it divides columns, no field has one."""
+    """Return a number, or NaN for other text.
+
+    A comma is a decimal comma: if commas separate columns, no field contains one.
+    """
     try:
         return float(text.strip().replace(",", "."))
     except ValueError:

@@ -18,14 +18,17 @@ class _Packet:
 
 
 class Fragments:
-    """Pieces in, whole packets out. `given_up` counts packets of which a piece is missing, or that are none."""
+    """A reassembly of packets from fragments.
+
+    `given_up` counts packets with a missing fragment, and invalid ones.
+    """
 
     def __init__(self) -> None:
         self.given_up = 0
         self._open: dict[Hashable, _Packet] = {}
 
     def add(self, key: Hashable, offset: int, data: bytes, *, more: bool) -> bytes | None:
-        """A piece of the packet `key` (addresses, protocol, identification): what the packet carries once it is whole."""
+        """Add a fragment of the packet `key` (addresses, protocol, identification); return a complete payload."""
         packet = self._open.get(key)
         if packet is None:
             if len(self._open) >= MAX_PACKETS:

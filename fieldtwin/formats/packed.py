@@ -1,7 +1,7 @@
-"""Unpack gzip and bzip2 files, up to a limit: a few kilobytes of either can stand for gigabytes.
+"""Unpack gzip and bzip2 files, up to a limit: a few kilobytes of either can expand to gigabytes.
 
-Memory is no concern, because what is unpacked is read in pieces. Time is: without a limit, reading takes as long as the packed
-file wants it to take.
+Memory is not a concern, because unpacked data is read in pieces. Time is: without a limit, the packed file determines
+how long reading takes.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from typing import BinaryIO
 from fieldtwin.gateway.core.errors import FileInvalid
 
 FREE_BYTES = 64 * 1024 * 1024
-"""So much any packed file may hold."""
+"""Number of bytes that any packed file may expand to."""
 MOST_TIMES = 100
-"""A larger one may hold this many times its own size. Real captures and casts stay below 50 times."""
+"""A larger file may expand to this multiple of its own size. Real captures and casts stay below 50 times."""
 
 
 def most_unpacked(packed_bytes: int) -> int:

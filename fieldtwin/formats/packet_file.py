@@ -87,11 +87,11 @@ class PacketFile:
     def _guarded(self, packets: Iterator[Packet]) -> Iterator[Packet]:
         try:
             yield from packets
-        except (OSError, EOFError, zlib.error) as e:  # gzip says so of a file that is cut off or damaged
+        except (OSError, EOFError, zlib.error) as e:  # gzip's errors for a truncated or damaged file
             raise self._invalid(f"cannot be read on: {e}") from e
 
     def _read(self, size: int) -> bytes:
-        """So many bytes; fewer at the end of the file."""
+        """Read `size` bytes; fewer at the end of the file."""
         data = self._file.read(size)
         self.position += len(data)
         return data

@@ -1,9 +1,9 @@
-"""Captures of a wire as pcap files, so that tools that are not ours (tshark, Wireshark) can read them.
+"""Write captures as pcap files, so that other tools (tshark, Wireshark) can read them.
 
-A tap sees chunks and frames, not packets; what is missing around them is made up here so that a dissector finds what it
-expects: Ethernet, IP and TCP with right check sums and sequence numbers around Modbus/TCP, nothing at all around
-Modbus RTU (DLT_USER0, to be decoded as ``mbrtu``), a SocketCAN header around CAN frames. No byte of the protocols
-themselves is made or changed here, and none is looked into: this module must never know Modbus or CANopen.
+A tap sees chunks and frames, not packets; the missing layers around them are made up here so that a dissector finds
+what it expects: Ethernet, IP and TCP with right check sums and sequence numbers around Modbus/TCP, nothing at all
+around Modbus RTU (DLT_USER0, to be decoded as ``mbrtu``), a SocketCAN header around CAN frames. No byte of the
+protocols themselves is made, changed or interpreted here: this module must never depend on Modbus or CANopen.
 
 Sources: the pcap file format and its link types (https://www.tcpdump.org/linktypes.html), RFC 791, RFC 9293.
 """
@@ -36,7 +36,7 @@ SNAPLEN = 65_535
 MODBUS_PORT = 502
 CLIENT_PORT = 50_200
 MAX_SEGMENT = 1460
-_CLIENT, _SERVER = bytes((192, 0, 2, 1)), bytes((192, 0, 2, 2))  # TEST-NET-1 (RFC 5737): nobody's addresses
+_CLIENT, _SERVER = bytes((192, 0, 2, 1)), bytes((192, 0, 2, 2))  # TEST-NET-1 (RFC 5737): reserved for examples
 _MACS = {_CLIENT: bytes((2, 0, 0, 0, 0, 1)), _SERVER: bytes((2, 0, 0, 0, 0, 2))}
 _SYN, _ACK, _PSH = 0x02, 0x10, 0x08
 
@@ -46,10 +46,10 @@ MAX_LINE_BYTES = 1 << 20
 
 
 def read_capture(path: Path, refusals: list[dict[str, Any]] | None = None) -> Iterator[Captured]:
-    """What a `TapFile` wrote, in order, a line at a time. A last line that was cut off is left out. Writes that did not reach
-    their device are no traffic: they go to `refusals`.
+    """Yield the content of a file written by `TapFile`, in order, a line at a time. A truncated last line is omitted.
 
-    Raises `FileInvalid` when the file cannot be read, and at any other flaw with its line.
+    Writes that did not reach their device are not traffic: they go to `refusals`. Raises `FileInvalid` when the file
+    cannot be read, and for any other invalid line with its number.
     """
     try:
         with open_input(path) as file:

@@ -1,8 +1,8 @@
-"""From packets to the bytes of their conversations: link layer, IP, UDP, and TCP put in order again.
+"""Extract the bytes of conversations from packets: link layer, IP, UDP, and TCP reassembled.
 
-`Conversations` is fed packets and calls back with what each TCP or UDP conversation carried, in the order in which it was said;
-`Segments` puts one direction of a TCP stream together. Sans-IO and bounded: so many conversations, so many bytes waiting for
-a segment that is missing. It must never know what is carried.
+`Conversations` is fed packets and calls back with the payload of each TCP or UDP conversation, in the order of sending;
+`Segments` reassembles one direction of a TCP stream. Sans-IO and bounded, in the number of conversations and in the
+bytes that wait for a missing segment. It must never depend on the payload's protocol.
 
 Sources: RFC 791, 8200, 768, 9293; link types: https://www.tcpdump.org/linktypes.html.
 """
@@ -48,7 +48,7 @@ class Segments:
         self._waiting: dict[int, bytes] = {}
 
     def add(self, sequence: int, data: bytes) -> list[tuple[int, bytes]]:
-        """What can be told now: (bytes lost just before, bytes), in order. Repeated bytes are told once."""
+        """Return the available data: (bytes lost just before, bytes), in order. Repeated bytes are returned once."""
         if self.next < 0 or sequence == self.next:
             self.next = (sequence + len(data)) % _SEQUENCES
             return [(0, data)] if not self._waiting else [(0, data), *self._follow()]
@@ -65,14 +65,14 @@ class Segments:
         return self._give_up() if full else []
 
     def acknowledged(self, number: int) -> list[tuple[int, bytes]]:
-        """The receiver has all before `number`: what is missing there was lost by the capture, and will not be repeated."""
+        """Note that the receiver has everything before `number`: the capture lost any gap there; it is not repeated."""
         found: list[tuple[int, bytes]] = []
         while self._waiting and 0 < (number - self.next) % _SEQUENCES < _SEQUENCES // 2:
             found += self._give_up()
         return found
 
     def flush(self) -> list[tuple[int, bytes]]:
-        """Nothing follows: what is missing will not come."""
+        """Return the remaining data at the end of the stream; gaps will not be filled."""
         found = []
         while self._waiting:
             found += self._give_up()
@@ -112,7 +112,7 @@ class Conversation:
     last_ns: int = 0
     ended: bool = False
     state: object = None
-    """Whatever the one who listens keeps about it."""
+    """State that the caller keeps for the conversation."""
 
 
 OnData = Callable[[Conversation, Side, bytes, int, int], None]
@@ -122,8 +122,7 @@ OnEnd = Callable[[Conversation], None]
 
 @dataclass(slots=True)
 class PacketCounters:
-    """What came of the packets: `carried` had something to say; `fragments` are IP packets of which a
-    piece is missing."""
+    """The counts of packets. `carried` had a payload; `fragments` are IP packets with a missing fragment."""
 
     packets: int = 0
     carried: int = 0
@@ -174,7 +173,7 @@ class Conversations:
             self.counters.others += 1
 
     def _next_segment(self, t_ns: int, data: bytes) -> bool:
-        """The way of nearly all packets: what follows in a connection that is known, with nothing missing. False: it is not."""
+        """Handle the common case: the next segment of a known connection without gaps. Return False in any other case."""
         path = self._paths.get(data[26:38])
         if (
             path is None
@@ -276,7 +275,7 @@ class Conversations:
         flags, payload = data[at + 13], data[at + (data[at + 12] >> 4) * 4 : end]
         if flags & 0x10:
             self._acknowledged(sender, other, int.from_bytes(data[at + 8 : at + 12]), t_ns)
-        if flags & 0x07 == 0x02:  # with FIN or RST beside it, it opens nothing
+        if flags & 0x07 == 0x02:  # together with FIN or RST it opens no connection
             self._opened(sender, other, data[at + 4 : at + 8], acknowledged=bool(flags & 0x10))
             return
         if payload:

@@ -1,10 +1,10 @@
-"""The position at which a live dialogue continues a recorded one, cell by cell.
+"""Find the position at which a live dialogue continues a recorded one, cell by cell.
 
-An emulator of a recording gives each register and bit its recorded values one after the other. If it was read before, its values
-come from further on in the recording; compared position by position, the same device would seem different. So where exchanges
-differ, the values that came are looked for in the recorded ones. A shifted match counts only if it is exact and shows at least
-two different values: a device that always gives the same value, or another one, matches nothing. What came after the end of the
-recorded values is not compared. Pure.
+An emulator of a recording gives each register and bit its recorded values one after the other. If it was read before,
+its values come from further on in the recording; compared position by position, the same device would seem different.
+So where exchanges differ, the live values are looked up in the recorded ones. A shifted match counts only if it is
+exact and contains at least two different values: a device with a constant value, or a different device, matches
+nothing. Values after the end of the recorded ones are not compared. Pure.
 """
 
 from __future__ import annotations
@@ -54,10 +54,10 @@ class _Series:
     wraps: bool = False
     """The recorded values begin again after their end."""
     foreign: bool = False
-    """What came is nowhere in the recorded values: compared position by position."""
+    """The live values do not occur in the recorded ones: they are compared position by position."""
 
     def expected(self, index: int) -> int | None:
-        """The recorded value for the live value `index`, None where there is none."""
+        """Return the recorded value for the live value `index`, None if there is none."""
         if not self.sure:
             return None
         at = self.shift + index
@@ -67,7 +67,7 @@ class _Series:
 
     @property
     def tail(self) -> list[int]:
-        """What came after the end of the recorded values."""
+        """Return the live values after the end of the recorded values."""
         return self.other[len(self.recorded) - self.shift :]
 
     @property
@@ -97,8 +97,10 @@ class _Series:
 
 
 class Dialogue:
-    """Pairs of a recorded exchange and what came of the same request now, in order. `rest` takes recorded exchanges that were not
-    asked again."""
+    """Pairs of a recorded exchange and the live exchange of the same request, in order.
+
+    `rest` receives recorded exchanges that were not repeated.
+    """
 
     def __init__(self) -> None:
         self._pairs: list[tuple[Exchange, Exchange]] = []
@@ -205,7 +207,7 @@ class Dialogue:
 
 
 def _values(exchange: Exchange) -> tuple[Span, list[int]] | None:
-    """What a plain read (functions 01 to 04) was answered with; None for anything else."""
+    """Return the values of the reply to a plain read (functions 01 to 04); None for anything else."""
     if not exchange.reply or not 1 <= exchange.request[0] <= 4:
         return None
     asked = parse_request(exchange.request)

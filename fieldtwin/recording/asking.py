@@ -1,7 +1,7 @@
-"""One request of anybody's to a live device, and what came of it, as a recording keeps it: PDU in, `Exchange` out.
+"""Send one arbitrary request to a live device and return the result as a recording keeps it: PDU in, `Exchange` out.
 
-The gateway's own master sends it: its silences, its judgement of what is a reply. Never retries; a fault of the wire is an
-outcome. It must never decide what may be sent: who asks does, with `changes`.
+The gateway's own Modbus client sends it, with its silences and its validation of replies. It never retries; a fault of
+the connection is an outcome. This module must never decide which requests are allowed: the caller does, with `changes`.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _READS = frozenset({1, 2, 3, 4})
 
 
 def asked_of(pdu: bytes) -> Asked | None:
-    """What a request asks for, also a malformed read (which a device refuses); None for what no request can be."""
+    """Parse a request, even a malformed read (which a device refuses); None for a PDU that cannot be a request."""
     try:
         return examine(pdu)
     except ModbusExceptionReply:
@@ -47,7 +47,7 @@ def changes(pdu: bytes) -> bool:
 
 
 def frame_for(url: str, unit: int, pdu: bytes) -> bytes | None:
-    """What a request would look like on the wire at `url`, for `--dry-run`; None for what cannot be sent."""
+    """Return the frame of a request on the endpoint `url`, for `--dry-run`; None for a PDU that cannot be sent."""
     asked = asked_of(pdu)
     if asked is None:
         return None
@@ -83,8 +83,11 @@ class Asker:
         self._lost = False
 
     async def ask(self, unit: int, pdu: bytes) -> Exchange | None:
-        """What came of the request; None where it cannot be sent. Raises `ConnectionLost` when the connection was lost before:
-        the request during which it is lost has that as its outcome."""
+        """Send the request and return the exchange; None if it cannot be sent.
+
+        Raises `ConnectionLost` when the connection was lost before. If it is lost during the request, that is the
+        request's outcome.
+        """
         asked = asked_of(pdu)
         if asked is None or (unit == 0 and self._broadcasts and pdu[0] not in BROADCAST_FUNCTIONS):
             return None

@@ -31,7 +31,7 @@ MAX_UNWRITTEN = 100_000
 """Cells that left-out writes had set, of which it is remembered."""
 QUANTILES = tuple(q / 100 for q in range(5, 100, 5))
 FLOOR_S = 0.001
-"""Added to both quantiles of a ratio: a tenth of a millisecond beside none is no difference between devices."""
+"""Added to both quantiles of a ratio, so that a tenth of a millisecond more than zero is not a difference."""
 
 _COUNTING = frozenset({0x08, 0x0B, 0x0C})
 T = TypeVar("T")
@@ -39,7 +39,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class Tolerance:
-    """What a value may differ by: `absolute` in its unit, or `share` of the recorded one, whichever is more."""
+    """The permitted difference of a value: `absolute` in its unit, or `share` of the recorded one, whichever is larger."""
 
     absolute: float = 0.0
     share: float = 0.0
@@ -89,7 +89,7 @@ class LatencyRow:
 
 @dataclass(slots=True)
 class Comparison:
-    """What came of it. `extra`: what the other has beyond the recording; nothing was said of that."""
+    """The result of a comparison. `extra` counts exchanges that only the other side has; they have no verdict."""
 
     compared: int = 0
     alike: int = 0
@@ -128,7 +128,7 @@ class Comparison:
 
 
 class Comparer:
-    """Takes pairs, one after the other; `result` may be asked for once all are in."""
+    """A comparison that is given pairs, one after the other; `result` may be called after the last."""
 
     def __init__(self, rules: Rules | None = None, profile: DeviceProfile | None = None) -> None:
         self._rules, self._profile = rules or Rules(), profile
@@ -167,7 +167,7 @@ class Comparer:
         return not trial._result.by_kind
 
     def left_out(self, exchange: Exchange) -> None:
-        """An exchange that was not asked again. What a write set is not there, and may be missed later."""
+        """Count an exchange that was not repeated. The effect of a write that was omitted may be missing later."""
         self._result.left_out += 1
         asked = self._asked(exchange.request)
         if asked.write_span is None or not exchange.reply or exchange.reply[0] & 0x80:
@@ -185,7 +185,7 @@ class Comparer:
         self._result.shifts += shifts
 
     def result(self) -> Comparison:
-        """What came of all."""
+        """Return the result of the comparison."""
         judge_latencies(self._result, {_service(f): both for f, both in sorted(self._latencies.items())}, self._rules)
         return self._result
 
@@ -209,7 +209,7 @@ class Comparer:
         if one.exception is not None or two.exception is not None:
             self._differ(recorded, "exception", "", _outcome(recorded), _outcome(other))
         elif asked.function in _COUNTING and not (one.problem or two.problem):
-            return  # what they count is the wire as it was
+            return  # their counts belong to the recorded connection
         elif asked.read_span is None or one.problem or two.problem or not one.read:
             self._differ(recorded, "reply", "", recorded.reply.hex(" "), other.reply.hex(" "))
         else:
@@ -240,7 +240,7 @@ class Comparer:
         if not isinstance(one, int | float) or not isinstance(two, int | float):
             return one == two
         if name in self._counters and name not in self._rules.tags:
-            return two >= one  # it only grows: that it has grown since is no difference
+            return two >= one  # a counter that has increased is not a difference
         return self._rules.tags.get(name, self._rules.values).holds(one, two)
 
     def _differ(
@@ -284,9 +284,9 @@ def judge_latencies(result: Comparison, kept: Mapping[str, tuple[array[float], a
 def pairs_of(
     recorded: Iterable[T], other: Iterable[T], key_of: Callable[[T], Hashable]
 ) -> Iterator[tuple[T | None, T | None]]:
-    """Each exchange of the one with the one of the same key in the other, the first with the first, in order.
+    """Pair each exchange with the one of the same key on the other side, the first with the first, in order.
 
-    What is not found within `LOOK_AHEAD` exchanges is missing; what is left over is extra.
+    An exchange without partner within `LOOK_AHEAD` exchanges is missing; the other side's remaining ones are extra.
     """
     waiting: dict[Hashable, deque[T]] = {}
     behind, rest = 0, iter(other)
@@ -310,7 +310,7 @@ def pairs_of(
 
 
 def request_of(exchange: Exchange) -> Hashable:
-    """What an exchange is paired by: unit and request."""
+    """Return the pairing key of an exchange: unit ID and request."""
     return exchange.unit, exchange.request
 
 

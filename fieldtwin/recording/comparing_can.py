@@ -1,7 +1,7 @@
-"""As `comparing`, for CANopen nodes by what a bus said: SDO transfers one by one, messages that nobody asks for by kind.
+"""As `comparing`, for CANopen nodes by a log of the bus: SDO transfers one by one, unrequested messages by kind.
 
-What a node sends by itself (PDOs, heartbeats) comes when it comes: there the same messages, of the same length, about as often,
-are alike; their contents are signals, which a replay reads at its own clock. Pure.
+The times of a node's own messages (PDOs, heartbeats) vary: the same messages, of the same length and about as often,
+are equal; their contents are signals, which a replay reads at its own clock. Pure.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from fieldtwin.recording.comparing import (
 
 TRANSFERS = ("SDO upload", "SDO download")
 RARE = 5
-"""Messages of a kind, below which nothing is said about how often they come."""
+"""Number of messages of a kind that is needed to judge their rate."""
 OFTEN = Tolerance(0.005, 0.5)
-"""What the mean time between messages may differ by, in seconds."""
+"""Permitted difference of the mean time between messages, in seconds."""
 
 Frames = Iterable[tuple[int, CanFrame]]
 """(time in ns, frame)"""
@@ -95,8 +95,11 @@ def compare_logs(
     messages: bool = True,
     uploads: int = -1,
 ) -> Comparison:
-    """Both logs, of `nodes` (all of them where none is named). `messages`: what nobody asked for counts too. `uploads`: of
-    transfers only the first so many uploads; -1: all, and downloads too."""
+    """Compare both logs for `nodes`, or for all nodes if it is empty.
+
+    `messages`: also compare messages that were not requested. `uploads`: compare only the first `uploads` uploads; -1:
+    all uploads and downloads.
+    """
     rules = rules or Rules()
     tags = TagMap(profile) if profile is not None else None
     result = Comparison(least=rules.least)
@@ -145,7 +148,10 @@ def _alike(one: Exchange, two: Exchange, rules: Rules, tags: TagMap | None) -> b
 
 
 def _values(one: Exchange, two: Exchange, tags: TagMap | None) -> tuple[str, Scalar | None, Scalar | None]:
-    """The tag's name and its values; bytes of a number's length as a number, lowest first, where there is no tag."""
+    """Return the tag's name and its values.
+
+    Without a tag, bytes with the length of a number become a number, lowest byte first.
+    """
     span, found = one.spans[0], []
     for done in (one, two):
         value = done.value

@@ -1,7 +1,8 @@
-"""A draft profile of each unit of a recording: what was asked of it, as tags. A person names them, and says what they mean.
+"""Draft a profile of each unit of a recording: the requested registers as tags, for the user to name and interpret.
 
-What traffic shows is written down: addresses, functions, limits, what was written, what was refused. What it does not show (types
-over several registers, scales, units) is not guessed here: `fieldtwin infer` ranks that from dumps. Pure and bounded.
+Only facts from the traffic are written: addresses, functions, limits, writes and refusals. Facts that traffic does not
+show (types over several registers, scales, units) are not guessed here: `fieldtwin infer` ranks them from dumps. Pure
+and bounded.
 """
 
 from __future__ import annotations

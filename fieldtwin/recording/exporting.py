@@ -159,7 +159,7 @@ def _outcome(e: Exchange) -> str:
 
 
 _FORMULA = frozenset("=+-@\t\r\n\0")
-"""What a cell of text may not begin with."""
+"""Characters with which a text cell may not begin."""
 
 
 def _write_table(out: Path, kind: str, columns: Sequence[Column], rows: Rows) -> int:

@@ -1,4 +1,4 @@
-"""What is spoken on a line, from its bytes: RTU, ASCII or Modbus TCP, whichever finds most of them in whole frames. Pure."""
+"""Guess the framing of a line from its bytes: RTU, ASCII or Modbus TCP, by the most bytes in whole frames. Pure."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""A capture of somebody else's traffic becomes recordings: one for each Modbus server, a log of CAN, and draft profiles.
+"""Convert a capture of foreign traffic into recordings: one for each Modbus server, a log of CAN, and draft profiles.
 
-Streams: memory is bounded by the conversations that are open. What is malformed, or answers nothing, is kept beside the recording
-(``.bad.jsonl``, read as a capture) and counted.
+Streaming: memory is bounded by the open conversations. Malformed frames and stray replies are kept next to the
+recording (``.bad.jsonl``, read as a capture) and counted.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class Made:
 
 @dataclass(slots=True)
 class PacketSummary:
-    """What came of a capture."""
+    """The result of the conversion of a capture."""
 
     packets: PacketCounters = field(default_factory=PacketCounters)
     pairs: PairCounters = field(default_factory=PairCounters)
@@ -91,7 +91,7 @@ class PacketImport:
         self._talks = Conversations(self._said, self._ended)
 
     def run(self, progress: Progress | None = None) -> PacketSummary:
-        """Read it all. Raises `FileInvalid` for a file that is no capture, or where a recording exists already."""
+        """Read the whole capture. Raises `FileInvalid` for a file that is not a capture, or if a recording exists already."""
         for path in (self._out, self._log_path):
             if path.exists():
                 raise FileInvalid("the recording exists already", path=str(path), hint="choose another name with --out")
@@ -119,7 +119,7 @@ class PacketImport:
 
     @property
     def _files(self) -> list[RotatingFile]:
-        """What was written so far."""
+        """Return the files written so far."""
         return [s.file for s in self._servers.values()] + ([self._can] if self._can else [])
 
     @property
@@ -263,7 +263,7 @@ def socketcan_frame(data: bytes) -> CanFrame | None:
 
 
 def _renamed(parts: list[Path], old: Path, new: Path) -> list[Path]:
-    """The only recording has the name that was asked for."""
+    """Rename the only recording to the requested name."""
     found = []
     for path in parts:
         target = path.with_name(new.stem + path.name.removeprefix(old.stem))

@@ -1,7 +1,7 @@
-"""What a foreign file is, and what becomes of it: the one door of `fieldtwin import` besides casts of a CTD.
+"""Detect the kind of a foreign file and import it. All of `fieldtwin import` goes through here, except casts of a CTD.
 
-By content where a format has a mark (pcap, pcapng, a trace of ours, mbpoll's banner), else by the file's name. Opens files; the
-formats themselves are in `fieldtwin.formats`.
+The kind is detected by the content if the format has a mark (pcap, pcapng, a fieldtwin trace, mbpoll's banner), else by
+the file's name. This module opens files; the formats themselves are in `fieldtwin.formats`.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ MAX_LINE = 65_536
 
 @dataclass(slots=True)
 class TextSummary:
-    """What came of a log, a capture or a poll session."""
+    """The result of importing a log, a capture or a poll session."""
 
     out: Path | None = None
     records: int = 0
@@ -116,9 +116,10 @@ def import_polls(path: Path, out: Path) -> TextSummary:
 def import_capture(
     path: Path, out: Path, framing: str = "", url: str = "", header: RecordingHeader | None = None
 ) -> TextSummary:
-    """A capture or tap of ours (`fieldtwin run --capture`, `record --tap`, a log of what a verb sent) as a recording.
+    """Import a fieldtwin capture or tap as a recording.
 
-    Of several endpoints `url` says which; `framing` (rtu, ascii, mbap) where it is not the endpoint's. Raises `FileInvalid`,
+    It is of `fieldtwin run --capture`, of `record --tap`, or a command's log of sent frames. If it has several
+    endpoints, `url` selects one; `framing` (rtu, ascii, mbap) overrides the endpoint's. Raises `FileInvalid`,
     `UsageError`.
     """
     seen = [Endpoint.parse(url)] if url else endpoints_of(path)
@@ -135,13 +136,13 @@ def import_capture(
 
 
 def _captured(path: Path) -> Iterator[Captured]:
-    """What is in all parts of a capture."""
+    """Yield the content of all parts of a capture."""
     for part in parts_of(path):
         yield from read_capture(part)
 
 
 def _framing(path: Path, endpoint: Endpoint) -> str:
-    """What is spoken there, as the bytes say, or the endpoint."""
+    """Return the framing according to the bytes, else that of the endpoint."""
     if endpoint.scheme in ("udp", "tls"):
         return framing_of(endpoint)
     chunks = (
@@ -189,7 +190,7 @@ def _pair_capture(
 
 
 def write_drafts(drafts: Drafts, recording: Path, origin: str) -> list[Path]:
-    """The draft profiles beside a recording: ``NAME.unit1.yaml``."""
+    """Write the draft profiles next to a recording: ``NAME.unit1.yaml``."""
     found = []
     for unit, text in drafts.texts(recording.stem, origin).items():
         path = recording.with_suffix(f".unit{unit}.yaml")
@@ -247,7 +248,7 @@ class _New:
 
 
 class BadFile:
-    """What became no part of an exchange, kept beside a recording as a capture (``NAME.bad.jsonl``), the first `most`."""
+    """The first `most` frames that are not part of an exchange, kept next to a recording as a capture (``NAME.bad.jsonl``)."""
 
     def __init__(self, recording: Path, endpoint: str, most: int = 100_000) -> None:
         self.path = recording.with_suffix(".bad.jsonl")
@@ -263,7 +264,7 @@ class BadFile:
             self._file.close()
 
     def discard(self) -> None:
-        """The recording was none: close and remove it."""
+        """Close and remove the file of a recording that turned out to be empty."""
         self.__exit__()
         if self._file is not None:
             self.path.unlink(missing_ok=True)

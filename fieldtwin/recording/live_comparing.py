@@ -1,6 +1,6 @@
-"""A live device held against a recording: it is asked what was asked then, in the same order. Reads only, unless that is said.
+"""Compare a live device with a recording by repeating its requests in order. Reads only, unless writes are requested.
 
-It must never know a screen; what may be written is decided by who calls.
+This module must not depend on a display; its caller decides which writes are allowed.
 """
 
 from __future__ import annotations
@@ -144,8 +144,11 @@ async def compare_node(
     connector: Connector | None = None,
     clock: Clock | None = None,
 ) -> Comparison:
-    """Make the SDO uploads that a log holds again, of `node` or of all nodes that were asked. With `listen_s`, listen so long
-    afterwards, and compare what nobody asks for, too. Raises `Unreachable`, `ConnectionLost`."""
+    """Repeat the SDO uploads of a log, for `node` or for all nodes in it, and compare the results.
+
+    With `listen_s`, listen for that many seconds afterwards, and compare unrequested messages as well. Raises
+    `Unreachable`, `ConnectionLost`.
+    """
     clock, kept = clock or WallClock(), _Kept()
     nodes, left_out = set[int](), 0
     async with canopen_at(

@@ -1,7 +1,8 @@
-"""A data sheet (EDS) of a CANopen node that nobody has one of, from a log of its bus: enough to hold and play what the log has.
+"""Write a data sheet (EDS) of a CANopen node from a log of its bus, sufficient to emulate the logged behaviour.
 
-Objects are those that were asked for or written over SDO, with the sizes that they had; process data whose mapping the log does
-not tell is declared as it stands in the frame, a byte each. Names and meanings are not in a log, and not here. Pure.
+Its objects are those that were read or written over SDO, with the sizes seen; process data without a mapping in the log
+is declared as in the frame, one object for each byte. A log contains no names and meanings, and neither does the data
+sheet. Pure.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ Key = tuple[int, int]
 
 MAX_OBJECTS = 10_000
 _TYPES = {1: 0x05, 2: 0x06, 3: 0x16, 4: 0x07, 5: 0x18, 6: 0x19, 7: 0x1A, 8: 0x1B}
-"""UNSIGNED of so many bytes (CiA 301, 7.4.7.1)."""
+"""Type codes of UNSIGNED by number of bytes (CiA 301, 7.4.7.1)."""
 _OCTETS = 0x0A
 _FIRST_FREE = 0x5F00
 """Manufacturer's objects, from which on process data without a mapping is put."""
@@ -60,7 +61,7 @@ def nodes_of(frames: Iterable[tuple[int, CanFrame]]) -> list[int]:
 
 
 class LogSheet:
-    """What a log tells of `node`; `eds` is the data sheet."""
+    """The information about `node` in a log; `eds` is the data sheet."""
 
     def __init__(self, frames: Iterable[tuple[int, CanFrame]], node: int) -> None:
         self.node = node
@@ -123,7 +124,7 @@ class LogSheet:
         return _text(name, indices, self._pdos)
 
     def _declare(self, indices: dict[int, dict[int, str]], sends: bool, number: int, pdo: _Pdo) -> None:
-        """Communication and mapping of a PDO; without a mapping in the log each byte is an object of its own."""
+        """Declare communication and mapping of a PDO; without a mapping in the log each byte is a separate object."""
         base, offset = (0x180, 0x1800) if sends else (0x200, 0x1400)
         parameters = indices.setdefault(offset + number - 1, {})
         parameters.setdefault(1, _entry(0x07, "rw", f"$NODEID+0x{base + 0x100 * (number - 1):X}"))

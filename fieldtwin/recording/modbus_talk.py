@@ -1,8 +1,8 @@
-"""A TCP or UDP conversation that may be Modbus: who asks, in what framing, and its exchanges.
+"""A TCP or UDP conversation that may be Modbus: its client, its framing, and its exchanges.
 
-Nothing is taken for granted but a port that the user named: the framing is told from the first bytes of either side, and who
-asks from the port, from who opened the connection, or from the first frame. What is not Modbus is let go after
-`MAX_UNDECIDED` bytes. Sans-IO.
+Nothing is assumed except a port that the user named: the framing is found from the first bytes of either side, and the
+client from the port, from the side that opened the connection, or from the first frame. A conversation that is not
+recognised as Modbus is dropped after `MAX_UNDECIDED` bytes. Sans-IO.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ MAX_UNDECIDED = 600
 
 
 class ModbusTalk:
-    """One conversation. `server` is None until it is known to be Modbus; `foreign` says that it is something else."""
+    """One conversation. `server` is None until Modbus is recognised; `foreign` means that it is another protocol."""
 
     def __init__(
         self, conversation: Conversation, zero_ns: int, ports: Collection[int] = (), on_bad: OnBad | None = None

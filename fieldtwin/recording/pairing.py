@@ -1,8 +1,9 @@
-"""Requests and replies of others, put together to exchanges: what a capture or a tap saw, as a recording keeps it.
+"""Combine observed requests and replies into exchanges: the content of a capture or a tap in the form of a recording.
 
-A `Pairer` is fed the bytes of one connection or line, both ways, as they were seen, and gives `Exchange`s in the order of
-their requests. What is no frame, or a frame that belongs to nothing, is given to `on_bad` and counted; nothing is thrown
-away unseen. Sans-IO: it knows no files and no clocks, times come with the bytes. Bounded: `MAX_OPEN` requests wait for an answer.
+A `Pairer` is fed the bytes of one connection or line, both ways, as they were seen, and yields `Exchange`s in the order
+of their requests. Bytes that form no frame, and frames without a counterpart, are given to `on_bad` and counted; none
+is dropped silently. Sans-IO: it uses no files and no clocks; times come with the bytes. Bounded: at most `MAX_OPEN`
+requests wait for an answer.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ class Bad:
 
 @dataclass(slots=True)
 class PairCounters:
-    """What came of the frames. `malformed` are runs of bytes that are no frame, `strays` frames that answer nothing."""
+    """The counts of frames. `malformed` counts runs of bytes that form no frame, `strays` frames that answer no request."""
 
     exchanges: int = 0
     unanswered: int = 0
@@ -73,7 +74,7 @@ class Pairer(ABC):
         """Nothing follows."""
 
     def lost(self, sent: bool) -> None:  # noqa: B027 - only a stream can lose its place
-        """Bytes of one direction are missing here (a capture that dropped packets): what is half there stays so."""
+        """Note that bytes of one direction are missing (a capture dropped packets): an open frame stays incomplete."""
 
     def _bad(self, t_ns: int, sent: bool, data: bytes, why: str, *, stray: bool = False) -> None:
         if stray:
@@ -257,7 +258,7 @@ class SerialPairer(Pairer):
         self._asked = _Asked(frame, Expected(frame.unit, frame.pdu[0], size), frame.t_ns)
 
     def _settle(self, found: list[Exchange]) -> None:
-        """Another request, or the end: what is left of replies is complete, or noise."""
+        """Conclude the exchange at the next request or at the end: remaining bytes are a complete reply, or noise."""
         if self._replies.pending:
             self._take_replies(self._replies.flush(self._expected), found)
         if (asked := self._asked) is not None:
@@ -278,7 +279,7 @@ class SerialPairer(Pairer):
 
 
 class OneWirePairer(SerialPairer):
-    """A line of which nobody said which way a frame went: a frame that can be the answer is it."""
+    """A line without known directions: a frame that can be the answer to the last request is taken for it."""
 
     def feed(self, sent: bool, data: bytes, t_ns: int) -> list[Exchange]:
         found: list[Exchange] = []

@@ -34,7 +34,7 @@ Sink = Callable[[Exchange], None]
 
 @dataclass(slots=True)
 class PollCounters:
-    """What was done so far."""
+    """The progress of the polling."""
 
     rounds: int = 0
     missed: int = 0
@@ -45,7 +45,7 @@ class PollCounters:
 
 
 class Round(Protocol):
-    """What is asked in each round."""
+    """The requests of a round."""
 
     @property
     def asks(self) -> list[tuple[int, bytes]]:
@@ -56,7 +56,7 @@ class Round(Protocol):
 
 
 class ProfileRound:
-    """All readable tags of a profile, in the fewest reads; what is refused is recorded, and then read in parts."""
+    """All readable tags of a profile, in the fewest reads; a refused read is recorded, and then repeated in parts."""
 
     def __init__(self, profile: DeviceProfile, unit: int, groups: Iterable[str] = ()) -> None:
         self._unit = unit
@@ -80,7 +80,7 @@ class ProfileRound:
             plan.pass_ended()
 
     async def _read(self, plan: GroupPlan, read: Read, asker: Asker, sink: Sink) -> tuple[Read, ...]:
-        """What is to be read instead."""
+        """Return the reads that replace this one."""
         exchange = await asker.ask(self._unit, _request(read))
         if exchange is None:
             return ()
@@ -139,7 +139,10 @@ async def record_polls(
     connector: Connector | None = None,
     clock: Clock | None = None,
 ) -> None:
-    """Poll until `stop` is set, or `rounds` are done (0: no limit). Raises `Unreachable` only where nobody was there at first."""
+    """Poll until `stop` is set, or `rounds` are done (0: no limit).
+
+    Raises `Unreachable` only if the first connection fails.
+    """
     clock = clock or WallClock()
     zero_ns = clock.monotonic_ns()
 
@@ -252,9 +255,9 @@ async def follow_bus(
     connector: Connector | None = None,
     clock: Clock | None = None,
 ) -> int:
-    """Every frame of a CAN bus into `sink` until `stop`; nothing is sent. How many frames were lost here for want of speed.
+    """Write every frame of a CAN bus to `sink` until `stop`, and return the number of frames lost here by overload.
 
-    Raises `Unreachable` where there is no bus, `ConnectionLost` when it is gone.
+    Nothing is sent. Raises `Unreachable` if the bus cannot be opened, `ConnectionLost` when it is lost.
     """
     clock = clock or WallClock()
     async with frames_at(target.url, target.bitrate, taps=[sink], connector=connector, clock=clock) as connection:

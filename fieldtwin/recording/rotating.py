@@ -22,12 +22,12 @@ _NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | getattr(os, "O_CLOEX
 
 
 class RotatingFile:
-    """Appends lines to `path` and the parts behind it. No part that is there already is overwritten.
+    """A file that appends lines to `path` and its further parts. An existing part is never overwritten.
 
-    A new part begins when `max_bytes` would be exceeded, or with the first line `max_s` seconds behind the first of a part
-    (0: never). At most `keep` parts stay (0: all), the oldest go; `removed` counts those. Raises `FileInvalid` when a part
-    exists already or the disk refuses; what was written before is whole. As a context manager it leaves no file behind
-    when an error ends the block before the first line: the name is free for the next try.
+    A new part begins when `max_bytes` would be exceeded, or with the first line `max_s` seconds after the first of a
+    part (0: never). At most `keep` parts are kept (0: all), the oldest are removed; `removed` counts those. Raises
+    `FileInvalid` when a part exists already or writing fails; everything written before is complete. As a context
+    manager it leaves no file if an error ends the block before the first line: the name is free for the next attempt.
     """
 
     def __init__(
@@ -56,7 +56,7 @@ class RotatingFile:
             self.path.unlink(missing_ok=True)
 
     def line(self, t_s: float, line: bytes) -> None:
-        """Append `line` (newline included), which is of the time `t_s`."""
+        """Append `line` (newline included), whose time is `t_s`."""
         if self._fd < 0:
             raise Bug("a closed file was written to", where=str(self.path))
         self._began_s = t_s if self._began_s is None else self._began_s
@@ -112,9 +112,10 @@ def part(path: Path, number: int) -> Path:
 
 
 def parts_of(path: Path) -> list[Path]:
-    """The parts of the recording at `path`, in order: those that are there, from the oldest that was kept.
+    """Return the existing parts of the recording at `path`, in order, from the oldest that was kept.
 
-    A last part without a header is none: its recorder was killed when it had made the file and not yet begun it.
+    A last part without a header does not count: its recorder was killed after creating the file and before writing to
+    it.
     """
     numbers = sorted(
         int(name)

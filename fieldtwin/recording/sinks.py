@@ -1,6 +1,6 @@
-"""Where a recording in progress goes: exchanges, CAN frames, or the bytes of a line, into a file that goes on for days.
+"""Destinations of a recording in progress: exchanges, CAN frames, or the bytes of a line, in a file that may grow for days.
 
-Each is one write a record, so that whoever kills the recorder loses the last one at most.
+Each record is one write, so that a killed recorder loses at most the last one.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ class ExchangeSink:
 
 
 class CanLogSink(Tap):
-    """Frames of a bus into `file` as candump writes them, with UTC times of the clock as it was at the start.
+    """A tap that writes the frames of a bus to `file` in candump format, with UTC times by the clock's state at the start.
 
-    A tap may not fail: when the disk refuses, `check` says so.
+    A tap may not fail: when writing fails, `check` raises the error.
     """
 
     def __init__(self, file: RotatingFile, clock: Clock, channel: str = "can0") -> None:

@@ -22,7 +22,10 @@ from fieldtwin.recording.tapping import Say
 
 
 class Directions:
-    """Cuts one stream into frames and says which way each went: SENT is towards a device. `framing` is rtu or ascii. Pure."""
+    """A splitter of one stream into frames that finds each frame's direction: SENT is towards a device.
+
+    `framing` is rtu or ascii. Pure.
+    """
 
     def __init__(self, framing: str) -> None:
         self._splitter = splitter(framing)
@@ -36,7 +39,7 @@ class Directions:
         return found + [self._told(frame) for frame in self._splitter.feed(data, t_ns)]
 
     def settle(self, now_ns: int) -> list[tuple[Direction, Frame]]:
-        """It is `now_ns`: after a silence, what is incomplete stays so."""
+        """Return the frames that a silence before `now_ns` has ended; an incomplete frame stays incomplete."""
         if self._last_ns is None or now_ns - self._last_ns <= SETTLE_NS:
             return []
         return self.flush()

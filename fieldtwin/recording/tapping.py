@@ -1,7 +1,7 @@
-"""Standing between a master and its devices: every byte is passed on as it came, and written down with its time and direction.
+"""Relay the bytes between a Modbus client and its devices unchanged, and record them with time and direction.
 
-`near` is where the master comes to: a serial port, a virtual one that is made there, or a TCP port that is listened on. `far` is
-the device's side. Nothing is looked into: what was spoken is found afterwards.
+`near` is where the client connects: a serial port, a virtual one that is made there, or a TCP port that is listened on.
+`far` is the device's side. The bytes are not interpreted; that is done afterwards.
 """
 
 from __future__ import annotations
@@ -24,9 +24,10 @@ Say = Callable[[str], None]
 
 
 class LineTap:
-    """Passes bytes on between `near` and `far`, and tells `sink`. `say` is told what a person wants to know.
+    """A relay between `near` and `far` that reports to `sink`. `say` is called with messages for the user.
 
-    A TCP master that leaves is nothing wrong, nor is a device that cannot be reached for it: the next one may come.
+    A TCP client that leaves is not an error, nor is a device that cannot be reached for it: the next client may
+    connect.
     """
 
     def __init__(
@@ -74,7 +75,7 @@ class LineTap:
         path = Path(self._near.path)
         if self._near.scheme in SERIAL_SCHEMES and path.is_char_device():
             return await self._connector.open_bytes(self._near)
-        from fieldtwin.emulators.endpoints.pty import PtyEnd  # not where there are no ptys
+        from fieldtwin.emulators.endpoints.pty import PtyEnd  # imported late: not every system has pseudo-terminals
 
         serial = Endpoint("rtu", path=self._near.path, params=self._near.params)
         return await PtyEnd.open(path, serial)

@@ -1,6 +1,6 @@
-"""What one test has: a field side on wires of its own, with what is said on them, and if it wants, the gateway and PLC before it.
+"""The setup of one test: a field simulator with its own endpoints and their traffic, optionally with gateway and PLC.
 
-A `Bench` lives from `open` to `aclose`; its folder holds its files and virtual serial ports, and goes with it.
+A `Bench` lives from `open` to `aclose`; its folder holds its files and virtual serial ports, and is removed with it.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ class Bench:
             self.plc.alive()
 
     def set(self, device: str, tag: str, value: Any) -> None:
-        """From now on `device` holds `value` for `tag`; None: what it says by itself again."""
+        """Make `device` hold `value` for `tag`; None: return to its own value."""
         self._tag(device, tag)
         self.field.faults.set_value(device, tag, value)
 

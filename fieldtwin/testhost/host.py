@@ -1,7 +1,8 @@
-"""The process behind a test run: emulated devices, whole field sides and stepped programs, made and ended as tests ask.
+"""The process behind a test run: emulated devices, whole field simulators and stepped programs, created and ended on request.
 
-It speaks the control channel's protocol over its own input and output (docs/testing.md has the verbs), so it may run in another
-virtual environment or in an image, and ends when whoever started it ends. Nothing of a test runner is known here.
+It uses the control channel's protocol over its standard input and output (docs/testing.md lists the commands), so it
+may run in another virtual environment or in an image, and it ends with the process that started it. It does not depend
+on a test runner.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from fieldtwin.twin.site.data_files import find
 from fieldtwin.twin.site.system import System, load_system
 
 MOST = 1_000
-"""Benches and programs at once: who forgets to end them is told."""
+"""Maximum number of simultaneous benches and programs; the error tells the user to end unused ones."""
 
 
 class Host:
@@ -37,7 +38,7 @@ class Host:
 
     def __init__(self, *, trust: bool = False) -> None:
         self._trust = trust
-        """Templates of strangers may run: somebody said so when the tests were started."""
+        """Foreign templates may run: the user allowed it when the tests were started."""
         self._clock = WallClock()
         self._benches: dict[int, Bench] = {}
         self._programs: dict[int, SteppedProgram] = {}
@@ -95,7 +96,7 @@ class Host:
         return {"fieldtwin": __version__, "pid": os.getpid()}
 
     async def _device(self, args: dict[str, Any]) -> dict[str, Any]:
-        """One device: what `Wanted` says, `profiles` (folders), `beside` (the test's folder)."""
+        """Open one device: the fields of `Wanted`, `profiles` (folders), `beside` (the test's folder)."""
         wanted = _wanted(args)
         beside = Path(args["beside"]) if args.get("beside") else None
         profiles = tuple(map(Path, args.get("profiles") or ()))

@@ -1,6 +1,7 @@
-"""A system of one device, written out as files: what a test says of a device becomes what a field side is made from.
+"""Write a system of one device as files: a test's description of a device becomes the input of a field simulator.
 
-So a device in a test is the device of any system: the same emulator, the same faults, the same names. Pure but for the files.
+So a device in a test is the device of any system: the same emulator, the same faults, the same names. Pure except for
+the files.
 """
 
 from __future__ import annotations
@@ -24,7 +25,10 @@ KINDS = ("pty", "tcp", "udp", "rtu+tcp", "can")
 
 @dataclass(frozen=True)
 class Wanted:
-    """What a test asked for. `on` is one of `KINDS`, or ``can:INTERFACE/CHANNEL``; "" what such a device usually has."""
+    """A test's request for a device.
+
+    `on` is one of `KINDS`, or ``can:INTERFACE/CHANNEL``; "" selects the device's usual one.
+    """
 
     device: str
     on: str = ""
@@ -39,10 +43,10 @@ class Wanted:
 
 
 def write_system(wanted: Wanted, folder: Path, profiles: tuple[Path, ...] = (), beside: Path | None = None) -> Path:
-    """Write the system file and its prototype file into `folder`; the former's path. `beside` is the folder of the test, where
-    profiles and recordings of its own may lie.
+    """Write the system file and its prototype file into `folder`; return the path of the system file.
 
-    Raises `UsageError` for what there is not, `FileInvalid` for a profile that is none.
+    `beside` is the folder of the test, which may contain its own profiles and recordings. Raises `UsageError` for a
+    missing file, `FileInvalid` for an invalid profile.
     """
     path = find("devices", wanted.device, beside=beside / "x" if beside else None, extra=profiles)
     profile = load_profile(path)

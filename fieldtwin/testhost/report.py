@@ -1,4 +1,4 @@
-"""A test run's results as one HTML page with its requirement matrix: what the plugin collected, by the report of scenarios."""
+"""Write a test run's results as one HTML page with its requirement matrix, from the plugin's data, by the scenario report."""
 
 from __future__ import annotations
 
@@ -13,8 +13,11 @@ _VERDICTS = {verdict.value: verdict for verdict in Verdict}
 
 
 def write_report(args: dict[str, Any]) -> None:
-    """Write ``file`` from ``tests`` (name, verdict, requirements, why, text, took_s, reproduce, file, line, case, role,
-    danger), ``title``, ``reproduce``, ``versions``. Raises `UsageError` for a verdict that there is not."""
+    """Write ``file`` from the data of a test run.
+
+    The data are ``tests`` (name, verdict, requirements, why, text, took_s, reproduce, file, line, case, role, danger),
+    ``title``, ``reproduce``, ``versions``. Raises `UsageError` for an unknown verdict.
+    """
     results = []
     for test in args.get("tests") or ():
         verdict = _VERDICTS.get(str(test.get("verdict")))

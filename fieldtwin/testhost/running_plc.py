@@ -1,7 +1,7 @@
-"""Gateway and PLC of a bench's system, as processes against its emulated field side: what a test watches and steers.
+"""Gateway and PLC of a bench's system, as processes connected to its emulated field, which a test observes and controls.
 
-They are those of every run, on the wall clock; what was retained before is not taken. It knows no test, and changes nothing of
-the field side.
+They are those of every run, on the wall clock; retained values of earlier runs are not used. The module does not depend
+on tests, and changes nothing in the field simulator.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class RunningPlc:
             system=str(system.path.resolve()),
             run_dir=str(folder),
             allow_writes=True,
-            mapping=mapping_to_json(mapping),  # and nothing but that: what is not emulated is not opened
+            mapping=mapping_to_json(mapping),  # only these: endpoints that are not emulated are not opened
             profiles=profiles,
         )
         config = folder / "gateway.json"

@@ -1,6 +1,7 @@
-"""A PLC program that a test steps: inputs in, so many scans at a frozen cycle, outputs out. No task, no image, no wall clock.
+"""A PLC program that a test steps: inputs in, scans of a constant cycle, outputs out. No task, no image, no wall clock.
 
-The program is the one of any system, in Python, Structured Text or a PLCopen export; its time is what the test lets pass.
+The program is the one of any system, in Python, Structured Text or a PLCopen export; the test decides how much time
+passes.
 """
 
 from __future__ import annotations
@@ -21,11 +22,14 @@ QUALITIES = {quality.name.lower(): quality for quality in Quality}
 
 
 class SteppedProgram:
-    """One program. An input is BAD, and has no value, until it is set; it keeps what it was set to, but for messages, which are
-    there for one scan."""
+    """One program.
+
+    An input is BAD, and has no value, until it is set; it keeps its value, except for messages, which are present for
+    one scan.
+    """
 
     def __init__(self, source: str, folders: tuple[str, ...], cycle_ms: float) -> None:
-        """Raises `FileInvalid` for a program that is none."""
+        """Load the program. Raises `FileInvalid` for an invalid one."""
         if cycle_ms <= 0:
             raise UsageError("a cycle", expected="more than 0 ms", got=f"{cycle_ms:g} ms")
         self.program: Program = load_program(source, folders)
@@ -40,7 +44,7 @@ class SteppedProgram:
         }
 
     def set(self, name: str, value: Any, quality: str = "good") -> None:
-        """What an input is from the next scan on; None: bad, without a value. A message is text or hex bytes."""
+        """Set an input from the next scan on; None: bad, without a value. A message is text or hex bytes."""
         variable = self.program.variables.get(name)
         if variable is None or variable.role is not Role.INPUT:
             inputs = [v.name for v in self.program.variables.values() if v.role is Role.INPUT]
@@ -60,7 +64,7 @@ class SteppedProgram:
         self._inputs[name] = TagValue(value, good, reason, self.now_ns)
 
     def scan(self, scans: int) -> None:
-        """So many scans. Raises `ProgramFailed` with file and line where the program fails."""
+        """Run `scans` scans. Raises `ProgramFailed` with file and line where the program fails."""
         if not 0 < scans <= MAX_SCANS:
             raise UsageError("scans at once", expected=f"1 to {MAX_SCANS:,}", got=str(scans))
         for _ in range(scans):

@@ -1,6 +1,6 @@
-"""What was exchanged on the wires of a field side, decoded: requests with their answers, messages; numbered and bounded.
+"""The decoded traffic of a field simulator: requests with their answers, and messages; numbered and bounded.
 
-Fed with bytes by the emulators' ends, with frames by a listener on a CAN bus. Knows no test.
+It is fed with bytes by the emulators, and with frames by a listener on a CAN bus. It does not depend on tests.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class WireLog:
         self._feed(bus, end, {"dir": way, "bytes": data.hex()})
 
     def on_frame(self, bus: str, frame: CanFrame) -> None:
-        """A frame on a CAN bus, whoever sent it."""
+        """Add a frame on a CAN bus, from any sender."""
         data: dict[str, Any] = {"dir": "received", "id": frame.can_id, "bytes": frame.data.hex()}
         data |= {key: True for key, on in (("ext", frame.extended), ("rtr", frame.remote), ("err", frame.error)) if on}
         self._feed(bus, None, data)
@@ -73,8 +73,11 @@ class WireLog:
             self._kept.append((self.number, exchange))
 
     def since(self, number: int) -> list[dict[str, Any]]:
-        """Those after `number`, in the order in which they ended, `AT_ONCE` at most, as plain data with their number, times (s
-        since the log began) and words. Of secrets there is no value. Looking changes nothing."""
+        """Return the exchanges after `number`, in the order in which they ended, at most `AT_ONCE`.
+
+        They are plain data with their number, times (s since the log began) and words, without the values of secrets. A
+        call has no side effects.
+        """
         found = [(n, e) for n, e in self._kept if n > number][:AT_ONCE]
         return [_plain(n, e) for n, e in found]
 

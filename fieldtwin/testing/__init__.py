@@ -1,4 +1,5 @@
-"""What tests of somebody's drivers hold: devices, field sides, wires, programs and scenarios, run by a process elsewhere.
+"""The objects that tests of drivers use: devices, field simulators, connections, programs and scenarios.
 
-Nothing here imports more than the standard library: the process may live in a virtual environment or an image of its own.
+Another process runs them. Nothing here imports more than the standard library: the process may live in a separate
+virtual environment or image.
 """

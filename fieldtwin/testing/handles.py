@@ -13,8 +13,11 @@ from fieldtwin.testing.wire import Wire
 
 
 class Endpoint:
-    """Where something is reached: `url`, and as far as there is one `path` (serial port), `host` and `port`, `interface` and
-    `channel` (python-can), `baudrate` and `frame`. A virtual serial port has no parity: some libraries must be told 8N1."""
+    """The address of a device or bus.
+
+    It has `url`, and where they apply `path` (serial port), `host` and `port`, `interface` and `channel` (python-can),
+    `baudrate` and `frame`. A virtual serial port has no parity: some libraries must be configured with 8N1.
+    """
 
     def __init__(self, words: dict[str, Any]) -> None:
         self.url: str = words["url"]
@@ -59,13 +62,15 @@ class Device:
         return getattr(self.endpoint, name)
 
     def set(self, tag: str, value: float | str | bool | None) -> None:
-        """From now on the device holds `value`, in engineering units, whatever it plays; None: what it plays again."""
+        """Make the device hold `value`, in engineering units, whatever it replays; None: return to its own values."""
         __tracebackhide__ = True
         self._runner.call("set", id=self._bench, device=self.name, tag=tag, value=value)
 
     def held(self, tag: str) -> Any:
-        """What the device holds, in engineering units: also what a driver has written. Of a device that samples or plays a
-        recording, what it showed last; None: nothing yet."""
+        """Return the device's value in engineering units, including one that a driver has written.
+
+        For a device that samples or replays a recording it is the last value shown; None: no value yet.
+        """
         __tracebackhide__ = True
         return self._runner.call("held", id=self._bench, device=self.name, tag=tag)
 
@@ -109,10 +114,10 @@ class Prototype:
 
 
 class Plc:
-    """A PLC program that is stepped. Its time is its own: 10 s of it take milliseconds.
+    """A PLC program that is stepped. It has its own time: 10 s of it take milliseconds.
 
-    ``plc.set(level=10.0)`` sets inputs (None: bad), ``plc.scan()`` runs one scan, ``plc.run(2.5)`` so many seconds of them;
-    ``plc["valve"]`` is a variable after the last scan, of a message output the list of what was sent.
+    ``plc.set(level=10.0)`` sets inputs (None: bad), ``plc.scan()`` runs one scan, ``plc.run(2.5)`` runs scans for 2.5
+    seconds; ``plc["valve"]`` is a variable after the last scan, for a message output the list of sent messages.
     """
 
     def __init__(
@@ -127,13 +132,13 @@ class Plc:
         self._runner = runner
 
     def set(self, quality: str = "good", **inputs: Any) -> Plc:
-        """Inputs from the next scan on; they stay, but for messages, which are there for one."""
+        """Set inputs from the next scan on; they keep their values, except messages, which are present for one scan."""
         __tracebackhide__ = True
         self._runner.call("input", id=self.id, values=inputs, quality=quality)
         return self
 
     def scan(self, scans: int = 1) -> Plc:
-        """So many scans."""
+        """Run `scans` scans."""
         __tracebackhide__ = True
         return self._took(self._runner.call("scan", id=self.id, scans=scans))
 

@@ -1,4 +1,4 @@
-"""A scenario run by `fieldtwin test`, in a process of its own: its verdict, and why.
+"""The result of a scenario that `fieldtwin test` ran in a separate process: its verdict, and the reason.
 
 Standard library only: see `fieldtwin.testing.runner`.
 """
@@ -50,12 +50,12 @@ class Outcome:
         return "\n".join(self.lines())
 
     def __repr__(self) -> str:
-        """In one line, as pytest shows it in a failed assertion; the lines stand in the report's section ``scenario``."""
+        """Return one line, which pytest shows in a failed assertion; the details are in the report's section ``scenario``."""
         reason = " ".join(self.reason.split())
         return f"<{self.verdict} scenario {self.name!r}" + (f": {reason}>" if reason else ">")
 
     def lines(self) -> list[str]:
-        """The verdict, what was expected and seen, and the line that runs it again."""
+        """Return the verdict, the expected and observed values, and the command line that repeats the run."""
         said = [f"{self.verdict.upper()}: {self.name}" + (f": {self.reason}" if self.reason else "")]
         for check in self.checks:
             if check["verdict"] != "passed":
@@ -74,7 +74,7 @@ def run_scenario(
     profiles: Sequence[str] = (),
     trust: bool = False,
 ) -> Outcome:
-    """Run one. Raises `FieldtwinRefused` for a file that is no scenario, `FieldtwinUnavailable` where nothing runs it."""
+    """Run one scenario. Raises `FieldtwinRefused` for an invalid file, `FieldtwinUnavailable` if fieldtwin cannot be run."""
     argv = [*command, "test", str(path), "--json"]
     argv += ["--seed", str(seed)] if seed is not None else []
     argv += ["--target", target] if target else []

@@ -1,4 +1,4 @@
-"""What a whole test run gave, for one HTML page (`--fieldtwin-html`): from pytest's reports, also those of xdist's workers."""
+"""Collect the results of a whole test run for one HTML page (`--fieldtwin-html`), from pytest's reports, also xdist's."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _WORKER = re.compile(r"\[gw\d+\] ")
 
 
 class Results:
-    """A plugin of its own, registered where the page was asked for."""
+    """A separate plugin, registered if the page was requested."""
 
     def __init__(self, config: pytest.Config) -> None:
         self._config = config

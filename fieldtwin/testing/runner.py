@@ -1,6 +1,6 @@
-"""The process that runs what tests ask for, and talking to it: one for a test session, started when it is first needed.
+"""Start the process that serves the tests, and communicate with it: one per test session, started on first use.
 
-Standard library only, and no other part of fieldtwin: what is imported here is imported into the user's own test run.
+Standard library only, and no other part of fieldtwin: modules imported here are imported into the user's own test run.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class FieldtwinUnavailable(Exception):
 
 
 class FieldtwinRefused(Exception):
-    """What was asked for makes no sense, or could not be done; `kind` is the error's class over there."""
+    """Raised for a request that makes no sense or could not be fulfilled; `kind` is the error's class in the other process."""
 
     def __init__(self, message: str, kind: str = "") -> None:
         super().__init__(message)
@@ -35,7 +35,7 @@ class FieldtwinRefused(Exception):
 
 
 def command_of(said: str = "") -> list[str]:
-    """The command `fieldtwin`: what was `said`, else FIELDTWIN_COMMAND, else this very Python's."""
+    """Return the command `fieldtwin`: `said`, else FIELDTWIN_COMMAND, else this Python's."""
     text = said or os.environ.get(COMMAND_VARIABLE, "")
     return shlex.split(text) if text else [sys.executable, "-P", "-m", "fieldtwin"]
 

@@ -18,9 +18,10 @@ WITHIN_S = 10.0
 
 
 class RunningPlc:
-    """``plc["relay.state"]`` is a program's variable or a tag of a device as the PLC has it now, a state by its name.
+    """A running PLC.
 
-    It runs by the wall clock; `wait` waits. What a test steers goes on record as done by ``test``, as what people do.
+    ``plc["relay.state"]`` is the current value of a program's variable or a device's tag, a state by its name. It runs
+    by the wall clock; `wait` waits. A test's commands are recorded as those of ``test``, in the way of a user's.
     """
 
     def __init__(self, runner: Runner, bench: int, profiles: Sequence[str] = ()) -> None:
@@ -82,7 +83,7 @@ class RunningPlc:
         self._steer("pause")
 
     def step(self, scans: int = 1) -> None:
-        """So many scans, while paused."""
+        """Run `scans` scans while paused."""
         self._steer("step", count=scans)
 
     def go(self) -> None:

@@ -1,4 +1,4 @@
-"""The wire of an emulated device as a test sees it: what was asked and answered on it, in words and values; faults on it.
+"""The traffic of an emulated device for a test: requests and replies, in words and values; and faults on its connection.
 
 Standard library only: see `fieldtwin.testing.runner`.
 """
@@ -86,13 +86,15 @@ class Wire:
         self._after_s = 0.0
 
     def exchanges(self, *, strays: bool = False, **like: Any) -> list[Exchange]:
-        """Return what was exchanged since the test began, or since `clear`, by the time of the request; the latest 20,000 are
-        kept. Looking changes nothing: a request that waits for its reply has the problem ``pending``, and is whole later.
+        """Return the exchanges since the test began, or since `clear`, by the time of the request.
 
-        `like` leaves those whose fields are equal: ``exchanges(function=16)``; ``tag="period"`` those that carry that tag.
-        Frames that answer no request are left out, unless `strays` is true or ``problem="stray"`` is asked for.
+        The latest 20,000 are kept. A call has no side effects: a request that waits for its reply has the problem
+        ``pending``, and is complete in a later call.
 
-        Raises `TypeError` where no exchange can be like that: an unknown field, problem or access.
+        `like` selects those whose fields are equal: ``exchanges(function=16)``; ``tag="period"`` those that carry that
+        tag. Frames that answer no request are omitted, unless `strays` is true or ``problem="stray"`` is given.
+
+        Raises `TypeError` for a selection that no exchange can match: an unknown field, problem or access.
         """
         __tracebackhide__ = True
         _check(like)
@@ -129,7 +131,7 @@ class Wire:
             self._since = answer["exchanges"][-1]["number"]
 
     def count(self, **like: Any) -> int:
-        """Return how many `exchanges` there are. Stray frames are no requests and are not counted."""
+        """Return the number of `exchanges`. Stray frames are not requests and are not counted."""
         return len(self.exchanges(**like))
 
     def expect(
@@ -143,10 +145,10 @@ class Wire:
     ) -> list[Exchange]:
         """Wait until there are `times` such exchanges (by default 1), and return them.
 
-        Instead of `times`, give bounds: `at_least` returns as soon as there are so many, `at_most` watches for all of
-        `within_s`, because one more could come until then. A pending request is waited for; at the end of `within_s` it counts,
-        and counts as one with ``no reply``. Raises `AssertionError` with what was on the wire where the number is another.
-        Blocks; in a coroutine use `expect_async`.
+        Instead of `times`, give bounds: `at_least` returns as soon as that number is reached, `at_most` observes for
+        all of `within_s`, because one more could come until then. A pending request is waited for; at the end of
+        `within_s` it counts, and counts as one with ``no reply``. Raises `AssertionError` with the observed traffic if
+        the number differs. Blocks; in a coroutine use `expect_async`.
         """
         __tracebackhide__ = True
         wanted = _Wanted.of(times, at_least, at_most, like)
@@ -204,7 +206,7 @@ class Wire:
 
 
 def _check(like: dict[str, Any]) -> None:
-    """Refuse what no exchange can be like: counted zero times it would hold for ever."""
+    """Refuse a selection that no exchange can match: a test that expects zero of them would always pass."""
     __tracebackhide__ = True
     for key in like.keys() - _FIELDS - {"tag"}:
         near = get_close_matches(key, [*_FIELDS, "tag"], 1)

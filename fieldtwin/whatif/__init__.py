@@ -1,1 +1,1 @@
-"""What-if: a prototype forked in virtual time from what is known of its plant, run ahead, and asked what came of it."""
+"""What-if: forks a prototype in virtual time from the known state of its plant, runs it ahead, and reports the outcome."""

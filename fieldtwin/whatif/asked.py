@@ -1,7 +1,8 @@
-"""The process that is asked: ``python -m fieldtwin.whatif.asked``, one JSON object in, one out.
+"""The process that answers a question: ``python -m fieldtwin.whatif.asked``. It reads one JSON object and writes one.
 
-In, as `Asked`: a system, what is known of it, a command and what must hold. Out: ``{"objection": TEXT}``, empty when nothing
-speaks against the command. With ``"only_check": true`` nothing is run; what is wrong with the question is the objection.
+Input, as `Asked`: a system, its known state, a command and the requirements. Output: ``{"objection": TEXT}``, empty if
+nothing speaks against the command. With ``"only_check": true`` nothing is run, and the objection is an error in the
+question.
 """
 
 from __future__ import annotations
@@ -21,11 +22,11 @@ from fieldtwin.whatif.plan import Plan
 from fieldtwin.whatif.state import KnownState
 
 NICE = 5
-"""Whoever runs beside it, a plant or its twin, goes first."""
+"""Niceness of the process: a plant or twin on the same computer has priority."""
 
 
 def objection(asked: Asked) -> str:
-    """What a prototype says of the command; empty when everything that is required holds."""
+    """Return the prototype's objection to the command; empty if all requirements hold."""
     fork = Fork(
         asked.system,
         KnownState(asked.values, asked.programs, source="the twin's knowledge"),
@@ -45,7 +46,7 @@ def objection(asked: Asked) -> str:
 
 
 def told(outcome: Outcome) -> str:
-    """Why a plan is not to be followed: that its fork failed, or the first requirement that does not hold."""
+    """Return why a plan must not be followed: its fork failed, or the first requirement that does not hold."""
     if outcome.error:
         return f"the prototype failed: {outcome.error}"
     for requirement in outcome.requirements:
@@ -61,7 +62,7 @@ def main() -> int:
     if hasattr(os, "nice"):
         os.nice(NICE)
     answers = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # what control logic prints is no answer
+    os.dup2(2, 1)  # output of control logic must not mix with the answer
     asked = msgspec.json.decode(sys.stdin.buffer.read(), type=Asked)
     with answers:
         answers.write(msgspec.json.encode({"objection": objection(asked)}) + b"\n")

@@ -1,6 +1,6 @@
-"""Asks a prototype on behalf of a digital twin: a process for each question, bounded in time, beside the twin that goes on.
+"""Asks a prototype on behalf of a digital twin: one process per question, with a time limit, while the twin continues.
 
-No answer is an objection: a prototype that fails, that takes too long or that nobody can fork lets no command through.
+A missing answer is an objection: if the prototype fails, takes too long or cannot be forked, the command is not sent.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ from fieldtwin.whatif.state import Number
 
 TIMEOUT_S = 60.0
 TOLD_WITHIN_S = 12.0
-"""So long after its beginning a twin knows of everything: a plant tells every ten seconds what does not change."""
+"""Time after its start when a twin knows every value: a plant repeats unchanged values every ten seconds."""
 LOOK_MS = 100
 MOST_KEPT = 1 << 16
-"""Bytes of what the process says."""
+"""Bytes of the process's output that are kept."""
 
 
 class Asked(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A question as it goes to the process `fieldtwin.whatif.asked`.
+    """A question as it is sent to the process `fieldtwin.whatif.asked`.
 
-    `require`, `finally_`, `horizon_s` and `settle_s` as in `fieldtwin.twin.model.mape.what_if.Question`.
+    `require`, `finally_`, `horizon_s` and `settle_s` are as in `fieldtwin.twin.model.mape.what_if.Question`.
     """
 
     system: str
@@ -53,7 +53,7 @@ class Asked(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True)
 class Subject:
-    """What is forked: the system that the twin has, and where its prototype is described."""
+    """The system to fork: the twin's system, its profiles, and its prototype file."""
 
     system: System
     profiles: tuple[Path, ...] = ()
@@ -61,7 +61,7 @@ class Subject:
 
 
 class Asking:
-    """A `WhatIf`. `run` belongs to the twin's nursery; `known` is kept up by whoever sees the events."""
+    """A `WhatIf`. `run` belongs in the twin's nursery. The receiver of the events must pass them to `known`."""
 
     def __init__(
         self,
@@ -90,21 +90,21 @@ class Asking:
         return self._answer
 
     async def recall(self, store: KnowledgeStore, origins: Sequence[str]) -> None:
-        """Begin with what the twin knew before it was restarted."""
+        """Restore what the twin knew before it was restarted."""
         from fieldtwin.whatif.known import recall
 
         for origin in origins:
             await recall(store, origin, self.known.take)
 
     async def check(self, questions: Sequence[Question]) -> None:
-        """Whether the prototype can be made and what is required can be looked at. Raises `UsageError`."""
+        """Check that the prototype can be made and that the requirements can be evaluated. Raises `UsageError`."""
         for question in questions:
             found = await self._process(self._form(question, only_check=True))
             if found:
                 raise UsageError(f"a prototype of {self._subject.system.name} cannot be asked: {found}")
 
     async def run(self) -> None:
-        """Answer questions, for good."""
+        """Answer questions until cancelled."""
         self._began_ns = self._clock.monotonic_ns()
         while True:
             await self._wake.wait()
@@ -145,7 +145,7 @@ class Asking:
         )
 
     async def _process(self, asked: Asked) -> str:
-        """The objection of a process of its own. Raises `Unreachable` when it took too long or died."""
+        """Return the objection of a separate process. Raises `Unreachable` if it took too long or died."""
         try:
             process = await asyncio.create_subprocess_exec(
                 *child_command("fieldtwin.whatif.asked"),
@@ -171,11 +171,11 @@ class Asking:
 
 
 async def _talk_with(process: asyncio.subprocess.Process, question: bytes) -> tuple[bytes, bytes]:
-    """Tell it the question; the ends of what it answers and complains of, however much that is."""
+    """Send the question, and return the last `MOST_KEPT` bytes of the process's stdout and stderr."""
     assert process.stdin is not None
     assert process.stdout is not None
     assert process.stderr is not None
-    with suppress(ConnectionError):  # it died: its code says more
+    with suppress(ConnectionError):  # it died: its exit code tells more
         process.stdin.write(question)
         await process.stdin.drain()
     process.stdin.close()

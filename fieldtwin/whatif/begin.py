@@ -1,4 +1,4 @@
-"""Begins a fork with what is known: programs go on from their variables, devices from their values."""
+"""Initializes a fork with the known state: programs continue from their variables, devices from their values."""
 
 from __future__ import annotations
 
@@ -15,18 +15,19 @@ from fieldtwin.whatif.state import KnownState, Number
 
 
 def retain_for(state: KnownState, run_dir: Path) -> None:
-    """Let the fork's PLC find what the other one retained."""
+    """Copy retained variables to where the fork's PLC finds them."""
     if state.retained is not None:
         shutil.copyfile(state.retained, run_dir / "retain")
 
 
 def begin(run: VirtualPrototype, state: KnownState) -> list[str]:
-    """For `VirtualPrototype(prepare=...)`. Returns the devices of which values are known that could not be taken over.
+    """Initialize `run`, for `VirtualPrototype(prepare=...)`. Return the devices whose known values could not be
+    applied.
 
-    A recording is sought through for its nearest row, a simulation by formulas goes on from the values, registers hold them.
-    A device that has its state to itself (a drive's motor, a model in Python) begins as it always does. What the
-    programs command is written by the gateway anew. A program that keeps its period to itself is commanded what is
-    known. Raises `FileInvalid` for a variable that cannot hold its value.
+    A recording is searched for its nearest row, a simulation by formulas continues from the values, and registers take
+    them. A device with internal state (a drive's motor, a model in Python) starts as usual. The gateway writes the
+    outputs of the programs again. A program whose period is not one of its variables is commanded the known period.
+    Raises `FileInvalid` for a variable that cannot hold its value.
     """
     for bound in run.plc.programs:
         known = state.programs.get(bound.name)
@@ -47,13 +48,13 @@ def begin(run: VirtualPrototype, state: KnownState) -> list[str]:
 
 
 def _command(run: VirtualPrototype, period_s: Number) -> None:
-    """Let the transmitter have brought this command, where the plant has one and listens to it."""
+    """Inject this command as if the transmitter had received it, if the plant has one and listens to it."""
     if len(run.gateway.pumps) == 1 and isinstance(period_s, int):
         run.gateway.pumps[0].command(encode_period(period_s).data, "what is known")
 
 
 def otherwise(run: VirtualPrototype, state: KnownState) -> list[str]:
-    """Programs that have started, and whose state is not the one that is known of them."""
+    """Return the programs that have started and whose state is not the known one."""
     waiting = {f"{start.name}.state" for start in run.plc.starts.waiting}
     outputs = {tag: value for tag, value in run.plc.outputs.last().items() if tag not in waiting}
     known = {name: variables["state"] for name, variables in state.programs.items() if "state" in variables}

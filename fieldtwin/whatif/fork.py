@@ -1,7 +1,8 @@
-"""One fork: a prototype in virtual time that begins with what is known, does what a plan says, and is watched to the horizon.
+"""One fork: a prototype in virtual time that starts from the known state, executes a plan, and is observed up to the
+horizon.
 
-The gateway, the PLC and the emulators are those of every prototype run, unmodified; only what happens is summed up instead of
-traced. Sealed off like every run in virtual time.
+The gateway, the PLC and the emulators are those of every prototype run, unmodified; the events are summarized instead
+of traced. The fork is isolated like every run in virtual time.
 """
 
 from __future__ import annotations
@@ -34,17 +35,17 @@ from fieldtwin.whatif.plan import Plan
 from fieldtwin.whatif.state import KnownState
 
 LOOK_S = 1.0
-"""How often the requirements are looked at, besides each change of a program's variables."""
+"""Interval in seconds at which requirements are evaluated, in addition to each change of a program's variables."""
 BEGUN_S = 2.0
-"""Until then a plan that says nothing has not moved a program from where it began."""
+"""Time in seconds until which a plan without commands has not moved a program from its initial state."""
 MAX_TRANSITIONS = 10_000
 MAX_HORIZON_S = 30 * 86_400.0
 
 
 @dataclass(frozen=True)
 class Fork:
-    """What is forked: `system` by name or path, from `state`, for `horizon_s` seconds. Requirements count from `settle_s` on:
-    before, the gateway has not read everything yet."""
+    """A fork of `system` (name or path), from `state`, for `horizon_s` seconds. Requirements count from `settle_s` on,
+    because before that the gateway has not read everything yet."""
 
     system: str
     state: KnownState
@@ -56,8 +57,8 @@ class Fork:
 
 
 def answer(fork: Fork, plan: Plan) -> Outcome:
-    """Run `plan` in a fork. What fails in it is in the outcome's `error`; raises `FileInvalid` or `UsageError` for what cannot be
-    begun at all."""
+    """Run `plan` in a fork. A failure inside it is in the outcome's `error`. Raises `FileInvalid` or `UsageError` if
+    the fork cannot be started at all."""
     _check_horizon(fork)
     run = _ForkRun(fork, plan)
     clock = WallClock()
@@ -68,7 +69,9 @@ def answer(fork: Fork, plan: Plan) -> Outcome:
 
 
 def check(fork: Fork, plan: Plan) -> None:
-    """Whether a fork can be begun and what the plan requires can be looked at; nothing is run. Raises as `answer`."""
+    """Check that a fork can be started and that the plan's requirements can be evaluated; nothing is run. Raises like
+    `answer`.
+    """
     _check_horizon(fork)
     _ForkRun(fork, plan)
 
@@ -134,16 +137,17 @@ class _ForkRun:
         async with AsyncExitStack() as stack:
             await stack.enter_async_context(run)
             run.gateway.tags.on_put = self.outcome.saw_tag
-            if self.plan.commands or run.field.far:  # nobody at the far end would mean modems that are full for ever
+            if self.plan.commands or run.field.far:  # without a topside controller, the modems would stay full
                 nursery = await stack.enter_async_context(Nursery())
                 nursery.start(self._shore().run(list(self.plan.commands)), "far end")
             for fault in self.plan.faults:
                 run.field.faults.inject(fault)
             await self._watch(run, loop)
-            if run.plc.stop_reason is not StopReason.NONE:  # whatever its variables say: nothing holds any more
+            if run.plc.stop_reason is not StopReason.NONE:  # whatever its variables say, no requirement holds any more
                 self.outcome.error = f"the PLC stopped ({run.plc.stop_reason.value}): {run.plc.error or 'on request'}"
             self.outcome.ends(loop.now_ns)
-            run.gateway.tags.on_put, self._over = None, True  # what its end brings (safe outputs) is none of the plan's
+            # The end of the run (safe outputs) is not part of the plan.
+            run.gateway.tags.on_put, self._over = None, True
             for requirement, expression in self._at_the_end:
                 self._judge(requirement, expression)
 
@@ -181,7 +185,7 @@ class _ForkRun:
         if self._over:
             return
         value = self._named(change.tag, change.after)
-        assert self._run is not None  # it was made before anything of it moved
+        assert self._run is not None  # it was made before any variable changed
         self.outcome.saw_variable(change.tag, value, self._run.loop.now_ns)
         if change.tag in self._words:
             seen = self.outcome.states.setdefault(change.tag.removesuffix(".state"), [])
@@ -192,7 +196,8 @@ class _ForkRun:
         return self._words[tag].get(value, value) if tag in self._words else value
 
     def _judge(self, requirement: Requirement, expression: Expression) -> None:
-        if requirement.broken_s is None and expression.truth(self._look) is not True:  # nor is an unknown one met
+        # An unknown one is not met either.
+        if requirement.broken_s is None and expression.truth(self._look) is not True:
             requirement.broken_s = self._now_s()
             requirement.seen = "; ".join(
                 f"{name}: {self._look('value', name)!r}" for name in dict.fromkeys(expression.names)
@@ -220,7 +225,7 @@ class _ForkRun:
         seen = tags.current(name, now_ns)
         match function:
             case "quality" if seen.value is None:
-                return None  # it has not gone bad: it never had a value
+                return None  # it has not turned bad: it never had a value
             case "quality":
                 return Quality(seen.quality).name.lower()
             case "reason":
@@ -233,4 +238,4 @@ class _ForkRun:
 
 
 Progress = Callable[[Outcome], None]
-"""Told of each outcome as it comes."""
+"""Called with each outcome as soon as it is available."""

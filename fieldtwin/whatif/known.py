@@ -1,4 +1,4 @@
-"""The last that a knowledge store knows of a plant: an SQLite file, or PostgreSQL."""
+"""Reads the last known state of a plant from a knowledge store: an SQLite file, or PostgreSQL."""
 
 from __future__ import annotations
 
@@ -12,13 +12,15 @@ from fieldtwin.whatif.last_known import LastKnown
 from fieldtwin.whatif.state import KnownState
 
 RECENT = 100_000
-"""Events of the end of a log. A plant tells again every ten seconds what does not change, so the last minutes have everything."""
+"""Number of events read from the end of a log. A plant repeats unchanged values every ten seconds, so the last minutes
+contain everything.
+"""
 BLOCK = 5_000
 
 
 async def known_state(place: str, system: System, origin: str = "") -> KnownState:
-    """The last that a knowledge store knows of an origin; without a name, of its only one that tells of tags or states.
-    Raises `FileInvalid` or `UsageError`. Nothing older is used where the last value of a tag was bad.
+    """Return the last known state of an origin in a knowledge store. Without a name, there must be only one origin with
+    tags or states. Raises `FileInvalid` or `UsageError`. If the last value of a tag was bad, no older one is used.
     """
     store = await open_knowledge(place)
     try:
@@ -47,7 +49,7 @@ async def known_state(place: str, system: System, origin: str = "") -> KnownStat
 
 
 async def recall(store: KnowledgeStore, origin: str, take: Callable[[Sequence[Event]], None]) -> None:
-    """Let `take` have the end of what a store has of an origin, block by block."""
+    """Pass the end of an origin's log in a store to `take`, block by block."""
     first, last = await store.span(origin)
     at = max(first, last - RECENT + 1)
     while at <= last:

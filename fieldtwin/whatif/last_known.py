@@ -1,6 +1,6 @@
-"""The last that is known of a system, kept up with events as they come: what a fork begins with.
+"""The last known state of a system, updated with events as they arrive. A fork starts from it.
 
-It must never know where the events are from, nor how a fork is begun.
+This module must never know where the events come from, nor how a fork is started.
 """
 
 from __future__ import annotations
@@ -18,7 +18,9 @@ from fieldtwin.whatif.state import KnownState, Number
 
 
 class LastKnown:
-    """`take` events of one or several logs, each in its order; of a name the newest counts. What turned bad is not known."""
+    """Keeps the newest value of each name from `take`, which accepts events of one or several logs, each in order. A
+    value that turned bad is not known.
+    """
 
     def __init__(self, system: System) -> None:
         self.utc_ms = 0
@@ -49,26 +51,28 @@ class LastKnown:
 
     @property
     def unknown(self) -> str:
-        """Of what nothing was heard yet that a fork should not begin without: a program, or all the tags. Empty: nothing."""
+        """What a fork should not start without and is still unknown: the state of a program, or every tag. Empty if
+        nothing is.
+        """
         silent = sorted(self._programs - self._when_ms.keys())
         if silent:
             return f"the state of {', '.join(silent)}"
         return "" if self._when_ms.keys() & self._tags else "any value"
 
     def state(self, source: str) -> KnownState:
-        """What is known now."""
+        """Return the state that is known now."""
         return KnownState(dict(self._values), dict(self._states), self.utc_ms, source)
 
 
 def of_period(period_s: int) -> dict[str, Number]:
-    """The variables of a program with the reference state machine, after a command of `period_s`."""
+    """Return the variables of a program with the reference state machine, after a command of `period_s`."""
     model = DigitalModel()
     state = model.process_event(encode_period(period_s))
     return {"period": period_s, "period_s": period_s, "state": list(STATES).index(state.name)}
 
 
 def of_status(data: bytes) -> dict[str, Number]:
-    """The same variables from a STATUS, which has state and period both; none from what is no status."""
+    """Return the same variables from a STATUS, which has state and period; none if `data` is not a status."""
     try:
         name, period_s = decode_status(data)
     except Desync:

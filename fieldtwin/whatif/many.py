@@ -1,4 +1,4 @@
-"""Many plans at once, in processes of this computer."""
+"""Runs several plans in parallel, in processes on this computer."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from fieldtwin.whatif.plan import Plan
 
 
 def answers(fork: Fork, plans: Sequence[Plan], jobs: int, progress: Progress = lambda outcome: None) -> list[Outcome]:
-    """The outcome of each plan, in their order. One job or one plan: in this process. Raises as `answer`."""
+    """Return the outcome of each plan, in their order. One job or one plan runs in this process. Raises like `answer`."""
     if jobs <= 1 or len(plans) == 1:
         found = []
         for plan in plans:

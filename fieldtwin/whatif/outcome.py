@@ -1,4 +1,6 @@
-"""What came of a plan: each variable over the horizon, and each requirement with the instant at which it first did not hold."""
+"""The outcome of a plan: each variable over the horizon, and each requirement with the time at which it first did not
+hold.
+"""
 
 from __future__ import annotations
 
@@ -11,8 +13,8 @@ from fieldtwin.gateway.core.values import Quality, TagValue
 
 @dataclass(slots=True)
 class VariableOutcome:
-    """A tag or a program's variable: how often it was new, and its values that were good. Its mean is one over time, each value
-    counted for as long as it was the last: sampling less often, which is what plans are about, is no reason for another mean."""
+    """A tag or a program's variable: its number of updates, and statistics of its good values. The mean is weighted by
+    time, so that a different sampling period, which plans are about, does not change it."""
 
     updates: int = 0
     good: int = 0
@@ -26,7 +28,7 @@ class VariableOutcome:
     _since_ns: int = 0
 
     def saw(self, value: Any, good: bool, t_ns: int) -> None:
-        """It was this at `t_ns`, of the fork's monotonic clock."""
+        """Record a value at `t_ns` of the fork's monotonic clock."""
         self.updates += 1
         self.ends(t_ns)
         if not good or value is None:
@@ -40,7 +42,7 @@ class VariableOutcome:
             self.lowest, self.highest = min(self.lowest, value), max(self.highest, value)
 
     def ends(self, t_ns: int) -> None:
-        """What it was counts until then."""
+        """End the last value at `t_ns`, and add it to the mean."""
         if self._held is not None and t_ns > self._since_ns:
             self._weighed += self._held * (t_ns - self._since_ns)
             self._spent_ns += t_ns - self._since_ns
@@ -48,7 +50,7 @@ class VariableOutcome:
 
     @property
     def mean(self) -> float | None:
-        """Over time; None where there never was a number."""
+        """The mean over time; None if there was never a number."""
         if self._spent_ns:
             return self._weighed / self._spent_ns
         return self.lowest if self.lowest <= self.highest else None
@@ -67,7 +69,9 @@ class VariableOutcome:
 
 @dataclass(slots=True)
 class Requirement:
-    """`kind`: ``require`` or ``finally``. `broken_s`: when it first did not hold, None while it does; `seen`: what was then."""
+    """A requirement. `kind` is ``require`` or ``finally``. `broken_s` is the time at which it first did not hold, None
+    while it holds; `seen` are the values at that time.
+    """
 
     kind: str
     text: str
@@ -86,8 +90,8 @@ class Requirement:
 
 @dataclass
 class Outcome:
-    """Of one plan. `error`: why there is none. `not_taken`: devices and programs that could not begin with what was known of
-    them."""
+    """The outcome of one plan. `error` says why there is none. `not_taken` names devices and programs that could not
+    start from their known state."""
 
     plan: str
     horizon_s: float = 0.0
@@ -103,15 +107,15 @@ class Outcome:
         return not self.error and all(r.broken_s is None for r in self.requirements)
 
     def saw_tag(self, name: str, value: TagValue) -> None:
-        """A tag was published."""
+        """Record a published tag."""
         self._of(name).saw(value.value, value.quality is not Quality.BAD, value.t_ns)
 
     def saw_variable(self, name: str, value: Any, t_ns: int) -> None:
-        """A program changed a variable."""
+        """Record a program's change of a variable."""
         self._of(name).saw(value, True, t_ns)
 
     def ends(self, t_ns: int) -> None:
-        """The horizon."""
+        """End the statistics at the horizon."""
         for variable in self.variables.values():
             variable.ends(t_ns)
 
@@ -122,7 +126,7 @@ class Outcome:
         return found
 
     def described(self) -> dict[str, Any]:
-        """As JSON-able data; of the same fork always the same, but for `took_s`."""
+        """Return JSON data, which is the same for every run of the same fork, except for `took_s`."""
         return {
             "plan": self.plan,
             "met": self.met,

@@ -1,4 +1,6 @@
-"""Plans: what is done in a fork, and what must hold meanwhile. One by the command line, or several in a file."""
+"""Plans: the commands and faults in a fork, and the requirements on it. One from the command line, or several in a
+file.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,7 @@ from fieldtwin.running.shore import Scripted
 
 MAX_PLANS = 1000
 MOST_NAMED = 6
-"""Commands and faults in the name of a plan that is made of them; the others are counted."""
+"""Number of commands and faults named in the name of a plan that is made from them; the others are counted."""
 Text = Annotated[str, Field(min_length=1, max_length=1000)]
 
 
@@ -26,7 +28,7 @@ class _Strict(BaseModel):
 
 
 class CommandForm(_Strict):
-    """A period that the far side commands, and when: ``{at: 10s, period_s: 60}``."""
+    """A period that the topside controller commands, and the time: ``{at: 10s, period_s: 60}``."""
 
     at: str = "0s"
     period_s: int
@@ -41,7 +43,7 @@ class PlanForm(_Strict):
 
 
 class PlansForm(_Strict):
-    """Several plans for one system. `require` and `finally` at the top are every plan's."""
+    """Several plans for one system. `require` and `finally` at the top apply to every plan."""
 
     what_if: Text
     require: list[Text] = []
@@ -51,7 +53,9 @@ class PlansForm(_Strict):
 
 @dataclass(frozen=True)
 class Plan:
-    """`require`: expressions that hold all the time; `finally_`: at the end. `faults` as in a fault file."""
+    """A plan. `require` are expressions that must hold all the time, `finally_` at the end. `faults` are as in a fault
+    file.
+    """
 
     name: str
     commands: tuple[Scripted, ...] = ()
@@ -61,7 +65,7 @@ class Plan:
 
 
 def command(text: str) -> Scripted:
-    """``60``, or ``60@10min``: the period, and when it is sent. Raises `UsageError`."""
+    """Parse ``60`` or ``60@10min``: the period, and the time at which it is sent. Raises `UsageError`."""
     period, _, at = text.partition("@")
     try:
         encode_period(int(period))
@@ -89,7 +93,7 @@ def _time(time_s: float) -> str:
 
 
 def load_plans(path: Path) -> tuple[str, list[Plan]]:
-    """The system that a file of plans is for, and the plans. Raises `FileInvalid`."""
+    """Return the system that a file of plans is for, and the plans. Raises `FileInvalid`."""
     file = load(path)
     form = validate(file, PlansForm)
     names = [plan.name for plan in form.plans]

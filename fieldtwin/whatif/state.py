@@ -1,7 +1,7 @@
-"""What is known of a system at one instant: the values of its devices, and the variables of its programs.
+"""The known state of a system at one instant: the values of its devices, and the variables of its programs.
 
-Read from a file or from an instance that runs; from a knowledge store by `fieldtwin.whatif.known`. What was not good is not
-known. It must never know how a fork is begun with it.
+It is read from a file or from a running instance; from a knowledge store by `fieldtwin.whatif.known`. Values that were
+not good are not known. This module must never know how a fork is started from the state.
 """
 
 from __future__ import annotations
@@ -35,9 +35,10 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
 
 @dataclass(frozen=True)
 class KnownState:
-    """`values`: DEVICE.TAG -> value in engineering units; `programs`: program -> variable -> value. `utc_ms` 0: no time known.
+    """The known state. `values`: DEVICE.TAG -> value in engineering units; `programs`: program -> variable -> value.
+    `utc_ms` is 0 if the time is unknown.
 
-    `retained` is a file of retained variables as a PLC keeps it, where there is one.
+    `retained` is a PLC's file of retained variables, if there is one.
     """
 
     values: Mapping[str, Number] = field(default_factory=dict)
@@ -47,14 +48,14 @@ class KnownState:
     retained: Path | None = None
 
     def dump(self, system: System) -> str:
-        """As a file that `read_state` takes."""
+        """Return the text of a file that `read_state` accepts."""
         values = {k: v for k, v in self.values.items() if not (isinstance(v, float) and math.isnan(v))}
         form = _File(VERSION, system.name, self.utc_ms, values, {p: dict(v) for p, v in self.programs.items()})
         return json.dumps(msgspec.to_builtins(form), indent=1) + "\n"
 
 
 def read_state(path: Path, system: System) -> KnownState:
-    """A state file. Raises `FileInvalid`; names that the system does not have are refused."""
+    """Read a state file. Raises `FileInvalid`, also for names that the system does not have."""
     try:
         data = read_input(path, MAX_BYTES)
     except OSError as e:
@@ -85,8 +86,8 @@ def read_state(path: Path, system: System) -> KnownState:
 
 
 async def of_instance(run_dir: Path, system: System) -> KnownState:
-    """What an instance of `system` knows that runs now, by its control channels. Raises `Unreachable`, and `UsageError` for one
-    of another system."""
+    """Return the state of a running instance of `system`, from its control channels. Raises `Unreachable`, and
+    `UsageError` if the instance runs a different system."""
     gateway, plc = await _asked(run_dir / "gateway.sock"), await _asked(run_dir / "plc.sock")
     if (runs := gateway["config"]["system"]) != system.name:
         raise UsageError(f"the instance {run_dir.name!r} is one of another system", expected=system.name, got=runs)

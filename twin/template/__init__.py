@@ -1,1 +1,1 @@
-"""The digital template: a system, and all that it needs, as one file."""
+"""The digital template: a system and everything that it needs, as one file."""

@@ -1,7 +1,7 @@
-"""Whether a template is what it should be: complete, of one piece, and able to run by itself. And how two of them differ.
+"""Checks that a template is complete, consistent and able to run by itself, and compares two templates.
 
-Looks at a folder whose hashes were verified. It reads system file, profiles and prototype; it imports control logic only where
-it was told that it may.
+It inspects a folder whose hashes were verified. It reads system file, profiles and prototype; it imports control logic
+only where that was permitted.
 """
 
 from __future__ import annotations
@@ -24,10 +24,12 @@ MAX_SHOWN_BYTES = 256 * 1024
 
 
 def examine(folder: Path, manifest: Manifest, *, plant: bool = False, shown: Path | None = None) -> System:
-    """Load the template's system and see that nothing it names is missing from the template. Runs no control logic.
+    """Load the template's system and check that the template contains every file that the system names. Runs no control
+    logic.
 
-    With `plant` the prototype's file and what it names are not looked at: they take emulators, which a plant need not have.
-    `shown` is the template as its user knows it, where that is not `folder`. Raises `FileInvalid` for the first thing wrong.
+    With `plant` the prototype file and the files that it names are not checked: that requires emulators, which a plant
+    need not have. `shown` is the template's path as its user knows it, if that is not `folder`. Raises `FileInvalid`
+    for the first error.
     """
     where = str(shown or folder)
     system = load_system(str(folder / manifest.system_file))
@@ -54,7 +56,7 @@ def examine(folder: Path, manifest: Manifest, *, plant: bool = False, shown: Pat
 
 
 def _check_wheel(folder: Path, manifest: Manifest, where: str) -> None:
-    """The wheel holds the software that the manifest names. Nothing of it is run."""
+    """Check that the wheel contains the software that the manifest names. None of it is run."""
     said, (version, modules) = manifest.software, wheel_hash(folder / manifest.software.wheel)
     if (version, modules) != (said.version, said.modules_sha256):
         raise FileInvalid(
@@ -64,14 +66,16 @@ def _check_wheel(folder: Path, manifest: Manifest, where: str) -> None:
 
 
 def put_together(manifest: Manifest, system: System, folder: Path, clock: Clock) -> DigitalTemplate:
-    """Make the template's control system, and its prototype where it has one: what a run would do first.
+    """Build the template's control system, and its prototype if it has one, as a run would do first.
 
     This imports control logic in Python. Raises `FileInvalid`.
     """
     template = DigitalTemplate(manifest, system)
     if manifest.prototype_file:
         from fieldtwin.twin.prototype.file import load_prototype
-        from fieldtwin.twin.prototype.prototype import DigitalTwinPrototype  # a plant has no emulators installed
+
+        # Imported here: a plant has no emulators installed.
+        from fieldtwin.twin.prototype.prototype import DigitalTwinPrototype
 
         DigitalTwinPrototype(system, load_prototype(system, folder / manifest.prototype_file), clock)
     return template
@@ -79,7 +83,7 @@ def put_together(manifest: Manifest, system: System, folder: Path, clock: Clock)
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """A file that two templates do not have in common: `before` and `after` are hashes, empty where there is none."""
+    """A file that differs between two templates. `before` and `after` are hashes, empty for a missing file."""
 
     path: str
     kind: str
@@ -111,9 +115,10 @@ def software_difference(before: Software, after: Software) -> list[Difference]:
 
 
 def unified(path: str, *sides: tuple[Package, Content | None]) -> Iterator[str]:
-    """Yield the lines of a unified diff of one text file: nothing for other files, and those of more than `MAX_SHOWN_BYTES`.
+    """Yield the lines of a unified diff of one text file; nothing for other files, and for files of more than
+    `MAX_SHOWN_BYTES`.
 
-    `sides` are the two templates, each with what it holds under `path`.
+    `sides` are the two templates, each with its content under `path`.
     """
     texts: list[list[str]] = []
     for package, content in sides:

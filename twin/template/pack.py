@@ -1,8 +1,9 @@
-"""Packing a template: everything that a system names, found where a run would find it, under paths that work anywhere.
+"""Packs a template: all files that a system names, found where a run would find them, under paths that work anywhere.
 
-A package has ``systems/``, ``devices/``, ``recordings/``, ``documents/`` and ``software/``. What a system file names by a
-relative path keeps its place beside it; what it names bare lies where a bare name is looked for
-(`fieldtwin.twin.site.data_files`). The system file itself is never touched: plant, prototype and template have the same bytes.
+A package has ``systems/``, ``devices/``, ``recordings/``, ``documents/`` and ``software/``. A file that the system file
+names by a relative path keeps its position relative to it. A file that it names by a bare name is put where bare names
+are searched (`fieldtwin.twin.site.data_files`). The system file itself is never changed: plant, prototype and template
+have the same bytes.
 """
 
 from __future__ import annotations
@@ -36,12 +37,12 @@ from fieldtwin.twin.template.template import (
 
 MODEL = "model.json"
 OUR_PROGRAMS = "fieldtwin"
-"""The package whose programs come with fieldtwin itself."""
+"""The package whose programs are part of fieldtwin itself."""
 
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """A file to pack: what it is, and where its bytes are: a file, or `data` that was made."""
+    """A file to pack: its kind, and the source of its bytes: a file, or generated `data`."""
 
     kind: Kind
     source: Path | None
@@ -62,14 +63,14 @@ class Item:
 
 @dataclass
 class Collected:
-    """What a system needs, by its path in the package."""
+    """The files that a system needs, by their paths in the package."""
 
     system_file: str
     prototype_file: str = ""
     items: dict[str, Item] = field(default_factory=dict)
 
     def add(self, path: str, item: Item) -> None:
-        """Put a file in. Raises `FileInvalid` for a path outside the package, or two files for one place."""
+        """Add a file. Raises `FileInvalid` for a path outside the package, or two files for one path."""
         check_path(path, str(item.source or path))
         old = self.items.setdefault(path, item)
         if old.source is not None and item.source is not None and old.source.resolve() != item.source.resolve():
@@ -77,9 +78,9 @@ class Collected:
 
 
 def collect(system: System, profiles: Iterable[Path] = (), prototype: Path | None = None) -> Collected:
-    """Every file that `system` names, and what its file `prototype` does where one is given.
+    """Return every file that `system` names, and every file that `prototype` names if it is given.
 
-    Raises `FileInvalid` for one that has no place in a package.
+    Raises `FileInvalid` for a file that cannot be placed in a package.
     """
     got = Collected(f"systems/{system.path.name}")
     got.add(got.system_file, Item("system", system.path))
@@ -97,7 +98,9 @@ def collect(system: System, profiles: Iterable[Path] = (), prototype: Path | Non
 
 
 def _place(folder: str, reference: str, named_in: Path) -> str:
-    """Where what `named_in` calls `reference` goes: beside it when it is beside it, else where bare names are looked for."""
+    """Return the path in the package of the file that `named_in` calls `reference`: relative to `named_in` if it is
+    found there, else where bare names are searched.
+    """
     path = PurePosixPath(reference)
     if path.is_absolute():
         raise FileInvalid(
@@ -124,7 +127,8 @@ def _profile(got: Collected, named_in: Path, reference: str, profile: DeviceProf
 
 
 def _prototype(got: Collected, system: System, path: Path) -> None:
-    from fieldtwin.twin.prototype.file import load_prototype  # where there is one, there are emulators
+    # Imported here: a system with a prototype has emulators installed.
+    from fieldtwin.twin.prototype.file import load_prototype
 
     prototype = load_prototype(system, path)
     got.prototype_file = f"systems/{system.path.stem}.prototype.yaml"
@@ -162,7 +166,9 @@ def _program(got: Collected, system: Path, source: str) -> None:
 
 
 def _python(got: Collected, folder: Path, module: str) -> bool:
-    """Take a module beside the system file, and what it imports from there. False when there is none. Nothing is run."""
+    """Add a module from the system file's folder, and the modules of that folder that it imports. Return False if it is
+    not there. Nothing is run.
+    """
     top = module.partition(".")[0]
     package, single = folder / top, folder / f"{top}.py"
     if package.is_dir() and (any(package.glob("*.py"))):
@@ -197,16 +203,17 @@ def _imports(path: Path) -> Iterator[str]:
 
 @dataclass(frozen=True, slots=True)
 class Extras:
-    """What a template holds beside what its system names: documents by kind, and the wheel of the control software."""
+    """Files in a template that its system does not name: documents by kind, and the wheel of the control software."""
 
     documents: Mapping[DocumentKind, tuple[Path, ...]] = field(default_factory=dict)
     wheel: Path | None = None
 
 
 def pack(system: System, collected: Collected, extras: Extras, version: str, target: Path) -> Manifest:
-    """Write the template: a zip when `target` ends in ``.zip``, else a folder. `version` is that of the control software.
+    """Write the template: a zip if `target` ends in ``.zip``, else a folder. `version` is that of the control software.
 
-    Raises `FileInvalid` for a file that changes meanwhile or a wheel of other software, `Unreachable` when the disk refuses.
+    Raises `FileInvalid` for a file that changes meanwhile or a wheel of other software, and `Unreachable` if the disk
+    refuses.
     """
     hash_here = modules_hash()
     wheel = _add_wheel(collected, extras.wheel, version, hash_here) if extras.wheel else ""
@@ -266,7 +273,7 @@ def _write_zip(manifest: Manifest, collected: Collected, target: Path) -> None:
 
 
 def _entry(path: str) -> zipfile.ZipInfo:
-    """No date and no mode of this computer's: equal templates are equal byte by byte."""
+    """Return a zip entry without this computer's dates and modes, so that equal templates are equal byte by byte."""
     entry = zipfile.ZipInfo(path, (1980, 1, 1, 0, 0, 0))
     entry.compress_type = zipfile.ZIP_DEFLATED
     entry.create_system = 3
@@ -296,7 +303,7 @@ def _write_folder(manifest: Manifest, collected: Collected, target: Path) -> Non
 
 
 def _same(file: TemplateFile, item: Item) -> Iterator[bytes]:
-    """The file's blocks once more. Raises `FileInvalid` at the end when it was changed since it was hashed."""
+    """Yield the file's blocks again. Raises `FileInvalid` at the end if it has changed since it was hashed."""
     digest = hashlib.sha256()
     for block in item.blocks():
         digest.update(block)

@@ -1,7 +1,7 @@
-"""Reading a template, folder or zip, that anybody may have made: nothing of it is believed before it is checked.
+"""Reads a template, folder or zip, from an untrusted source: nothing is trusted before it is checked.
 
-Sizes and counts are bounded before memory is spent, paths cannot leave the folder, links and devices are refused, and every
-byte is compared with the manifest's hash. Nothing that a template brings is run or imported here.
+Sizes and counts are bounded before memory is allocated, paths cannot leave the folder, links and devices are refused,
+and every byte is compared with the manifest's hash. Nothing in a template is run or imported here.
 """
 
 from __future__ import annotations
@@ -36,21 +36,23 @@ from fieldtwin.twin.template.template import (
 
 BLOCK = 1 << 20
 MAX_RATIO = 200
-"""Of a file of more than a block: unpacked to packed. A recording of zeros compresses 100 times, a bomb 1,000 times."""
+"""Highest ratio of unpacked to packed size, for files of more than a block. A recording of zeros compresses 100 times,
+a zip bomb 1,000 times.
+"""
 MAX_DIRECTORY_BYTES = MAX_FILES * 600
 _END = struct.Struct("<4s4H2LH")
 """A zip's end of central directory record (APPNOTE 4.3.16)."""
 _LOCAL_CACHE = "__pycache__"
 _DAMAGED = (OSError, EOFError, zlib.error, zipfile.BadZipFile, NotImplementedError, RuntimeError)
-"""What reading a file of a damaged or foreign zip raises: `zipfile` passes on the errors of the modules that it uses."""
+"""The exceptions of reading a damaged or foreign zip: `zipfile` passes on the errors of the modules that it uses."""
 
 
 def _reason(error: Exception) -> str:
-    return str(error) or "it ends too early"  # EOFError has no text of its own
+    return str(error) or "it ends too early"  # EOFError has an empty text
 
 
 class Content(NamedTuple):
-    """What a file of a template holds: its kind (empty if the manifest does not name the file), bytes, and SHA-256."""
+    """The content of a file of a template: its kind (empty if the manifest does not name the file), bytes, and SHA-256."""
 
     kind: str
     bytes: int
@@ -58,24 +60,26 @@ class Content(NamedTuple):
 
 
 class Package(ABC):
-    """A template as it lies there. `path` is the folder or the zip; `manifest` what it says of itself, checked as such."""
+    """A template as stored. `path` is the folder or the zip; `manifest` is its manifest, which has been checked."""
 
     path: Path
     manifest: Manifest
     caches: tuple[str, ...] = ()
-    """Files that Python leaves where it imported from. Not of the template, and code where it is a stranger's."""
+    """Cache files that Python writes where it imports from. They are not part of the template, and are code if they
+    come from an untrusted source.
+    """
 
     @abstractmethod
     def open(self, name: str) -> IO[bytes]:
-        """The contents of a file of the package."""
+        """Return the contents of a file of the package."""
 
     @property
     def code(self) -> tuple[str, ...]:
-        """What Python could run out of this package."""
+        """Files of this package that Python could run."""
         return (*self.manifest.code, *self.caches)
 
     def read(self, file: TemplateFile) -> Iterator[bytes]:
-        """A file in blocks. Raises `FileInvalid` at its end when it was another than the manifest says."""
+        """Yield a file in blocks. Raises `FileInvalid` at its end if it is not what the manifest says."""
         digest, size = hashlib.sha256(), 0
         try:
             with self.open(file.path) as source:
@@ -105,14 +109,14 @@ class Package(ABC):
                 pass
 
     def text(self, name: str) -> bytes:
-        """The whole of one file, checked."""
+        """Return the whole content of one file, checked."""
         return b"".join(self.read(self.manifest.by_path()[name]))
 
     def contents(self) -> dict[str, Content]:
         """Return every file with the hash of its bytes, by path, in the manifest's order.
 
-        Reads all files once. Raises `FileInvalid` for the first file that is not what the manifest says: a damaged file has the
-        manifest's hash only on paper, so it would differ from nothing.
+        Reads all files once. Raises `FileInvalid` for the first file that is not what the manifest says: otherwise a
+        damaged file would be listed with the manifest's hash and seem unchanged.
         """
         self.verify()
         return {file.path: Content(file.kind, file.bytes, file.sha256) for file in self.manifest.files}
@@ -134,7 +138,7 @@ def open_package(path: Path, *, edited: bool = False) -> Iterator[Package]:
 
 
 def is_template(path: Path) -> bool:
-    """Whether `path` is a folder with a manifest, or a file that begins as a zip does."""
+    """Return whether `path` is a folder with a manifest, or a file with the signature of a zip."""
     if path.is_dir():
         return (path / MANIFEST).is_file()
     try:
@@ -145,7 +149,7 @@ def is_template(path: Path) -> bool:
 
 
 class FolderPackage(Package):
-    """A template as a folder: every file that is in it, and no other."""
+    """A template as a folder, which must contain exactly the files of its manifest."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -164,7 +168,8 @@ class FolderPackage(Package):
 class EditedFolder(Package):
     """A template as a folder that its owner works in: files may have been edited, added or removed since it was packed.
 
-    Only for comparing. Everything that runs or unpacks a template takes a `FolderPackage`, which accepts no such change.
+    For comparing only. Everything that runs or unpacks a template takes a `FolderPackage`, which accepts no such
+    change.
     """
 
     def __init__(self, path: Path) -> None:
@@ -186,7 +191,7 @@ class EditedFolder(Package):
         return text
 
     def contents(self) -> dict[str, Content]:
-        """Return the files that the folder holds now. A file that the manifest does not name has an empty kind."""
+        """Return the files that are in the folder now. A file that the manifest does not name has an empty kind."""
         kinds: dict[str, str] = {file.path: file.kind for file in self.manifest.files}
         found = {}
         for name in sorted(names_below(self.path)):
@@ -214,7 +219,7 @@ def _open_inside(folder: Path, name: str) -> IO[bytes]:
 
 
 def names_below(folder: Path) -> Iterator[str]:
-    """Every file below, with ``/``. Raises `FileInvalid` for what is neither file nor folder: links, pipes, devices."""
+    """Yield every file below `folder`, with ``/``. Raises `FileInvalid` for anything else: links, pipes, devices."""
     count, waiting = 0, [folder]
     while waiting:
         with os.scandir(waiting.pop()) as entries:
@@ -302,7 +307,9 @@ def _bounded(text: bytes, where: str) -> bytes:
 
 
 def _check_directory(path: Path) -> None:
-    """Refuse a directory that would take more memory than a template can need; found as zipfile finds it."""
+    """Refuse a zip directory that would need more memory than a template can. It is located in the same way as zipfile
+    does.
+    """
     size = path.stat().st_size
     if size > MAX_TOTAL_BYTES + MAX_DIRECTORY_BYTES:
         raise FileInvalid("too large", path=str(path), expected=f"at most {MAX_TOTAL_BYTES} bytes", got=str(size))
@@ -324,7 +331,7 @@ def _check_directory(path: Path) -> None:
 
 
 def _compare(found: list[str], manifest: Manifest, where: str) -> None:
-    """The files that are there and those in the manifest are the same ones."""
+    """Check that the files found are exactly those of the manifest."""
     named = {MANIFEST, *manifest.by_path()}
     if strangers := sorted(set(found) - named):
         raise FileInvalid(
@@ -335,9 +342,9 @@ def _compare(found: list[str], manifest: Manifest, where: str) -> None:
 
 
 def unpack(package: Package, target: Path) -> None:
-    """Write the package as the folder `target`, which must be missing or empty. All of it, checked, or nothing.
+    """Write the package as the folder `target`, which must be missing or empty: all files, checked, or nothing.
 
-    Raises `FileInvalid` for a wrong file, `UsageError` for a target in use, `Unreachable` when the disk does not take it.
+    Raises `FileInvalid` for a wrong file, `UsageError` for a target in use, `Unreachable` if the disk refuses.
     """
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise UsageError("the folder is not empty", got=str(target), hint="choose another with -o")

@@ -1,7 +1,7 @@
-"""What a prototype would use of the computer that it runs on, beyond its own run directory and this computer's loopback.
+"""The resources of this computer that a prototype would use, beyond its own run directory and the loopback interface.
 
-A stranger's prototype file may say that a bus is the plant's own, name a CAN interface of the kernel, or listen to the network.
-Whoever runs it is told before. Nothing is opened here.
+An untrusted prototype file may use the plant's own bus, name a CAN interface of the kernel, or listen on the network.
+The user is informed before it runs. Nothing is opened here.
 """
 
 from __future__ import annotations
@@ -18,7 +18,9 @@ OUR_BUS = "fieldtwin"
 
 
 def reach(system: System, prototype: Prototype) -> tuple[str, ...]:
-    """One sentence for each thing that somebody has to agree to; none where everything stays inside. In the files' order."""
+    """Return one sentence for each resource that the user must agree to, in the files' order; none if the prototype
+    uses no such resource.
+    """
     return tuple(dict.fromkeys(_reach(system, prototype)))
 
 
@@ -48,7 +50,7 @@ def _listening(at: Endpoint, what: str) -> Iterator[str]:
             yield f"it makes a link at {at.path}, outside of its run directory ({what})"
         return
     elif at.is_serial:
-        return  # opened where the prototype maps it to, or refused
+        return  # opened at its mapped endpoint, or refused
     else:
         host = at.host
     if not _is_loopback(host):
@@ -56,7 +58,9 @@ def _listening(at: Endpoint, what: str) -> Iterator[str]:
 
 
 def _is_loopback(host: str) -> bool:
-    """A name is none but for one: what it means is elsewhere's to say."""
+    """Return whether `host` is a loopback address. No name except localhost counts as one, because names are resolved
+    elsewhere.
+    """
     bare = host.strip("[]")
     return bare in ("localhost", "::1") or (
         bare.startswith("127.") and bare.count(".") == 3 and bare.replace(".", "").isdigit()

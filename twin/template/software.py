@@ -1,7 +1,8 @@
-"""Which control software this is: one hash over its modules, the same in a checkout, where it is installed, and in its wheel.
+"""Identifies the control software: one hash over its modules, the same in a checkout, in an installation, and in its
+wheel.
 
-Two machines with the same hash run the same program, whatever their version numbers say. Shipped profiles and recordings are data
-and have hashes of their own.
+Two machines with the same hash run the same program, whatever their version numbers are. Shipped profiles and
+recordings are data and have their own hashes.
 """
 
 from __future__ import annotations
@@ -18,23 +19,27 @@ from fieldtwin.gateway.core.errors import FileInvalid
 
 PACKAGE = "fieldtwin"
 HERE = Path(__file__).absolute().parents[3]
-"""The folder that holds the package. Not resolved: in a checkout fieldtwin/twin is a link to a folder beside the package."""
+"""The folder that holds the package. Not resolved: in a checkout fieldtwin/twin is a link to a folder outside the
+package.
+"""
 MAX_MODULE_BYTES = 16 << 20
 MAX_MODULES = 10_000
 MAX_WHEEL_BYTES = 16 << 20
-"""Packed; and sixteen times that unpacked. Ours is a tenth of it, and a stranger's may be a bomb."""
+"""Largest packed size; the largest unpacked size is sixteen times that. A fieldtwin wheel is a tenth of it, and an
+untrusted one may be a zip bomb.
+"""
 _DATA = f"{PACKAGE}/_data/"
 _NO_SOURCE = re.compile(r"(^|/)__pycache__/|\.pyc$|(^|/)\.")
-"""What lies beside the modules on a computer that runs them, and never in a wheel of ours."""
+"""Files that are next to the modules on a computer that runs them, and never in a fieldtwin wheel."""
 
 
 def modules_hash(folder: Path = HERE) -> str:
-    """SHA-256 over the names and contents of all modules below `folder`, as 64 hexadecimal digits."""
+    """Return the SHA-256 over the names and contents of all modules below `folder`, as 64 hexadecimal digits."""
     return _hash(_modules_below(folder))
 
 
 def _modules_below(folder: Path) -> Iterator[tuple[str, bytes]]:
-    for parent, _, files in os.walk(folder / PACKAGE, followlinks=True):  # the links of a checkout
+    for parent, _, files in os.walk(folder / PACKAGE, followlinks=True):  # follow the links of a checkout
         for path in (Path(parent, file) for file in files):
             name = path.relative_to(folder).as_posix()
             if not name.startswith(_DATA) and not _NO_SOURCE.search(name) and path.is_file():
@@ -42,7 +47,9 @@ def _modules_below(folder: Path) -> Iterator[tuple[str, bytes]]:
 
 
 def wheel_hash(wheel: Path) -> tuple[str, str]:
-    """Version of a wheel of ours, and the same hash over what it would install. Raises `FileInvalid`."""
+    """Return the version of a fieldtwin wheel, and the hash over the modules that it would install. Raises
+    `FileInvalid`.
+    """
     match = re.fullmatch(r"fieldtwin-([0-9A-Za-z.!+_]+)-[^-]+-[^-]+-[^-]+\.whl", wheel.name)
     if match is None:
         raise FileInvalid("no wheel of fieldtwin", path=str(wheel), expected="fieldtwin-VERSION-py3-none-any.whl")
@@ -56,8 +63,8 @@ def wheel_hash(wheel: Path) -> tuple[str, str]:
 
 
 def _modules_in(archive: zipfile.ZipFile, about: str) -> Iterator[tuple[str, bytes]]:
-    """Yield all that the wheel would install, without shipped data and without what it says `about` itself. A module of another
-    package is included, because a wheel of ours has none."""
+    """Yield everything that the wheel would install, except for shipped data and its metadata (`about`). A module of
+    another package is included, because a fieldtwin wheel has none."""
     entries = archive.infolist()
     if len(entries) > MAX_MODULES:
         raise FileInvalid("too many files for a wheel of ours", path=str(archive.filename), expected=f"{MAX_MODULES}")

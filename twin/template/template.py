@@ -1,10 +1,10 @@
-"""The digital template: what is needed to build a physical twin and to keep it running, as one package.
+"""The digital template: everything needed to build a physical twin and to keep it running, as one package.
 
-A package is a folder, or a zip of one. Its manifest (``template.json``) names every file with its kind, size and SHA-256:
-the system file, profiles, EDS files, control logic, recordings, a description of the digital model, the software's own hash,
-and documents. The same files give the same bytes: nothing in a package is dated.
+A package is a folder, or a zip of one. Its manifest (``template.json``) names every file with its kind, size and
+SHA-256: the system file, profiles, EDS files, control logic, recordings, a description of the digital model, the
+software's own hash, and documents. The same files give the same bytes: nothing in a package is dated.
 
-This module is the form alone. It opens no file, runs nothing, and knows no zip.
+This module defines the format only. It opens no file, runs nothing, and does not handle zips.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ Kind = Literal[
 ]  # fmt: skip
 DocumentKind = Literal["", "blueprint", "technical-manual", "bill-of-materials", "generic"]
 CODE_SUFFIXES = (".py", ".pyw", ".pyc", ".so", ".pyd", ".dll", ".dylib", ".pth")
-"""What Python would run when it imports something, or is given it as a simulation."""
+"""Suffixes of files that Python would run when it imports something, or when given one as a simulation."""
 
 _BAD_CHARACTER = re.compile(r'[\x00-\x1f\x7f\\:*?"<>|]')
 _DEVICE_NAME = re.compile(r"(?i)^(con|prn|aux|nul|com[0-9]|lpt[0-9])(\.|$)")
@@ -47,12 +47,12 @@ _HASH = re.compile(r"[0-9a-f]{64}")
 
 
 def is_code(path: str) -> bool:
-    """Whether Python would run the file if something named it."""
+    """Return whether Python would run the file if something named it."""
     return path.lower().endswith(CODE_SUFFIXES)
 
 
 class TemplateFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True, kw_only=True):
-    """A file of the package: its path inside (with ``/``), what it is, and what it holds."""
+    """A file of the package: its path inside (with ``/``), kind, size and SHA-256."""
 
     path: str
     kind: Kind
@@ -62,13 +62,13 @@ class TemplateFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit
 
     @property
     def is_code(self) -> bool:
-        """Whether it is something that Python runs, whatever it says of itself."""
+        """Whether Python would run the file, whatever its stated kind is."""
         return is_code(self.path)
 
 
 class Software(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True, kw_only=True):
-    """The control software: its version, the hash of its modules (`fieldtwin.twin.template.software`), and the wheel in the
-    package, if any."""
+    """The control software: its version, the hash of its modules (`fieldtwin.twin.template.software`), and the wheel in
+    the package, if any."""
 
     name: str = "fieldtwin"
     version: str
@@ -77,7 +77,9 @@ class Software(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_def
 
 
 class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True, kw_only=True):
-    """``template.json``. `system_file` and `prototype_file` are paths inside the package; a template may have no prototype."""
+    """``template.json``. `system_file` and `prototype_file` are paths inside the package; a template may have no
+    prototype.
+    """
 
     version: int = msgspec.field(name="fieldtwin_template")
     system: str
@@ -87,26 +89,26 @@ class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_def
     files: tuple[TemplateFile, ...]
 
     def to_json(self) -> bytes:
-        """The file's bytes: two equal manifests give the same."""
+        """Return the file's bytes, which are the same for equal manifests."""
         return msgspec.json.format(msgspec.json.encode(self), indent=1) + b"\n"
 
     @property
     def id(self) -> str:
-        """What tells this template from every other: the SHA-256 of its manifest, 64 hexadecimal digits."""
+        """The identity of this template: the SHA-256 of its manifest, 64 hexadecimal digits."""
         return hashlib.sha256(self.to_json()).hexdigest()
 
     def by_path(self) -> dict[str, TemplateFile]:
-        """The files under their paths, in the manifest's order."""
+        """Return the files by path, in the manifest's order."""
         return {file.path: file for file in self.files}
 
     @property
     def code(self) -> tuple[str, ...]:
-        """Files that Python would run. Somebody has to say yes first, unless the template is their own."""
+        """Files that Python would run. Unless it is their own template, the user must agree before they are run."""
         return tuple(file.path for file in self.files if file.is_code)
 
 
 def parse_manifest(text: bytes, where: str) -> Manifest:
-    """Read ``template.json``. Raises `FileInvalid` for anything that a package could not hold, before a file is looked at."""
+    """Read ``template.json``. Raises `FileInvalid` for anything that a package could not hold, before any file is read."""
     try:
         version = msgspec.json.decode(text).get("fieldtwin_template")
     except (msgspec.MsgspecError, AttributeError, RecursionError) as e:
@@ -187,7 +189,9 @@ def check_path(path: str, where: str) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Document:
-    """SPEC row Document: what describes the physical twin or is needed to build it. `path` is its place in the package."""
+    """SPEC row Document: a description of the physical twin, or a document needed to build it. `path` is its path in
+    the package.
+    """
 
     path: str
     sha256: str
@@ -195,21 +199,21 @@ class Document:
 
 
 class BluePrint(Document):
-    """How something is built: a drawing, a wiring plan."""
+    """A construction document: a drawing, a wiring plan."""
 
     __slots__ = ()
     kind = "blueprint"
 
 
 class TechnicalManual(Document):
-    """What a maker says of a device."""
+    """A manufacturer's document about a device."""
 
     __slots__ = ()
     kind = "technical-manual"
 
 
 class BillOfMaterials(Document):
-    """What the physical twin is made of."""
+    """The list of the parts of the physical twin."""
 
     __slots__ = ()
     kind = "bill-of-materials"
@@ -228,10 +232,10 @@ DOCUMENTS: dict[DocumentKind, type[Document]] = {
 
 
 class DigitalTemplate:
-    """SPEC row DigitalTemplate: documents, the embedded control system, and a digital model of its own.
+    """SPEC row DigitalTemplate: documents, the embedded control system, and its own digital model.
 
-    `system` is the one of the package, loaded. Making it puts the control logic together, which imports programs in Python:
-    whoever makes it of a stranger's package has asked before.
+    `system` is the system of the package, loaded. Creating this object assembles the control logic, which imports
+    Python programs: for an untrusted package, the caller must have asked the user before.
     """
 
     def __init__(self, manifest: Manifest, system: System) -> None:
@@ -244,9 +248,9 @@ class DigitalTemplate:
 
 
 def describe_model(system: System) -> bytes:
-    """The digital model as the package holds it (``model.json``): the state machine, and the variables that the system declares.
+    """Return the digital model as the package holds it (``model.json``): the state machine, and the declared variables.
 
-    Made from the system file, so that a template whose model is not that of its system is found out.
+    It is made from the system file, so that a template whose model does not match its system is detected.
     """
     model = DigitalModel(declared_variables(system))
     described: dict[str, Any] = {

@@ -1,1 +1,1 @@
-"""The digital thread: two logs that are made equal over TCP, MQTT, or the modem of the plant."""
+"""The digital thread: synchronizes the logs of two twins over TCP, MQTT, or the modem of the plant."""

@@ -1,7 +1,8 @@
-"""A thread's broker as a URL: ``mqtt://[USER@]HOST[:1883]/GROUP/NODE[?host=NAME]``, or ``mqtts://`` with TLS (port 8883), and
-``ca=FILE`` of the authorities that are trusted (else the system's), ``cert=FILE&key=FILE`` of our own certificate.
+"""A thread's broker as a URL: ``mqtt://[USER@]HOST[:1883]/GROUP/NODE[?host=NAME]``, or ``mqtts://`` with TLS (port
+8883). With TLS, ``ca=FILE`` names the trusted authorities (default: the system's), and ``cert=FILE&key=FILE`` this
+side's certificate.
 
-A password stands in FIELDTWIN_MQTT_PASSWORD, or in the file that FIELDTWIN_MQTT_PASSWORD_FILE names, never in a URL.
+The password is in FIELDTWIN_MQTT_PASSWORD, or in the file that FIELDTWIN_MQTT_PASSWORD_FILE names, never in a URL.
 """
 
 from __future__ import annotations
@@ -29,13 +30,13 @@ PASSWORD = "FIELDTWIN_MQTT_PASSWORD"
 
 
 def is_broker(place: str) -> bool:
-    """Whether a thread that goes to `place` goes to a broker."""
+    """Return whether `place` is the URL of a broker."""
     return place.startswith(SCHEMES)
 
 
 def broker_carrier(place: str, clock: Clock, plant: System | None) -> Carrier:
-    """An edge node of `plant`, or the host application where there is none. Raises `UsageError` for what is no broker, and
-    `Unreachable` for files of no use."""
+    """Return the carrier of an edge node for `plant`, or of the host application if `plant` is None. Raises
+    `UsageError` for an invalid URL, and `Unreachable` for unusable certificate files."""
     try:
         from fieldtwin.twin.thread.mqtt import Broker, MqttCarrier  # an extra
     except ModuleNotFoundError as e:
@@ -54,7 +55,7 @@ def broker_carrier(place: str, clock: Clock, plant: System | None) -> Carrier:
         )
     broker = Broker(url.hostname, port, url.username, _password(), tls)
     if plant is None:
-        HostApplication(group, node, host)  # names that are none are said at once
+        HostApplication(group, node, host)  # raises at once for invalid names
         return MqttCarrier(broker, lambda number, began_ms: HostApplication(group, node, host, began_ms), clock)
     schema, types = schema_of(plant), types_of(plant)
     EdgeNode(group, node, host, schema, types, 0)
@@ -64,7 +65,7 @@ def broker_carrier(place: str, clock: Clock, plant: System | None) -> Carrier:
 
 
 def _split(place: str) -> tuple[Any, str, str, dict[str, str]]:
-    """The URL, group, node, and what else is said."""
+    """Return the URL, group, node, and the remaining parameters."""
     try:
         url = urlsplit(place)
         names = url.path.strip("/").split("/")
@@ -85,7 +86,7 @@ def _split(place: str) -> tuple[Any, str, str, dict[str, str]]:
 
 
 def _password() -> str | None:
-    """The broker's, from the environment, or from the file that it names."""
+    """Return the broker's password from the environment, or from the file that the environment names."""
     path = os.environ.get(f"{PASSWORD}_FILE")
     if not path:
         return os.environ.get(PASSWORD)

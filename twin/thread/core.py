@@ -1,14 +1,14 @@
-"""Store and forward between two twins: at least once on the wire, exactly once in the log, in whatever order frames come.
+"""Store and forward between two twins: at least once on the link, exactly once in the log, in any order of frames.
 
-Sans-IO. `Outgoing` sends one log; `Incoming` receives others. Both are told what came, what is stored and what time it is, and
-say what to send, load and keep. What an ACK confirms is in the receiver's store; so either side may die at any instant, and when
-frames get through again the two logs become equal.
+Sans-IO. `Outgoing` sends one log; `Incoming` receives logs. Both are given the received frames, what is stored, and the
+time, and return what to send, load and store. An ACK confirms only what is in the receiver's store. Either side may
+therefore die at any instant, and as soon as frames arrive again the two logs become equal.
 
-    sender      HELLO until acknowledged, then DATA as far as the window goes; again what an ACK calls missing, and what was
-                not confirmed in time (RFC 6298, doubled up to a minute); LOST for what the log has no more
-    receiver    ASK for a tag that it does not know, REFUSED for a schema that it does not have, else ACK
+    sender      HELLO until acknowledged, then DATA within the window; retransmits what an ACK reports missing, and what was
+                not confirmed in time (RFC 6298, doubled up to a minute); LOST for events that are no longer in the log
+    receiver    ASK for an unknown tag, REFUSED for an unknown schema, else ACK
 
-Everything is bounded: the window, ranges behind a gap, streams.
+Everything is bounded: the window, the ranges after a gap, the streams.
 """
 
 from __future__ import annotations
@@ -22,31 +22,31 @@ from fieldtwin.gateway.store.event import Event, Kind, merged
 from fieldtwin.twin.thread.frames import MAX_RUNS, Ack, Ask, Data, Frame, Hello, Lost, Refused, tag_of
 
 WINDOW = 2000
-"""Events that are under way or wait for their turn in memory; the rest waits in the store."""
+"""Events in memory, in flight or waiting to be sent; the rest waits in the store."""
 FAR_AHEAD = 100_000
-"""Numbers so far behind the first gap are not kept: they come again."""
+"""Numbers that are further than this after the first gap are not stored; they will be sent again."""
 RTO_FIRST_NS, RTO_MIN_NS, RTO_MAX_NS = NS_PER_S, 200 * NS_PER_MS, 60 * NS_PER_S
 MAX_STREAMS = 16
 MAX_RANGES = 1000
 
 URGENT = frozenset((Kind.COMMAND, Kind.STATE))
-"""What waits for nobody."""
+"""Kinds of events that are sent at once, without waiting to fill a frame."""
 
 Fit = Callable[[bytes, Sequence[Event]], int]
-"""How many of these events one frame of the carrier takes (`FrameCodec.fit`)."""
+"""Returns how many of these events fit into one frame of the carrier (`FrameCodec.fit`)."""
 
 
 @dataclass(slots=True)
 class _Slot:
     event: Event
     sent_ns: int = -1
-    """When it was last sent; -1: it is to be sent."""
+    """Time at which it was last sent; -1: it is yet to be sent."""
     tries: int = 0
 
 
 @dataclass(slots=True)
 class _Rto:
-    """How long to wait for an ACK (RFC 6298, without its granularity)."""
+    """The retransmission timeout (RFC 6298, without its clock granularity)."""
 
     now_ns: int = RTO_FIRST_NS
     smoothed_ns: int = 0
@@ -64,13 +64,15 @@ class _Rto:
         self.now_ns = min(2 * self.now_ns, RTO_MAX_NS)
 
     def calm(self) -> None:
-        """Something arrived: no more patience than was measured."""
+        """Reset the timeout to the measured value, because something arrived."""
         wanted_ns = self.smoothed_ns + 4 * self.varies_ns if self.smoothed_ns else RTO_FIRST_NS
         self.now_ns = min(max(wanted_ns, RTO_MIN_NS), RTO_MAX_NS)
 
 
 class Outgoing:
-    """One log on its way. `first` and `last` are the span of the store; `load` brings events when `wanted` asks for them."""
+    """One log that is being sent. `first` and `last` are the span of the store. When `wanted` asks for events, the
+    caller passes them to `load`.
+    """
 
     def __init__(self, origin: str, schema: bytes, first: int, last: int, *, prototype: bool, fit: Fit) -> None:
         self.origin = origin
@@ -78,14 +80,18 @@ class Outgoing:
         self.first = first
         self.last = last
         self.through = 0
-        """Everything up to here is in the other side's log."""
+        """Every event up to this number is in the other side's log."""
         self.refused = False
-        """The other side does not have our schema. It is asked again now and then: it may get it."""
+        """The other side does not have this side's schema. HELLO is repeated now and then, because it may get the
+        schema.
+        """
         self.resent = 0
         self.linger_ns = 0
-        """How long events wait for others that fill the frame; a matter of the carrier."""
+        """How long events wait for more events that fill the frame. The carrier sets it."""
         self.contradicted = False
-        """The other side has more of our log than we: our store went back in time. What is new here would pass for old there."""
+        """The other side has more of this log than this side: the store went back in time, for example from a backup.
+        New events would have numbers that the other side already has.
+        """
         self._schema = schema
         self._prototype = prototype
         self._fit = fit
@@ -93,29 +99,29 @@ class Outgoing:
         self._loaded = 0
         self._to_send: deque[int] = deque()
         self._gathers_ns: int | None = None
-        """Since when what is to be sent waits for more."""
+        """Time since which events wait for more to fill the frame."""
         self._known = False
         self._hello_ns: int | None = 0
-        """When to say HELLO next; None while the other side knows us and nothing is due."""
+        """Time of the next HELLO; None while the other side knows this stream and nothing is due."""
         self._hello_sent_ns = -1
         self._doubt_ns: int | None = None
-        """When to ask with HELLO whether the other side has what it confirmed; None while nobody doubts it."""
+        """Time at which to verify with HELLO that the other side has what it confirmed; None while there is no doubt."""
         self._asked_ns: int | None = None
-        """When that was asked first."""
+        """Time at which that was first asked."""
         self._rto = _Rto()
         self._lost: deque[tuple[int, int]] = deque()
-        """To be told."""
+        """Ranges of lost events that are yet to be reported."""
         self._told: dict[tuple[int, int], int] = {}
-        """Told to be lost, and when, until that is confirmed."""
+        """Ranges reported as lost, with the time of the report, until they are confirmed."""
 
     # -- the log ----------------------------------------------------------------------------------------------------------
 
     def appended(self, last: int) -> None:
-        """The log has grown to number `last`."""
+        """Note that the log has grown to number `last`."""
         self.last = max(self.last, last)
 
     def wanted(self) -> tuple[int, int] | None:
-        """First number and how many events to load from the store now; None: there is enough."""
+        """Return the first number and the count of events to load from the store now; None if enough are loaded."""
         first = max(self._loaded, self.through) + 1
         room = WINDOW - len(self._window)
         if not self._known or first > self.last or room < WINDOW // 2:
@@ -123,7 +129,9 @@ class Outgoing:
         return first, min(room, self.last - first + 1)
 
     def load(self, first: int, events: Sequence[Event]) -> None:
-        """What the store has from number `first` on. Numbers that it has no more are told to be lost."""
+        """Take the events that the store has from number `first` on. Numbers that it no longer has are reported as
+        lost.
+        """
         expected = first
         for event in events:
             if event.sequence > expected:
@@ -140,13 +148,15 @@ class Outgoing:
 
     @property
     def waiting(self) -> int:
-        """Events of the log that the other side has not confirmed."""
+        """Number of events of the log that the other side has not confirmed."""
         return max(0, self.last - self.through)
 
     # -- what comes -------------------------------------------------------------------------------------------------------
 
     def connected(self, now_ns: int) -> None:
-        """A link is there, perhaps a new one: whatever was under way may be lost, and who is there may be new."""
+        """Start over on a link, which may be new: frames in flight may be lost, and the other side may be a different
+        one.
+        """
         self._known = False
         self._hello_ns = now_ns
         self._doubt_ns = self._asked_ns = None
@@ -158,7 +168,7 @@ class Outgoing:
         self._loaded = self.through
 
     def on_ask(self, now_ns: int) -> None:
-        """The other side lost what it knew of us."""
+        """Send HELLO, because the other side lost what it knew about this stream."""
         if self._hello_ns is None or now_ns - self._hello_sent_ns > self._rto.now_ns:
             self._hello_ns = now_ns
         self._known = False
@@ -169,7 +179,7 @@ class Outgoing:
         self._hello_ns = now_ns + RTO_MAX_NS
 
     def on_ack(self, ack: Ack, now_ns: int) -> None:
-        """Take what is confirmed out of the window, and see what is missing."""
+        """Remove confirmed events from the window, and queue missing ones again."""
         if ack.through > self.last:
             self.contradicted = True
             return
@@ -181,9 +191,8 @@ class Outgoing:
             self._loaded = max(self._loaded, ack.through)
             self._rto.calm()
         progress = self._confirm_through(ack.through, now_ns)
-        late_ns = (
-            now_ns - (self._rto.smoothed_ns or self._rto.now_ns) // 2
-        )  # an ACK under way knows nothing of what was just sent
+        # An ACK in flight does not cover what was just sent.
+        late_ns = now_ns - (self._rto.smoothed_ns or self._rto.now_ns) // 2
         at = ack.through
         for gap, run in ack.runs:
             at += gap
@@ -197,8 +206,9 @@ class Outgoing:
             self._rto.calm()
 
     def _is_less(self, through: int, now_ns: int) -> bool:
-        """The other side has less than it confirmed: an ACK that was late, or one who is there for the first time. HELLO asks,
-        and what answers it is believed: what was confirmed before was to somebody else. Whether this ACK is taken."""
+        """Handle an ACK for less than was confirmed before: it is late, or the other side is a different one. HELLO
+        asks, and its answer is believed, because the earlier confirmations were another side's. Return whether to use
+        this ACK."""
         asked_ns = self._asked_ns
         if self._known and (asked_ns is None or now_ns - asked_ns < self._rto.smoothed_ns // 2):
             self._doubt_ns = now_ns if self._doubt_ns is None else self._doubt_ns
@@ -208,7 +218,9 @@ class Outgoing:
         return True
 
     def _confirm_run(self, first: int, last_missing: int, last: int, now_ns: int, late_ns: int) -> bool:
-        """Numbers from `first` on are missing, those behind `last_missing` are kept."""
+        """Process a gap and a run of an ACK: numbers from `first` to `last_missing` are missing, those after it are
+        stored.
+        """
         progress = False
         span = range(first, last + 1)
         for number in [n for n in self._window if n in span] if len(span) > len(self._window) else span:
@@ -232,7 +244,7 @@ class Outgoing:
         return progress
 
     def _measure(self, slot: _Slot, now_ns: int) -> bool:
-        if slot.tries == 1 and slot.sent_ns >= 0:  # Karn: of what was sent twice nobody knows which was confirmed
+        if slot.tries == 1 and slot.sent_ns >= 0:  # Karn's algorithm: a retransmitted event gives no round-trip time
             self._rto.measured(now_ns - slot.sent_ns)
         return True
 
@@ -244,7 +256,7 @@ class Outgoing:
     # -- what goes --------------------------------------------------------------------------------------------------------
 
     def next_frame(self, now_ns: int) -> Frame | None:
-        """What to send now, if anything."""
+        """Return the frame to send now, or None."""
         if not self._known:
             if self._hello_ns is None or now_ns < self._hello_ns:
                 return None
@@ -281,16 +293,16 @@ class Outgoing:
         return Hello(self.origin, self._schema, self.first, self.last, self._prototype)
 
     def _may_wait(self, events: Sequence[Event], now_ns: int) -> bool:
-        """Whether these, of which there are no more, wait for others."""
+        """Return whether these last unsent events may wait for more to fill the frame."""
         assert self._gathers_ns is not None
         return now_ns < self._gathers_ns + self.linger_ns and not any(event.kind in URGENT for event in events)
 
     def _time_out(self, now_ns: int) -> None:
-        """Send again what waits for its ACK for too long; the oldest is enough to know."""
+        """Send again what waited too long for its ACK. It is enough to check the oldest event."""
         oldest = next(iter(self._window.values()), None)
         if oldest is None or oldest.sent_ns < 0 or now_ns < oldest.sent_ns + self._rto.now_ns:
             if oldest is None and not self._lost and self.through < self._loaded and self._tail_due(now_ns):
-                self.connected(now_ns)  # a LOST was lost: begin anew from what is confirmed
+                self.connected(now_ns)  # a LOST frame was lost: start again from what is confirmed
             return
         due_ns = now_ns - self._rto.now_ns
         for number, slot in self._window.items():
@@ -305,7 +317,7 @@ class Outgoing:
         return True
 
     def _next_events(self) -> list[Event]:
-        """Unsent events that follow one another, as many as a frame takes."""
+        """Return unsent events with consecutive numbers, as many as fit into a frame."""
         run: list[Event] = []
         while self._to_send and len(run) < 1000:
             number = self._to_send[0]
@@ -324,7 +336,7 @@ class Outgoing:
         return run[:count]
 
     def wake_ns(self, now_ns: int) -> int | None:
-        """When `next_frame` may have something although nothing came; None: never."""
+        """Return the time at which `next_frame` may have a frame even if nothing arrives; None: never."""
         if not self._known:
             return self._hello_ns
         due_ns = self._wake_ns(now_ns)
@@ -348,14 +360,14 @@ class Outgoing:
 
 @dataclass(frozen=True, slots=True)
 class Open:
-    """Look up in the store what there is of this origin, and tell `Incoming.opened`."""
+    """Effect: look up in the store what it has of this origin, then call `Incoming.opened`."""
 
     origin: str
 
 
 @dataclass(frozen=True, slots=True)
 class Keep:
-    """Store these, then tell `Incoming.kept`."""
+    """Effect: store these events, then call `Incoming.kept`."""
 
     origin: str
     events: tuple[Event, ...]
@@ -364,7 +376,7 @@ class Keep:
 
 @dataclass(frozen=True, slots=True)
 class NoteLost:
-    """These will never come; note it, then tell `Incoming.noted`."""
+    """Effect: record that these events will never come, then call `Incoming.noted`."""
 
     origin: str
     first: int
@@ -379,12 +391,12 @@ class _Stream:
     hello: Hello
     through: int = 0
     ranges: list[tuple[int, int]] = field(default_factory=list)
-    """Kept behind the first gap, in order."""
+    """Ranges that are stored after the first gap, in order."""
     under_way: set[int] = field(default_factory=set)
-    """Given out to be kept."""
+    """Numbers whose storing is in progress."""
     open: bool = False
     ack_ns: int | None = None
-    """When to acknowledge."""
+    """Time at which to acknowledge."""
 
     def has(self, number: int) -> bool:
         return number <= self.through or number in self.under_way or any(a <= number <= b for a, b in self.ranges)
@@ -396,7 +408,9 @@ class _Stream:
 
 
 class Incoming:
-    """Logs of others on their way here. `knows`: whether a schema can be read. By `ack_delay_ns` one ACK serves many frames."""
+    """Receives logs of other sides. `knows` tells whether a schema can be decoded. ACKs are delayed by `ack_delay_ns`,
+    so that one serves many frames.
+    """
 
     def __init__(self, knows: Callable[[bytes], bool], ack_delay_ns: int) -> None:
         self.duplicates = 0
@@ -406,10 +420,10 @@ class Incoming:
         self._streams: OrderedDict[bytes, _Stream] = OrderedDict()
         self._answers: deque[Frame] = deque(maxlen=MAX_STREAMS)
         self.unknown_schema = b""
-        """The last schema that was refused; empty when there was none."""
+        """The last schema that was refused; empty if none was."""
 
     def receive(self, frame: Hello | Data | Lost, now_ns: int) -> list[Effect]:
-        """Take a frame; what is to be done with the store."""
+        """Process a frame and return the effects on the store."""
         if isinstance(frame, Hello):
             return self._hello(frame, now_ns)
         stream = self._streams.get(frame.tag)
@@ -419,7 +433,7 @@ class Incoming:
                 self._answers.append(ask)
             return []
         if not stream.open:
-            return []  # it comes again
+            return []  # it will be sent again
         if isinstance(frame, Lost):
             return [NoteLost(stream.hello.origin, frame.first, frame.last)] if frame.last >= frame.first else []
         return self._data(stream, frame, now_ns)
@@ -435,13 +449,13 @@ class Incoming:
             if hello.first > stream.through + 1:
                 return [NoteLost(hello.origin, stream.through + 1, hello.first - 1)]
             return []
-        self._streams[hello.tag] = _Stream(hello)  # or again: the store did not answer the last time
+        self._streams[hello.tag] = _Stream(hello)  # a new stream, or one whose lookup the store did not answer
         if len(self._streams) > MAX_STREAMS:
             self._streams.popitem(last=False)
         return [Open(hello.origin)]
 
     def opened(self, origin: str, last: int, gaps: Sequence[tuple[int, int]], now_ns: int) -> list[Effect]:
-        """What the store has of `origin`: everything up to `last` but the `gaps`."""
+        """Take what the store has of `origin`: everything up to `last` except the `gaps`."""
         effects: list[Effect] = []
         for stream in self._of(origin):
             at = 0
@@ -471,19 +485,19 @@ class Incoming:
         return [Keep(stream.hello.origin, tuple(new), stream.hello.prototype)]
 
     def kept(self, origin: str, events: Sequence[Event], now_ns: int) -> None:
-        """These are in the store."""
+        """Note that these events are in the store."""
         for stream in self._of(origin):
             stream.under_way.difference_update(event.sequence for event in events)
             stream.add([(event.sequence, event.sequence) for event in events])
             self._acknowledge(stream, now_ns)
 
     def not_kept(self, origin: str, events: Sequence[Event]) -> None:
-        """The store refused these: they are not acknowledged, and come again."""
+        """Note that the store refused these events: they are not acknowledged, and will be sent again."""
         for stream in self._of(origin):
             stream.under_way.difference_update(event.sequence for event in events)
 
     def noted(self, origin: str, first: int, last: int, now_ns: int) -> None:
-        """The store knows that these are lost."""
+        """Note that the store has recorded these events as lost."""
         for stream in self._of(origin):
             stream.add([(first, last)])
             self._acknowledge(stream, now_ns)
@@ -492,7 +506,7 @@ class Incoming:
         return [stream for stream in self._streams.values() if stream.hello.origin == origin]
 
     def through(self, origin: str) -> int:
-        """Everything of `origin` up to this number is in the store, or known to be lost."""
+        """Return the number up to which everything of `origin` is in the store, or recorded as lost."""
         return max((stream.through for stream in self._of(origin) if stream.open), default=0)
 
     def _acknowledge(self, stream: _Stream, now_ns: int, *, at_once: bool = False) -> None:
@@ -500,7 +514,7 @@ class Incoming:
         stream.ack_ns = due_ns if stream.ack_ns is None else min(stream.ack_ns, due_ns)
 
     def next_frame(self, now_ns: int) -> Frame | None:
-        """An answer that is due, if any."""
+        """Return an answer that is due, or None."""
         if self._answers:
             return self._answers.popleft()
         for tag, stream in self._streams.items():
@@ -514,7 +528,7 @@ class Incoming:
         return None
 
     def wake_ns(self, now_ns: int) -> int | None:
-        """When an answer will be due; None: never."""
+        """Return the time at which an answer will be due; None: never."""
         if self._answers:
             return now_ns
         due = [s.ack_ns for s in self._streams.values() if s.open and s.ack_ns is not None]

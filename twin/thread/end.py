@@ -1,7 +1,7 @@
-"""One side of a thread: a store, a carrier, and the core between them, for as long as the twin runs.
+"""One side of a thread: a store, a carrier, and the protocol core between them, for as long as the twin runs.
 
-It opens links again and again, moves events from the store to the other side and from there into the store, and tells what is
-new in order. It holds what can send; a shadow is given only what arrives (SPEC ruling 16).
+It opens a link again whenever one is lost, sends events from the store to the other side, stores those that it
+receives, and passes new ones on in order. It can send; a shadow is given the received events only (SPEC ruling 16).
 """
 
 from __future__ import annotations
@@ -21,19 +21,22 @@ from fieldtwin.twin.thread.link import Carrier, Link, Unwelcome
 
 FIRST_RETRY_NS, LAST_RETRY_NS = 200 * NS_PER_MS, 10 * NS_PER_S
 PROVEN_NS = 5 * NS_PER_S
-"""A link that lasts so long was a good one. Two who want the same place take turns of that length."""
+"""A link that lasts this long counts as good. Two followers of the same place alternate at this interval."""
 READ_BLOCK = 1000
 STORE_PAUSE_NS = NS_PER_S
 
 OnEvents = Callable[[str, Sequence[Event]], Awaitable[None]]
-"""Told (origin, events) in the order of their numbers, each once as long as nobody dies between storing and telling."""
+"""Called with (origin, events) in the order of their numbers. Each event is passed on once, unless the process dies
+between storing it and passing it on.
+"""
 
 
 class ThreadEnd:
     """``ThreadEnd(store, carrier, schema, clock, origin=...)``; `run` until cancelled.
 
-    `origin` is the log that this side sends (`KnowledgeStore.own`), empty for a side that only receives. Call `appended` when the
-    log grew. Without `insists`, `run` ends when the other side does not want us and there never was a link.
+    `origin` is the log that this side sends (`KnowledgeStore.own`), empty for a side that only receives. Call
+    `appended` when the log has grown. Without `insists`, `run` ends if the other side refuses this one before a link
+    was ever established.
     """
 
     def __init__(
@@ -53,9 +56,9 @@ class ThreadEnd:
         self.connected = False
         self.links = 0
         self.trouble = ""
-        """Why nothing gets through now, or what the other side complained of; empty when all is well."""
+        """Why nothing gets through now, or what the other side reported; empty if all is well."""
         self._refused_by_store = ""
-        """Why our store did not do the last that was asked of it."""
+        """Why this side's store refused the last request."""
         self._store = store
         self._carrier = carrier
         self._schema = schema
@@ -65,7 +68,7 @@ class ThreadEnd:
         self._on_events = on_events
         self._insists = insists
         self.silent = "there was no link"
-        """What it means that nothing ever came; empty when something did."""
+        """What it means that nothing has ever been received; empty once something has."""
         self._link: Link | None = None
         self._news = asyncio.Event()
         self._told: dict[str, int] = {}
@@ -78,17 +81,19 @@ class ThreadEnd:
 
     @property
     def waiting(self) -> int:
-        """Events of our log that the other side has not confirmed."""
+        """Number of events of this side's log that the other side has not confirmed."""
         return self.out.waiting if self.out is not None else 0
 
     def appended(self, last: int) -> None:
-        """Our log has grown to number `last`."""
+        """Note that this side's log has grown to number `last`."""
         if self.out is not None:
             self.out.appended(last)
             self._news.set()
 
     async def make_room(self) -> int:
-        """Forget the older half of what the other side has confirmed; how many events. For a store of this side that is full."""
+        """Forget the older half of what the other side has confirmed, when this side's store is full. Return the number
+        of events.
+        """
         if self.out is None:
             return 0
         first, _ = await self._store.span(self._origin)
@@ -97,7 +102,7 @@ class ThreadEnd:
         return await self._store.forget(self._origin, first + (self.out.through - first) // 2)
 
     async def run(self) -> None:
-        """Keep the thread up. Raises `FieldtwinError` only when the store cannot be read at the start, and `Unwelcome`."""
+        """Keep the thread up. Raises `FieldtwinError` only if the store cannot be read at the start, and `Unwelcome`."""
         if self._origin:
             first, last = await self._store.span(self._origin)
             self.out = Outgoing(self._origin, self._schema.id, first, last, prototype=self._prototype, fit=self._fit)
@@ -159,7 +164,7 @@ class ThreadEnd:
             await self._clock.sleep_until_ns(self._clock.monotonic_ns() + STORE_PAUSE_NS)
 
     async def _wait(self, now_ns: int) -> None:
-        """Until something comes, or something is due."""
+        """Wait until something arrives or is due."""
         times = [self.into.wake_ns(now_ns), self.out.wake_ns(now_ns) if self.out is not None else None]
         due = min((t for t in times if t is not None), default=None)
         timeout_s = None if due is None else max(0.001, (due - now_ns) / NS_PER_S)
@@ -176,7 +181,8 @@ class ThreadEnd:
             try:
                 await self._take(frame)
                 self._refused_by_store = ""
-            except Unreachable as e:  # the store: what was not kept is not acknowledged, and comes again
+            # The store failed: what it did not store is not acknowledged, and will be sent again.
+            except Unreachable as e:
                 self._refused_by_store = str(e)
                 await self._clock.sleep_until_ns(self._clock.monotonic_ns() + STORE_PAUSE_NS)
             self._news.set()
@@ -237,7 +243,7 @@ class ThreadEnd:
         self.into.noted(effect.origin, effect.first, effect.last, self._clock.monotonic_ns())
 
     async def _tell(self, origin: str) -> None:
-        """Pass on what follows what was passed on before, without holes but for what is lost."""
+        """Pass on the events after the last ones passed on, without gaps except for lost events."""
         through = self.into.through(origin)
         while self._on_events is not None and (told := self._told.get(origin, through)) < through:
             block = [e for e in await self._store.read(origin, told + 1, READ_BLOCK) if e.sequence <= through]
@@ -246,7 +252,7 @@ class ThreadEnd:
                 await self._on_events(origin, block)
 
     def describe(self) -> dict[str, Any]:
-        """How the thread is, for a status or a summary."""
+        """Return the state of the thread, for a status or a summary."""
         return {
             "carrier": self._carrier.name,
             "connected": self.connected,

@@ -1,15 +1,16 @@
-"""What two ends of a thread tell each other, and these frames as bytes small enough for an acoustic modem.
+"""The frames that the two ends of a thread exchange, and their encoding, small enough for an acoustic modem.
 
-A stream is one origin's log on its way to the other twin. Frames name it by a tag of two bytes; what the tag stands for, a HELLO
-says. An event takes 8 to 10 bytes: names are numbers of a schema that both ends have from the system file, times are differences,
-a value takes the bytes that it needs. Nothing is rounded: what arrives is what was logged.
+A stream is one origin's log on its way to the other twin. Frames identify it by a tag of two bytes, which a HELLO
+defines. An event takes 8 to 10 bytes: names are numbers in a schema that both ends derive from the system file, times
+are differences, and a value takes only the bytes that it needs. Nothing is rounded: the received event equals the
+logged one.
 
     HELLO    tag, schema id, origin, first and last number of the log, whether from a prototype
-    DATA     tag, first number, time, events that follow one another
+    DATA     tag, first number, time, events with consecutive numbers
     PIECE    tag, number, count, index, part of a DATA frame that is too large for the carrier
-    ACK      tag, everything up to a number is kept, then lengths of gaps and of runs behind it
-    LOST     tag, first and last number of what the log has no more
-    ASK      tag that the receiver does not know: say HELLO
+    ACK      tag, number up to which everything is stored, then lengths of the gaps and runs after it
+    LOST     tag, first and last number of events that are no longer in the log
+    ASK      tag that the receiver does not know: requests a HELLO
     REFUSED  tag, id of a schema that the receiver does not have
 
 Pure: no time, no network.
@@ -35,7 +36,7 @@ MAX_ORIGIN = 80
 MAX_RUNS = 64
 MAX_PIECES = 256
 PARTIAL = 8
-"""Frames in pieces that are kept until their other pieces come."""
+"""Number of incomplete frames that are kept until their remaining pieces arrive."""
 
 HELLO, DATA, PIECE, ACK, LOST, ASK, REFUSED = range(1, 8)
 _NONE, _INT, _FLOAT32, _FLOAT64, _TEXT, _BYTES = range(6)
@@ -44,15 +45,15 @@ _F32, _F64 = struct.Struct(">f"), struct.Struct(">d")
 
 @dataclass(frozen=True, slots=True)
 class Schema:
-    """Names that both ends know, in one order, and of which system; `id` tells one list from every other."""
+    """The names that both ends of a system's thread know, in one order. `id` identifies the list."""
 
     names: tuple[str, ...]
     system: str = ""
 
     @property
     def id(self) -> bytes:
-        """The first bytes of a SHA-256 over this encoding's version, the system and the names: of two plants that are built
-        alike, neither has the schema of the other."""
+        """The first bytes of a SHA-256 over the version of this encoding, the system and the names. Two plants of the
+        same design therefore have different schemas."""
         whole = "\n".join((str(VERSION), self.system, *self.names))
         return hashlib.sha256(whole.encode()).digest()[:SCHEMA_BYTES]
 
@@ -80,7 +81,9 @@ class Data:
 
 @dataclass(frozen=True, slots=True)
 class Ack:
-    """All up to `through` is kept; behind it, in turn, so many are missing and so many kept."""
+    """Everything up to `through` is stored. `runs` follow it: pairs of a number of missing and a number of stored
+    events.
+    """
 
     tag: bytes
     through: int
@@ -116,7 +119,7 @@ def tag_of(origin: str, schema: bytes) -> bytes:
 
 
 def varint(number: int) -> bytes:
-    """An unsigned number, seven bits a byte, lowest first."""
+    """Encode an unsigned number, seven bits per byte, lowest first."""
     out = bytearray()
     while number > 0x7F:
         out.append(number & 0x7F | 0x80)
@@ -126,12 +129,12 @@ def varint(number: int) -> bytes:
 
 
 def zigzag(number: int) -> bytes:
-    """A signed number: small ones of either sign are short."""
+    """Encode a signed number so that small ones of either sign are short."""
     return varint(number << 1 if number >= 0 else (-number << 1) - 1)
 
 
 class Reader:
-    """Takes a frame apart. Every read past the end is a `Desync`."""
+    """Decodes a frame. Every read past the end raises `Desync`."""
 
     def __init__(self, data: bytes) -> None:
         self.data = data
@@ -240,7 +243,9 @@ def _decode_event(reader: Reader, sequence: int, before_ms: int, schema: Schema)
 
 
 class FrameCodec:
-    """Frames to datagrams of at most `mtu` bytes, and back. One for each link: it remembers tags and pieces."""
+    """Converts frames to datagrams of at most `mtu` bytes, and back. Each link needs its own, because it remembers tags
+    and pieces.
+    """
 
     def __init__(self, schemas: Iterable[Schema], mtu: int) -> None:
         if mtu < SMALLEST_MTU:
@@ -252,18 +257,18 @@ class FrameCodec:
         self._pieces: OrderedDict[tuple[bytes, int, int], dict[int, bytes]] = OrderedDict()
 
     def knows(self, schema: bytes) -> bool:
-        """Whether events of this schema can be read here."""
+        """Return whether events of this schema can be decoded."""
         return schema in self._schemas
 
     def learn(self, tag: bytes, schema: bytes) -> None:
-        """What a tag stands for, heard or said."""
+        """Remember the schema of a tag that was sent or received."""
         self._of_tag[tag] = schema
         self._of_tag.move_to_end(tag)
         if len(self._of_tag) > 64:
             self._of_tag.popitem(last=False)
 
     def fit(self, tag: bytes, events: Sequence[Event]) -> int:
-        """How many of `events` go into one datagram; at least one, which may take pieces."""
+        """Return how many of `events` go into one datagram; at least one, which may need pieces."""
         numbers, size, before = self._names(tag), 1 + TAG_BYTES, events[0].t_ms
         size += len(varint(events[0].sequence)) + len(zigzag(before))
         for count, event in enumerate(events[:MAX_EVENTS]):
@@ -277,7 +282,7 @@ class FrameCodec:
         return self._numbers.get(self._of_tag.get(tag, b""), {})
 
     def encode(self, frame: Frame) -> list[bytes]:
-        """The datagrams of a frame: one, or the pieces of a large DATA frame."""
+        """Return the datagrams of a frame: one, or the pieces of a large DATA frame."""
         if isinstance(frame, Data):
             data = self._encode_data(frame)
             return [data] if len(data) <= self.mtu else self._cut(frame, data)
@@ -291,7 +296,7 @@ class FrameCodec:
             for gap, run in frame.runs:
                 more = varint(gap) + varint(run)
                 if len(head) + len(more) > self.mtu:
-                    break  # what is not said is asked for again
+                    break  # the rest is reported in a later ACK
                 head += more
             return [head]
         if isinstance(frame, Lost):
@@ -322,7 +327,7 @@ class FrameCodec:
         return [head + varint(len(parts)) + varint(i) + part for i, part in enumerate(parts)]
 
     def decode(self, data: bytes) -> Frame | None:
-        """A frame; None for a piece whose others are missing. Raises `Desync` for what is no frame."""
+        """Return a frame, or None for a piece of an incomplete frame. Raises `Desync` for invalid data."""
         reader = Reader(data)
         head = reader.take(1)[0]
         if head >> 4 != VERSION:
@@ -368,7 +373,7 @@ class FrameCodec:
     def _decode_data(self, tag: bytes, reader: Reader) -> Data:
         schema = self._schemas.get(self._of_tag.get(tag, b""))
         if schema is None:
-            return Data(tag, ())  # whoever reads it asks what the tag stands for
+            return Data(tag, ())  # the receiver will ask what the tag means
         sequence, before = reader.varint(), reader.zigzag()
         events: list[Event] = []
         while not reader.done:

@@ -1,6 +1,7 @@
-"""What a thread needs of a carrier: links that take frames and bring frames, and end with an error when they are lost.
+"""The interface between a thread and its carrier: links that send and receive frames, and raise an error when they are
+lost.
 
-A link may lose, repeat and reorder; it may not change what a frame holds. `DatagramLink` is for carriers of bytes.
+A link may lose, repeat and reorder frames; it must not change their contents. `DatagramLink` is for carriers of bytes.
 """
 
 from __future__ import annotations
@@ -14,41 +15,41 @@ from fieldtwin.twin.thread.frames import Frame, FrameCodec, Schema
 
 
 class Unwelcome(Unreachable):
-    """The other side is there and does not want us: our password or certificate, or what we may do. To wait is no help."""
+    """The other side refuses this one, because of its password, certificate or permissions. Waiting does not help."""
 
 
 class Link(ABC):
-    """A way to the other side, until it is lost. One reader and one writer."""
+    """A connection to the other side, until it is lost. It has one reader and one writer."""
 
     trouble = ""
-    """Why nothing gets through now although the link is not lost; empty when all is well."""
+    """Why nothing gets through now although the link is not lost; empty if all is well."""
     quiet = "nothing came"
-    """What it means when nothing ever comes over it, for whoever waits."""
+    """Explanation for the user if nothing is ever received over this link."""
     ack_delay_ns = 0
-    """How long an ACK may wait for others: one that takes a second on the way serves for many frames."""
+    """How long an ACK may be delayed. On a link with seconds of latency, one ACK serves for many frames."""
 
     linger_ns = 0
-    """How long events may wait for others: a frame that takes a second on the way had better be full."""
+    """How long events may wait for more events. On a link with seconds of latency, frames should be full."""
 
     @abstractmethod
     async def send(self, frame: Frame) -> None:
-        """Hand a frame over, waiting for room. Raises `Unreachable` when the link is lost."""
+        """Send a frame, waiting for room. Raises `Unreachable` if the link is lost."""
 
     @abstractmethod
     async def receive(self) -> Frame:
-        """The next frame. Raises `Unreachable` when the link is lost. What is no frame is counted and left out."""
+        """Return the next frame. Raises `Unreachable` if the link is lost. Invalid frames are counted and skipped."""
 
     @abstractmethod
     def fit(self, tag: bytes, events: Sequence[Event]) -> int:
-        """How many of these events go into one frame; at least one."""
+        """Return how many of these events go into one frame; at least one."""
 
     @abstractmethod
     def knows(self, schema: bytes) -> bool:
-        """Whether events of this schema can be read here."""
+        """Return whether events of this schema can be decoded."""
 
     @abstractmethod
     async def aclose(self) -> None:
-        """Give the link up."""
+        """Close the link."""
 
 
 class Carrier(ABC):
@@ -58,10 +59,10 @@ class Carrier(ABC):
 
     @abstractmethod
     async def open(self) -> Link:
-        """A link to the other side, waiting for it where it is the one who comes. Raises `Unreachable`."""
+        """Return a link to the other side. A listening side waits for it. Raises `Unreachable`."""
 
     async def aclose(self) -> None:
-        """Open no more."""
+        """Open no more links."""
         return
 
 
@@ -75,11 +76,11 @@ class DatagramLink(Link):
 
     @abstractmethod
     async def send_datagram(self, data: bytes) -> None:
-        """As `send`."""
+        """Send one datagram. Waits and raises like `send`."""
 
     @abstractmethod
     async def receive_datagram(self) -> bytes:
-        """As `receive`."""
+        """Return the next datagram. Raises like `receive`."""
 
     async def send(self, frame: Frame) -> None:
         for datagram in self._codec.encode(frame):

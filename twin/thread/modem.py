@@ -1,7 +1,7 @@
-"""A thread over the reference system's modems: each datagram is one message in a mailbox, 64 bytes, a few a second.
+"""A thread over the reference system's modems: each datagram is one mailbox message of 64 bytes, a few per second.
 
-The transmitter's driver is the plant's own (`TransmitterDriver`); what is sent is put into its outbox when the one before was
-taken, and a message is acknowledged when it was read here. Either end is this class.
+The transmitter's driver is the plant's own (`TransmitterDriver`). A datagram is put into the modem's outbox when the
+previous one was taken, and a received message is acknowledged after it was read. Both ends use this class.
 """
 
 from __future__ import annotations
@@ -25,14 +25,16 @@ from fieldtwin.twin.thread.link import Carrier, DatagramLink
 
 TICK_NS = 20 * NS_PER_MS
 ACK_DELAY_NS = 1000 * NS_PER_MS
-"""A frame takes a second or more on the way: one ACK confirms several."""
+"""A frame takes a second or more to arrive, so one ACK confirms several."""
 LINGER_NS = 500 * NS_PER_MS
 HALT_S = 0.5
 NOT_ASKED = DeviceState.error
 
 
 class ModemLink(DatagramLink):
-    """A link through a transmitter's mailboxes. It stays while the modem is away: what it holds is sent when it is back."""
+    """A link through a transmitter's mailboxes. It persists while the modem is offline, and sends what it holds when
+    the modem is back.
+    """
 
     ack_delay_ns = ACK_DELAY_NS
     linger_ns = LINGER_NS
@@ -67,7 +69,7 @@ class ModemLink(DatagramLink):
 
     @property
     def trouble(self) -> str:  # type: ignore[override]
-        """The modem does not answer, and why, without what differs from one try to the next; at first nobody has asked it."""
+        """Why the modem does not answer, without the details that differ between tries; empty before the first request."""
         state = self._bus.devices[0]
         why = "" if state.online else self._bus.error or state.error.removeprefix(NOT_ASKED)
         return f"the modem: {why.partition('; expected')[0]}" if why else ""
@@ -77,7 +79,7 @@ class ModemLink(DatagramLink):
             raise ConnectionLost(f"the transmitter is not served any more: {failure}", where=self._driver.config.name)
 
     async def _pump(self) -> None:
-        """Every so often the next exchange with the modem's mailboxes, one at a time."""
+        """Start the next exchange with the modem's mailboxes periodically, one at a time."""
         while True:
             now_ns = self._clock.monotonic_ns()
             self._boxes.next(now_ns, taken=not self._inbox.queue)

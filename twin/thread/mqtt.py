@@ -1,4 +1,4 @@
-"""A thread over an MQTT broker, as Sparkplug B (the extra `mqtt`). The only file that knows aiomqtt."""
+"""A thread over an MQTT broker, as Sparkplug B (the extra `mqtt`). This is the only module that imports aiomqtt."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ from fieldtwin.twin.thread.sparkplug_payloads import MAX_PAYLOAD
 KEEPALIVE_S = 15
 TIMEOUT_S = 10.0
 QUEUED = 1000
-"""Messages that may wait to be read; what is too much is dropped by the client, and comes again."""
+"""Number of received messages that may wait. The client drops further ones, which will be sent again."""
 ACK_DELAY_NS = 100 * NS_PER_MS
 GOODBYE_S = 1.0
 
 
 FAILURE = 0x80
-"""Codes of a SUBACK from here on are refusals (MQTT 3.9.3)."""
+"""SUBACK codes from here on are refusals (MQTT 3.9.3)."""
 ACCESS = "the user needs to read and write the topics of group and node, and STATE (docs/thread.md)"
 
 
 class _Socket(ssl.SSLSocket):
-    """One that is closed when the other side is not whom we trust: paho leaves it to the collector."""
+    """A TLS socket that closes itself when the handshake fails. paho leaves it to the garbage collector."""
 
     def do_handshake(self, block: bool = False) -> None:
         try:
@@ -44,7 +44,7 @@ class _Socket(ssl.SSLSocket):
 
 
 class _Heard(logging.Handler):
-    """The last thing that paho had to say: why a connection broke is nowhere else."""
+    """Keeps the last log message of paho, which is the only source for the reason of a lost connection."""
 
     def __init__(self) -> None:
         super().__init__(logging.WARNING)
@@ -55,8 +55,10 @@ class _Heard(logging.Handler):
 
 
 def _refusal(e: aiomqtt.MqttError, heard: str, where: str) -> Unreachable:
-    """Why there is no session: who is not there may be later, who refuses will go on doing so."""
-    cause = e.__context__  # aiomqtt keeps the text of what paho raised
+    """Return why there is no session. A broker that is not reachable may be later; one that refuses will go on
+    refusing.
+    """
+    cause = e.__context__  # aiomqtt keeps the exception that paho raised
     if isinstance(cause, ssl.SSLCertVerificationError):
         hint = "ca= names who is trusted; the certificate is for the host in the URL"
         return Unwelcome(f"the broker's certificate is refused: {cause.verify_message}", where=where, hint=hint)
@@ -78,7 +80,7 @@ def _refusal(e: aiomqtt.MqttError, heard: str, where: str) -> Unreachable:
 
 @dataclass(frozen=True, slots=True)
 class Broker:
-    """Where the broker is and who we are there. The password is never shown."""
+    """Address and credentials of the broker. The password is never shown."""
 
     host: str
     port: int = 1883
@@ -110,7 +112,7 @@ class MqttLink(Link):
         self._messages: AsyncIterator[aiomqtt.Message] = aiter(client.messages)
 
     async def begin(self) -> None:
-        """Subscribe, and say that we are here."""
+        """Subscribe, and announce this side."""
         try:
             for topic in self.side.subscriptions:
                 granted = await self._client.subscribe(topic, qos=1)
@@ -153,7 +155,7 @@ class MqttLink(Link):
         return self.side.fit(events)
 
     def knows(self, schema: bytes) -> bool:
-        """Births announce every name: nobody needs to have the schema beforehand."""
+        """Return True: births announce every name, so the schema need not be known beforehand."""
         return True
 
     async def aclose(self) -> None:
@@ -165,8 +167,8 @@ class MqttLink(Link):
 
 
 class MqttCarrier(Carrier):
-    """Goes to the broker. `make_side` is called for each session with its number, since births and deaths are counted, and with
-    when it began (UTC, ms)."""
+    """Connects to the broker. `make_side` is called for each session with its number, because births and deaths are
+    counted, and with its start time (UTC, ms)."""
 
     def __init__(self, broker: Broker, make_side: Callable[[int, int], Side], clock: Clock) -> None:
         self.name = f"thread over {broker}"
@@ -183,7 +185,7 @@ class MqttCarrier(Carrier):
         self._sessions += 1
         will = side.will()
         heard = _Heard()
-        logger = logging.Logger("mqtt", logging.WARNING)  # of this session; nothing of it goes to the screen
+        logger = logging.Logger("mqtt", logging.WARNING)  # logger of this session only; nothing is printed
         logger.addHandler(heard)
         client = aiomqtt.Client(
             b.host,

@@ -1,7 +1,8 @@
-"""Where a thread goes, as a URL: ``tcp://127.0.0.1:PORT`` on one computer, ``tls://HOST:PORT?ca=FILE&cert=FILE&key=FILE`` between
-two (the plant listens, its twin comes, both show a certificate), a broker with Sparkplug B (`fieldtwin.twin.thread.broker`), or
-the modems of the system: ``modem:`` or ``modem:DEVICE`` on the plant, which lends its mailboxes to the thread, and
-``modem:[DEVICE@]tcp://HOST:PORT``, the far modem, at its twin.
+"""The address of a thread as a URL: ``tcp://127.0.0.1:PORT`` on one computer;
+``tls://HOST:PORT?ca=FILE&cert=FILE&key=FILE`` between two (the plant listens, its twin connects, and both present a
+certificate); a broker with Sparkplug B (`fieldtwin.twin.thread.broker`); or the modems of the system: ``modem:`` or
+``modem:DEVICE`` on the plant, which lends its mailboxes to the thread, and ``modem:[DEVICE@]tcp://HOST:PORT``, the far
+modem, at its twin.
 """
 
 from __future__ import annotations
@@ -28,9 +29,9 @@ MODEM_POLL_MS = 200
 
 
 def lent_transmitter(place: str, system: System) -> str:
-    """The transmitter whose mailboxes the plant lends to a thread that goes to `place`; empty for other carriers.
+    """Return the transmitter whose mailboxes the plant lends to a thread at `place`; empty for other carriers.
 
-    Raises `UsageError` when there is none, or when it is not said which.
+    Raises `UsageError` if there is no transmitter, or if several and none is named.
     """
     return _transmitter(place.removeprefix(MODEM), system) if place.startswith(MODEM) else ""
 
@@ -47,8 +48,8 @@ def _transmitter(name: str, system: System) -> str:
 async def plant_carrier(
     place: str, system: System, clock: Clock, connector: Connector | None = None
 ) -> tuple[Carrier, str]:
-    """The plant's side, and where it is to be found: a free port is taken where the URL says 0. `connector` opens the bus of a
-    modem. Raises `UsageError`."""
+    """Return the carrier of the plant's side, and its address. Port 0 in the URL chooses a free port. `connector` opens
+    the bus of a modem. Raises `UsageError`."""
     if device := lent_transmitter(place, system):
         bus = system.buses[system.devices[device].bus]
         return _modem(system, device, bus.endpoint, connector or OsConnector(), clock), place
@@ -65,7 +66,7 @@ async def plant_carrier(
 
 
 def twin_carrier(place: str, system: System, clock: Clock) -> Carrier:
-    """The digital twin's side. Raises `UsageError`."""
+    """Return the carrier of the digital twin's side. Raises `UsageError`."""
     if place.startswith(MODEM):
         name, _, far = place.removeprefix(MODEM).rpartition("@")
         if not far.startswith("tcp:"):
@@ -93,7 +94,7 @@ def _is_loopback(host: str) -> bool:
 
 
 def _modem(system: System, device: str, endpoint: Endpoint, connector: Connector, clock: Clock) -> Carrier:
-    """The mailboxes of `device`'s modem, or of its peer, at `endpoint`."""
+    """Return the carrier for the mailboxes of `device`'s modem, or of its peer, at `endpoint`."""
     from fieldtwin.twin.thread.modem import ModemCarrier
 
     config = system.devices[device]

@@ -1,9 +1,9 @@
 """The plant's side of a digital thread as a process: ``python -m fieldtwin.twin.thread.plant_thread CONFIG.json``.
 
-It looks at the process image, as any watcher does, and shares what changes: values, states with their periods, commands that
-came, responses that went. It writes into a store of its own and sends from there. What its digital twin commands goes through
-the plant's own gate (`fieldtwin.twin.plant.command_gate`) to the gateway, as if the transmitter had brought it; the image is the
-gateway's. Control verbs: ready, get, stop.
+It reads the process image, like any watcher, and shares changes: values, states with their periods, received commands
+and sent responses. It writes them into its own store and sends from there. Commands from the digital twin pass through
+the plant's own gate (`fieldtwin.twin.plant.command_gate`) to the gateway, as if the transmitter had received them. Only
+the gateway writes the image. Commands of the control channel: ready, get, stop.
 """
 
 from __future__ import annotations
@@ -49,13 +49,14 @@ from fieldtwin.twin.thread.thread import PTtoDTConnection, schema_of
 
 LOOK_MS = 50
 REFRESH_MS = 10_000
-"""What does not change is told so often, so that a twin can tell it from silence."""
+"""A value that does not change is shared again at this interval, so that a twin can distinguish it from silence."""
 NAMES = list(STATES)
 
 
 class PlantThreadConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What the process is told. `place` is where the thread goes (`fieldtwin.twin.thread.place`), `store` a file or a database.
-    `mapping` is None on a plant. `every_ms`: a tag's new value is shared at most so often, however often it changes."""
+    """The configuration of the process. `place` is the address of the thread (`fieldtwin.twin.thread.place`), `store` a
+    file or a database. `mapping` is None on a plant. `every_ms` is the shortest interval between two shared values of a
+    tag."""
 
     system: str
     run_dir: str
@@ -68,17 +69,18 @@ class PlantThreadConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
 
 
 class ImageProcess(PTDigitalThreadProcess):
-    """Shares what the process image shows: `look` at both regions, as often as changes are not to be missed. Of a tag whose
-    quality stays, a new value is shared at most every `every_ms`; states and messages always.
+    """Shares the process image's changes. Call `look` with both regions often enough to miss no change. While a tag's
+    quality stays the same, its new values are shared at most every `every_ms`; states and messages always.
 
-    Whether a program runs is a value of its own name, bad when it does not (SPEC ruling 18). The last that a dead one said is no
-    state of the plant any more, and what a dead gateway read last is bad."""
+    Whether a program runs is a value with the program's name, which is bad when it does not run (SPEC ruling 18). When
+    the PLC is dead, its last state is no longer a state of the plant, and when the gateway is dead, its values are bad.
+    """
 
     def __init__(self, system: System, layout: ImageLayout, clock: Clock, every_ms: int = 0) -> None:
         super().__init__("image", clock)
         self._every_ms = every_ms
         tags = {tag.name: tag for region in layout.regions for tag in region.tags}
-        known = frozenset(schema_of(system).names)  # of a device's tags; not how far its messages were taken
+        known = frozenset(schema_of(system).names)  # only tags of devices; counters of taken messages are left out
         self._plain = [n for n, t in tags.items() if t.kind is not TagKind.MESSAGE and n in known]
         self._machines = {
             p: form.outputs.get("period_s", f"{p}.period_s")
@@ -119,7 +121,7 @@ class ImageProcess(PTDigitalThreadProcess):
                     self.share(Kind.PAYLOAD, tag, RESPONSE(message.data), (message.t_ns + offset_ns) // NS_PER_MS)
 
     def _controller(self, dead: Reason, outputs: Snapshot, now_ms: int, offset_ns: int) -> None:
-        """Whether its programs run; and the states of those that do."""
+        """Share whether the PLC's programs run, and the states of running ones."""
         runs = TagValue(not dead, Quality.BAD if dead else Quality.GOOD, dead, outputs.t_ns)
         for program in self._programs:
             self._value(program, runs, now_ms, offset_ns)
@@ -130,7 +132,9 @@ class ImageProcess(PTDigitalThreadProcess):
             self._status(program, outputs.value(f"{program}.state"), outputs.value(period), now_ms)
 
     def tell_again(self) -> None:
-        """Share states with the next look, changed or not: a command was refused, and who sent it holds them for others."""
+        """Share the states with the next look even if unchanged: after a refused command, its sender assumes a wrong
+        state.
+        """
         for program in self._machines:
             self._said.pop(f"{program}.", None)
 
@@ -164,7 +168,7 @@ class ImageProcess(PTDigitalThreadProcess):
 
 
 class PlantThread:
-    """The process: looks, writes, sends, until told to stop."""
+    """The process: reads the image, writes the store and sends, until it is stopped."""
 
     def __init__(self, config: PlantThreadConfig) -> None:
         self._config = config
@@ -216,14 +220,16 @@ class PlantThread:
         return 0
 
     async def _since(self, store: KnowledgeStore, origin: str) -> int:
-        """When our log began; 0 when that is so long ago that it was forgotten."""
+        """Return when this log began (UTC, ms); 0 if its beginning has been forgotten."""
         first = await store.read(origin, 1, 1)
         if first:
             return first[0].t_ms if first[0].sequence == 1 else 0
         return self._clock.utc_ns() // NS_PER_MS
 
     async def _commanded(self, origin: str, events: Sequence[Event]) -> None:
-        """What arrived from the digital twin's log, each number once: to the gateway, if the gate admits it."""
+        """Pass each command from the digital twin's log to the gateway, if the gate admits it. Each number arrives
+        once.
+        """
         for event in events:
             if event.kind != Kind.COMMAND:
                 continue
@@ -233,11 +239,13 @@ class PlantThread:
                     await self._hand_over(client, origin, event)
                 finally:
                     await client.aclose()
-            except FieldtwinError as e:  # it is not tried again: a command is for now
+            except FieldtwinError as e:  # not tried again: a command is meant for now
                 self._gate.share(Kind.REFUSAL, "gateway", f"number {event.sequence} of {origin}: {e}")
 
     async def _hand_over(self, client: ControlClient, origin: str, event: Event) -> None:
-        """The switch and the limits are the gateway's, which may have taken over others since it started."""
+        """Pass a command on. The switch and the limits are read from the gateway, because a reload may have changed
+        them.
+        """
         now = await client.call("gate")
         least_s, most_s = now["period_s"]
         self._gate.restate(remote=now["remote"], bounds=Bounds(least_s, most_s, now["per_minute"]))
@@ -295,7 +303,7 @@ class PlantThread:
 
 
 def main(argv: list[str]) -> int:
-    """Run the process; errors go to stderr as one line."""
+    """Run the process; an error is printed to stderr as one line."""
     try:
         config = msgspec.json.decode(Path(argv[0]).read_bytes(), type=PlantThreadConfig)
         return run(PlantThread(config).run())

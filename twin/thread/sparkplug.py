@@ -3,14 +3,14 @@
 | frame | from the edge node | from the host |
 |---|---|---|
 | HELLO | NBIRTH, every tag with its alias | NCMD, in the metric `fieldtwin/frame` |
-| DATA | NDATA, a metric an event, marked historical when it is late | NCMD, a metric a command |
+| DATA | NDATA, a metric per event, marked historical when it is late | NCMD, a metric per command |
 | ASK | NDATA, `fieldtwin/frame` | NCMD, `Node Control/Rebirth`, which any host may send |
 | ACK, LOST, REFUSED | NDATA, `fieldtwin/frame` | NCMD, `fieldtwin/frame` |
 
-So a host of others sees tags with values, times and quality; what makes a log of them are three more metrics. Commands of hosts
-that know nothing of threads have no number and are not taken, but for a rebirth.
+A third-party host therefore sees tags with values, times and quality; three more metrics turn them into a log. Commands
+of a host that does not use threads have no number and are ignored, except for a rebirth.
 
-Pure: frames to messages and back. It knows no broker.
+Pure: converts frames to messages and back, without a broker.
 """
 
 from __future__ import annotations
@@ -43,15 +43,17 @@ OUR_TYPES = {SEQUENCE: DataType.INT64, TAG: DataType.BYTES, FRAME: DataType.BYTE
 REBIRTH = "Node Control/Rebirth"
 BD_SEQ = "bdSeq"
 JUDGED = "fieldtwin"
-"""Property of a metric: kind, quality and reason of the event, a byte each."""
+"""Property of a metric: kind, quality and reason of the event, one byte each."""
 HISTORICAL_MS = 10_000
-"""What is older than this when it is sent is marked historical: a host stores it and does not show it as now."""
+"""An event that is older than this when it is sent is marked historical: a host stores it and does not show it as
+current.
+"""
 MAX_EVENTS = 250
 MAX_BYTES = 60_000
 
 
 def types_of(system: System) -> dict[str, DataType]:
-    """The type that each tag is announced with."""
+    """Return the type with which each tag is announced."""
 
     def kind(tag: Tag) -> DataType:
         return DataType.STRING if tag.is_text else DataType.INT64 if tag.is_integer else DataType.DOUBLE
@@ -61,7 +63,7 @@ def types_of(system: System) -> dict[str, DataType]:
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """What is published: `retain` for the state of a host, `qos` as Sparkplug says."""
+    """A message to publish: `retain` for the state of a host, `qos` as Sparkplug requires."""
 
     topic: str
     payload: bytes
@@ -70,7 +72,7 @@ class Message:
 
 
 def metric_of(event: Event, now_ms: int, types: Mapping[str, DataType], aliases: Mapping[str, int]) -> Metric:
-    """An event as a metric. Its type stands in it only where the birth announced another."""
+    """Return an event as a metric. The metric contains its type only if it differs from the announced one."""
     announced = types.get(event.name, DataType.DOUBLE)
     needed = announced if event.value is None else type_of(event.value)
     alias = aliases.get(event.name)
@@ -90,7 +92,7 @@ def metric_of(event: Event, now_ms: int, types: Mapping[str, DataType], aliases:
 
 
 def event_of(metric: Metric, sequence: int, names: Mapping[int, str], types: Mapping[str, DataType]) -> Event:
-    """The event again, bit by bit. Raises `Desync` for an alias that no birth announced."""
+    """Return the original event, unchanged. Raises `Desync` for an alias that no birth announced."""
     name = metric.name or names.get(-1 if metric.alias is None else metric.alias, "")
     if not name:
         raise Desync("a metric without a name", expected="an alias of the last birth", got=str(metric.alias))
@@ -102,24 +104,24 @@ def event_of(metric: Metric, sequence: int, names: Mapping[int, str], types: Map
 
 
 def _is_online(data: bytes) -> bool:
-    """Whether a host says that it is there. What is no state of Sparkplug 3 says nothing."""
+    """Return whether a host reports that it is online. A payload that is not a Sparkplug 3 state counts as offline."""
     try:
         state = json.loads(data)
-    except ValueError:  # no JSON, or no UTF-8
+    except ValueError:  # neither JSON nor UTF-8
         return False
     return isinstance(state, dict) and state.get("online") is True
 
 
 class _Side:
-    """What edge and host have in common."""
+    """The common part of edge node and host."""
 
     def __init__(self) -> None:
         self._codec = FrameCodec((), 1400)
         self.not_taken = 0
-        """Messages of others that a thread has no use for."""
+        """Number of messages that do not belong to a thread."""
 
     def fit(self, events: Sequence[Event]) -> int:
-        """How many events one message takes; at least one."""
+        """Return how many events one message takes; at least one."""
         size = 0
         for count, event in enumerate(events[:MAX_EVENTS]):
             size += 64 + (len(event.value) * 4 if isinstance(event.value, str | bytes) else 0)
@@ -134,7 +136,7 @@ class _Side:
     def _data_frame(
         self, metrics: Sequence[Metric], names: Mapping[int, str], types: Mapping[str, DataType]
     ) -> Frame | None:
-        """The frame in a message; None where there is none of a thread."""
+        """Return the frame in a message; None if it does not belong to a thread."""
         ours = {
             name: m.value for m in metrics if (name := m.name or names.get(-1 if m.alias is None else m.alias)) in OURS
         }
@@ -148,12 +150,12 @@ class _Side:
         try:
             return Data(tag, tuple(event_of(m, sequence + i, names, types) for i, m in enumerate(rest)))
         except Desync:
-            return Data(tag, ())  # its birth was not heard: whoever reads this asks for one
+            return Data(tag, ())  # the birth was missed: the receiver will ask for one
 
 
 class EdgeNode(_Side):
-    """The physical twin's side. A new one for each link, which began at `began_ms` (UTC); `bd_seq` counts its births and deaths
-    and is one more each time."""
+    """The physical twin's side. Each link, which began at `began_ms` (UTC), needs a new one; `bd_seq` counts its births
+    and deaths and increases by one each time."""
 
     def __init__(
         self,
@@ -180,12 +182,16 @@ class EdgeNode(_Side):
         self._tag = b""
 
     def will(self) -> Message:
-        """What the broker says when we are gone (NDEATH); published by us before we go by ourselves."""
+        """Return the NDEATH, which the broker publishes if this side is lost; this side publishes it before it leaves
+        by itself.
+        """
         bd = Metric(BD_SEQ, None, self._began_ms, DataType.INT64, self._bd_seq)
         return Message(topic(self._group, "NDEATH", self._node), encode_payload(Payload(self._began_ms, (bd,))), qos=1)
 
     def hello(self) -> list[Message]:
-        """What to publish as soon as there is a link: the birth comes with the thread's HELLO."""
+        """Return what to publish when the link is established: nothing, because the birth is sent with the thread's
+        HELLO.
+        """
         return []
 
     def messages(self, frame: Frame, now_ms: int) -> list[Message]:
@@ -221,7 +227,9 @@ class EdgeNode(_Side):
         return Message(topic(self._group, kind, self._node), encode_payload(Payload(now_ms, metrics, seq)))
 
     def frame(self, where: str, data: bytes) -> Frame | None:
-        """What came: of the host's thread, a rebirth, or that the host is there now. Raises `Desync`."""
+        """Return the frame in a message: a frame of the host's thread, or an ASK after a rebirth or when the host comes
+        online. Raises `Desync`.
+        """
         if where == self._state:
             there = _is_online(data)
             return Ask(self._tag) if there and self._tag else None
@@ -232,8 +240,8 @@ class EdgeNode(_Side):
 
 
 class HostApplication(_Side):
-    """The digital twin's side, host `host` of one edge node. A new one for each link, which began at `began_ms` (UTC): birth and
-    death of a session have that time, both (Sparkplug 3.0.0, 6.4.27)."""
+    """The digital twin's side: host `host` of one edge node. Each link, which began at `began_ms` (UTC), needs a new
+    one. Both birth and death of a session carry that time (Sparkplug 3.0.0, 6.4.27)."""
 
     def __init__(self, group: str, node: str, host: str, began_ms: int = 0) -> None:
         super().__init__()
@@ -241,7 +249,7 @@ class HostApplication(_Side):
         self.alive = False
         """Whether the edge node has been born and has not died since."""
         self.missed = 0
-        """Messages that were missing by their `seq`."""
+        """Number of messages that are missing according to `seq`."""
         self._group, self._node, self._state = group, node, state_topic(host)
         self._began_ms = began_ms
         self._names: dict[int, str] = {}
@@ -255,11 +263,11 @@ class HostApplication(_Side):
         return Message(self._state, json.dumps(state, separators=(",", ":")).encode(), qos=1, retain=True)
 
     def will(self) -> Message:
-        """What the broker says when we are gone."""
+        """Return what the broker publishes if this side is lost."""
         return self._says(online=False)
 
     def hello(self) -> list[Message]:
-        """What to publish as soon as there is a link: that we are here, and whoever was born before may say so again."""
+        """Return what to publish when the link is established: that this host is online, and a request for a rebirth."""
         return [self._says(online=True), self._rebirth(self._began_ms)]
 
     def _rebirth(self, now_ms: int) -> Message:
@@ -280,7 +288,7 @@ class HostApplication(_Side):
         return [self._publish((self._control(frame, now_ms, None),), now_ms)]
 
     def frame(self, where: str, data: bytes) -> Frame | None:
-        """What came from the edge node. Raises `Desync`."""
+        """Return the frame in a message of the edge node, if any. Raises `Desync`."""
         payload = decode_payload(data)
         if where == self.subscriptions[2]:
             died = next((m.value for m in payload.metrics if m.name == BD_SEQ), None)

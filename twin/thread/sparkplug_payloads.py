@@ -1,7 +1,7 @@
-"""Payloads and topics of Sparkplug B (Eclipse Sparkplug 3.0.0, chapters 4 and 6): what hosts of others understand.
+"""Payloads and topics of Sparkplug B (Eclipse Sparkplug 3.0.0, chapters 4 and 6), which third-party hosts understand.
 
-The protocol buffers of a payload are written and read here, as far as a thread uses them, without generated code. Fields of
-others are skipped. Pure: no MQTT, no time.
+The protocol buffers of a payload are encoded and decoded here without generated code, as far as a thread uses them.
+Unknown fields are skipped. Pure: no MQTT, no time.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ GOOD_QUALITY, BAD_QUALITY = 192, 0
 
 
 class DataType(IntEnum):
-    """Types of metrics (6.4.16) that a thread sends; it reads the other integers too."""
+    """Types of metrics (6.4.16) that a thread sends; it also reads the other integer types."""
 
     INT8, INT16, INT32, INT64 = 1, 2, 3, 4
     UINT8, UINT16, UINT32, UINT64 = 5, 6, 7, 8
@@ -35,7 +35,9 @@ _SIGNED = {DataType.INT8: 32, DataType.INT16: 32, DataType.INT32: 32, DataType.I
 
 @dataclass(frozen=True, slots=True)
 class Metric:
-    """A metric. In data it has a name or an alias; `datatype` 0 is that of the birth. `properties` are integers by name."""
+    """A metric. In data it has a name or an alias; `datatype` 0 means the type of the birth. `properties` are integers
+    by name.
+    """
 
     name: str = ""
     alias: int | None = None
@@ -48,7 +50,7 @@ class Metric:
 
 @dataclass(frozen=True, slots=True)
 class Payload:
-    """`seq` runs from 0 to 255 and round; None where a message has none (NDEATH, NCMD)."""
+    """A payload. `seq` counts from 0 to 255 and wraps around; None in messages without it (NDEATH, NCMD)."""
 
     t_ms: int
     metrics: tuple[Metric, ...]
@@ -56,7 +58,7 @@ class Payload:
 
 
 def topic(group: str, message: str, node: str) -> str:
-    """``spBv1.0/GROUP/NDATA/NODE``. Raises `UsageError` for a name that MQTT takes for a pattern."""
+    """Return ``spBv1.0/GROUP/NDATA/NODE``. Raises `UsageError` for a name that MQTT would read as a pattern."""
     for part in (group, node):
         if not part or any(c in part for c in "+#/") or not part.isprintable():
             raise UsageError("a name in Sparkplug", expected="a word without + # /", got=repr(part))
@@ -64,13 +66,13 @@ def topic(group: str, message: str, node: str) -> str:
 
 
 def state_topic(host: str) -> str:
-    """Where a host application says that it is there."""
+    """Return the topic on which a host application reports whether it is online."""
     topic(host, "STATE", host)
     return f"{NAMESPACE}/STATE/{host}"
 
 
 def type_of(value: Value) -> DataType:
-    """The type that holds a value exactly."""
+    """Return the type that holds a value exactly."""
     if isinstance(value, int):
         return DataType.INT64
     if isinstance(value, float):
@@ -108,7 +110,7 @@ def _properties(properties: tuple[tuple[str, int], ...]) -> bytes:
 
 
 def encode_metric(metric: Metric) -> bytes:
-    """One metric, without its frame in a payload."""
+    """Encode one metric, without its field header in a payload."""
     out = _bytes(1, metric.name.encode()) if metric.name else b""
     if metric.alias is not None:
         out += _number(2, metric.alias)
@@ -131,7 +133,7 @@ def encode_payload(payload: Payload) -> bytes:
 
 
 def _fields(data: bytes) -> list[tuple[int, int | bytes]]:
-    """Numbers and contents of the fields of a message, in order."""
+    """Return numbers and contents of the fields of a message, in order."""
     reader, out = Reader(data), list[tuple[int, int | bytes]]()
     while not reader.done:
         key = _varint(reader)
@@ -148,7 +150,7 @@ def _fields(data: bytes) -> list[tuple[int, int | bytes]]:
 
 
 def _varint(reader: Reader) -> int:
-    """Protocol buffers take up to ten bytes, of which 64 bits count."""
+    """Read a varint. Protocol buffers use up to ten bytes, of which 64 bits count."""
     number = shift = 0
     while True:
         byte = reader.take(1)[0]
@@ -236,7 +238,7 @@ def _decode_value(number: int, content: int | bytes) -> Value:
 
 
 def decode_payload(data: bytes) -> Payload:
-    """Raises `Desync` for what is no payload of Sparkplug B, or too large to be one of a thread."""
+    """Decode a payload. Raises `Desync` for data that is not a payload of Sparkplug B, or too large for a thread."""
     if len(data) > MAX_PAYLOAD:
         raise Desync("a Sparkplug payload", expected=f"at most {MAX_PAYLOAD} bytes", got=str(len(data)))
     t_ms, seq = 0, None

@@ -1,8 +1,9 @@
-"""A thread over TCP: one side listens, the other comes. Each datagram has its length in two bytes before it.
+"""A thread over TCP: one side listens, the other connects. Each datagram is preceded by its length in two bytes.
 
-One follower a thread. Who comes says a number of its own, so that one whose link was lost is known again and has its place at
-once; another one is let in when the first does not answer any more, and else is told that the place is taken. These words begin
-with F0h, which no frame of a thread does, and stay between the two links.
+A thread has one follower. A connecting side sends an identifier that it chose, so that it is recognized after a lost
+link and gets its place back at once. A different follower is admitted if the first one no longer answers; otherwise it
+is told that the place is taken. These control messages begin with F0h, which no frame of a thread does, and stay
+between the two links.
 """
 
 from __future__ import annotations
@@ -23,9 +24,9 @@ ACK_DELAY_NS = 20_000_000
 WHO, HERE, TAKEN, PING, PONG = (b"\xf0" + word for word in (b"WHO", b"HERE", b"TAKEN", b"PING", b"PONG"))
 WHO_BYTES = 8
 SAYS_WITHIN_S = 1.0
-"""Who comes says at once who it is."""
+"""Seconds within which a connecting side must identify itself."""
 ANSWERS_WITHIN_S = 2.0
-"""Who is there, and is asked whether it still is."""
+"""Seconds within which a connected side must answer a PING."""
 LET_IN_WITHIN_S = SAYS_WITHIN_S + ANSWERS_WITHIN_S + 1.0
 MOST_WAITING = 8
 
@@ -40,12 +41,12 @@ class StreamLink(DatagramLink):
         self._connection = connection
         self._pending = bytearray()
         self._held: bytes | None = None
-        """A frame that came where a word was waited for."""
+        """A frame that arrived while a control message was expected."""
         self._heard = asyncio.Event()
         self.who = b""
-        """The number of who is at the other end, where it said one."""
+        """The identifier of the other side, if it sent one."""
         self.read = False
-        """Whether a thread reads it."""
+        """Whether a thread reads from this link."""
         self.over = asyncio.Event()
 
     async def send_datagram(self, data: bytes) -> None:
@@ -61,7 +62,9 @@ class StreamLink(DatagramLink):
                 return frame
 
     async def _word(self, data: bytes) -> bool:
-        """Whether it was one of ours, and no frame. Raises `Unwelcome` where it says so."""
+        """Process a control message and return whether `data` was one. Raises `Unwelcome` if the other side refuses
+        this one.
+        """
         if data.startswith(TAKEN):
             raise Unwelcome(
                 f"another shadow or twin follows this thread already: {data.removeprefix(TAKEN).decode(errors='replace')}",
@@ -75,12 +78,12 @@ class StreamLink(DatagramLink):
         return data[:1] == WHO[:1]
 
     async def introduce(self, who: bytes) -> None:
-        """Say who we are, and wait until we are let in. Raises `Unwelcome`."""
+        """Send this side's identifier, and wait until it is admitted. Raises `Unwelcome`."""
         await self.send_datagram(WHO + who)
         await self._first(LET_IN_WITHIN_S)
 
     async def introduced(self) -> None:
-        """Until the other side said who it is, or something else, or nothing for too long."""
+        """Wait until the other side has identified itself, has sent something else, or took too long."""
         await self._first(SAYS_WITHIN_S)
 
     async def _first(self, within_s: float) -> None:
@@ -91,7 +94,7 @@ class StreamLink(DatagramLink):
                     self._held = data
 
     async def answers(self) -> bool:
-        """Whether somebody is still at the other end."""
+        """Return whether the other side still answers."""
         if not self.read or self._connection.lost is not None:
             return self._connection.lost is None
         self._heard.clear()
@@ -123,7 +126,7 @@ class StreamLink(DatagramLink):
 
 
 class TcpDialler(Carrier):
-    """Goes to the other side."""
+    """Connects to the other side."""
 
     def __init__(self, endpoint: Endpoint, connector: Connector, schemas: Sequence[Schema]) -> None:
         self.name = f"thread to {endpoint}"
@@ -143,9 +146,10 @@ class TcpDialler(Carrier):
 
 
 class TcpListening(Carrier):
-    """Waits for the other side. A peer that lost its link may come again before we notice; `refused` counts others.
+    """Waits for the other side. A peer that lost its link may connect again before this side notices; `refused` counts
+    other peers that were refused.
 
-    ``carrier = await TcpListening.start(endpoint, TcpListener.open, schemas)``; `bound` says the port.
+    ``carrier = await TcpListening.start(endpoint, TcpListener.open, schemas)``; `bound` is the endpoint with its port.
     """
 
     def __init__(self, schemas: Sequence[Schema]) -> None:
@@ -153,7 +157,7 @@ class TcpListening(Carrier):
         self._schemas = schemas
         self._next: StreamLink | None = None
         self._there: StreamLink | None = None
-        """The follower, whether it is read yet or not; and where it is."""
+        """The follower, whether or not its link is read yet. `_where` is its address."""
         self._where = ""
         self._deciding = asyncio.Lock()
         self.refused = 0
@@ -174,7 +178,7 @@ class TcpListening(Carrier):
 
     async def _on_client(self, client: Client) -> None:
         link = StreamLink(client, self._schemas)
-        with suppress(Unreachable):  # it is gone before it was anybody
+        with suppress(Unreachable):  # the client left before it identified itself
             await link.introduced()
             async with self._deciding:
                 there = self._there

@@ -1,8 +1,8 @@
-"""The digital thread: a connection each way between two twins, and the processes whose knowledge goes over it.
+"""The digital thread: one connection in each direction between two twins, and the processes whose knowledge it carries.
 
-A process shares events; a connection collects them from its processes into the log that its end sends. Here the paper's
-schemas have their names; what goes over the wire is `fieldtwin.twin.thread.end`, and the database is the store that it keeps
-both logs in.
+A process shares events; a connection collects them from its processes into the log that its end sends. The classes here
+have the names of the paper's schemas. The protocol is in `fieldtwin.twin.thread.end`; the paper's database is the store
+in which that module keeps both logs.
 """
 
 from __future__ import annotations
@@ -30,8 +30,9 @@ COLLECT_MS = 50
 
 
 def schema_of(system: System) -> Schema:
-    """The names that a system's two twins have in common, in the system file's order: tags, then programs and devices. It is
-    of that system alone: a twin of another one that is built alike neither hears this plant nor commands it."""
+    """Return the names that a system's two twins have in common, in the system file's order: tags, then programs and
+    devices. The schema belongs to that system alone: the twin of another system of the same design can neither receive
+    from this plant nor command it."""
     names = [f"{d.name}.{t.name}" for d in system.devices.values() for t in d.profile.tags.values()]
     return Schema((*names, *system.plc.programs, *system.devices), system.name)
 
@@ -44,7 +45,7 @@ class Operator(DTDigitalThreadProcess):
         self.share(Kind.COMMAND, command.name or self.name, command)
 
     def command_period(self, period_s: int) -> None:
-        """Command a period in seconds. Raises `Desync` outside of 16 bits."""
+        """Command a period in seconds. Raises `Desync` if it does not fit into 16 bits."""
         self.command(encode_period(period_s))
 
 
@@ -52,9 +53,9 @@ P = TypeVar("P", bound=DigitalThreadProcess)
 
 
 class ThreadConnection(Generic[P]):
-    """What both directions have in common: an end (the transmitter's side of it) and the processes that it collects from.
+    """The common part of both directions: an end (its sending side) and the processes from which it collects events.
 
-    `pump` moves what the processes share into the writer of the log that the end sends.
+    `pump` moves the events that the processes share into the writer of the log that the end sends.
     """
 
     collects: ClassVar[type[DigitalThreadProcess]]
@@ -69,7 +70,7 @@ class ThreadConnection(Generic[P]):
         self._clock = clock
 
     def pump(self) -> int:
-        """Take what the processes share; how many events."""
+        """Collect the events that the processes share, and return their number."""
         count = 0
         for process in self.collect_from:
             for event in process.collect():
@@ -78,7 +79,7 @@ class ThreadConnection(Generic[P]):
         return count
 
     async def run(self) -> None:
-        """Pump for good."""
+        """Pump until cancelled."""
         while True:
             self.pump()
             await self._clock.sleep_until_ns(self._clock.monotonic_ns() + COLLECT_MS * NS_PER_MS)
@@ -97,7 +98,7 @@ class DTtoPTConnection(ThreadConnection[DTDigitalThreadProcess]):
 
 
 class DigitalThread:
-    """SPEC row DigitalThread: one connection each way."""
+    """SPEC row DigitalThread: one connection in each direction."""
 
     def __init__(self, pt_data: PTtoDTConnection, dt_data: DTtoPTConnection) -> None:
         if type(pt_data) is not PTtoDTConnection or type(dt_data) is not DTtoPTConnection:
@@ -107,7 +108,7 @@ class DigitalThread:
 
 
 def to_receivers(*receivers: ReceivingEnd) -> OnEvents:
-    """What passes arriving events on to every receiving end, in order."""
+    """Return a function that passes arriving events on to every receiving end, in order."""
 
     async def pass_on(origin: str, events: Sequence[Event]) -> None:
         for event in events:

@@ -1,26 +1,26 @@
 """The PLC process: an image file, programs, their tasks on the wall clock, and a control channel.
 
-Control verbs (fieldtwin.gateway.core.control, on the configured Unix socket):
+Commands on the control channel (fieldtwin.gateway.core.control, on the configured Unix socket):
 
     ready     {"ready": true, "state": ...}: the image is attached and the tasks were started
-    get       everything a display shows: state, error, statistics, forces; unless {"brief": true}, every tag's value and what is
-              retained besides, which with thousands of tags takes longer than there is between two scans
-    image     {"tags": [...]}, 64 at most: of each value, quality, time, age, unit, limits, force, what programs see; without
-              tags, the names of all
+    get       all that a display shows: state, error, statistics, forces; unless {"brief": true}, also every tag's value and the
+              retained variables, which with thousands of tags takes longer than the time between two scans
+    image     {"tags": [...]}, at most 64: of each tag value, quality, time, age, unit, limits, force, and what programs see;
+              without tags, the names of all tags
     force     {"tag": ..., "value": ..., "by": ...}: until `unforce` {"tag": ...}, or all with {"all": true}
-    pause     execute nothing more, outputs stay; `go` goes on; `step` {"count": n} executes n scans while paused
+    pause     stop executing, outputs keep their values; `go` continues; `step` {"count": n} executes n scans while paused
     why       {"tag": ...}: which program last changed it, when, and what it saw; what that program waits for before it starts
     origin    {"tag": ..., "value": ...}: the program and the line of its source that set the tag to this value
-    limits    {"tags": {name: [low, high] or null}}: other limits than those in the image's layout, after a reload
-    restart   make the programs anew: {"cold": true} without what is retained
-    sources   which programs' files changed since the PLC read them
-    stop      outputs safe, then the process ends
+    limits    {"tags": {name: [low, high] or null}}: limits in place of those in the image's layout, after a reload
+    restart   create the programs anew: {"cold": true} without retained variables
+    sources   the programs whose files changed since the PLC read them
+    stop      make the outputs safe, then end the process
 
-What people do (force to restart) goes on record before it is done; each of these verbs takes "by".
+The actions of users (force to restart) are recorded before they are carried out; each of these commands takes "by".
 
-SIGTERM and SIGINT do what stop does. The process ends within a second, with its outputs region flagged stopped. A task
-that stopped by itself for good (a program that raised, an input that tripped, restarts used up) leaves the process up,
-outputs safe, so that it can be asked.
+SIGTERM and SIGINT act like stop. The process ends within a second, with its outputs region flagged stopped. When a task
+stopped by itself for good (a program that raised an error, an input that tripped, restarts used up), the process keeps
+running with its outputs safe, so that its status can be read.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ class PlcProcess:
         self._stopping = False
 
     def run(self) -> int:
-        """Run until told to stop; the exit code: 0, or the error's when a task stopped by itself."""
+        """Run until requested to stop. Return the exit code: 0, or the error's when a task stopped by itself."""
         before = {s: signal.signal(s, self._on_signal) for s in (signal.SIGTERM, signal.SIGINT)}
         try:
             self._loop.run_until_complete(self._server.listen_unix(Path(self._config.control_path)))
@@ -113,8 +113,8 @@ class PlcProcess:
         return {"ready": True, "state": self._runner.describe()["state"], "pid": os.getpid()}
 
     async def _stop(self, args: dict[str, Any]) -> dict[str, Any]:
-        self._runner.stop()  # before the answer: whoever asked may rely on it
-        self._loop.call_later(0.02, self._end)  # after it, so that it gets out
+        self._runner.stop()  # stop before the answer, because the client may rely on it
+        self._loop.call_later(0.02, self._end)  # end after the answer, so that it is sent
         return {"state": self._runner.describe()["state"]}
 
     def _end(self) -> None:
@@ -220,7 +220,7 @@ class PlcProcess:
         cold = args.get("cold") is True
         self._note("restart", args, cold=cold)
         self._runner.restart(cold=cold)
-        self._loop.call_soon(self._loop.stop)  # a wait that began while nothing ran is too long now
+        self._loop.call_soon(self._loop.stop)  # a wait that began while no task ran is too long now
         return {"start": self._runner.retained.start}
 
 
@@ -241,7 +241,8 @@ def _text(args: dict[str, Any], name: str) -> str:
 
 
 def plc_main(config: PlcConfig) -> int:
-    """Attach, run until told to stop, return the exit code. Raises `FileInvalid` or `Unreachable` before the first scan."""
+    """Attach, run until requested to stop, return the exit code. Raises `FileInvalid` or `Unreachable` before the first
+    scan."""
     try:
         fd = os.open(config.image_path, os.O_RDWR | os.O_CLOEXEC)
     except OSError as e:

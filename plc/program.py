@@ -1,4 +1,4 @@
-"""What a PLC program is: a plain class with declared inputs, outputs, local variables and messages.
+"""The base class of PLC programs: a plain class with declared inputs, outputs, local variables and messages.
 
     class Hysteresis(Program):
         level: float | None = var_input(TagKind.REAL)
@@ -8,9 +8,9 @@
         def execute(self, scan: ScanInfo) -> None:
             ...
 
-Within `execute` inputs are attributes that do not change, outputs and locals are attributes that the program sets. A
-program must never know the plant behind a variable, the image, a clock (`scan.now_ns` is frozen for a scan) or another
-program. Nothing here waits.
+Within `execute`, inputs are attributes that do not change, and outputs and locals are attributes that the program sets.
+A program must not know the plant behind a variable, the image, a clock (`scan.now_ns` is frozen for a scan) or another
+program. Nothing in this module waits.
 """
 
 from __future__ import annotations
@@ -34,10 +34,11 @@ MESSAGE_DEPTH = 16
 
 
 class ProgramFailed(FieldtwinError):
-    """A program raised, or set a variable to what its tag cannot hold. The task stops and its outputs become safe.
+    """A program raised an error, or set a variable to a value that its tag cannot hold. The task stops and its outputs
+    become safe.
 
-    `program` is its name in the system file, `line` the line of its source that raised (0 where unknown), `variable`
-    the tag concerned, if one is.
+    `program` is its name in the system file, `line` the line of its source that raised the error (0 if unknown),
+    `variable` the tag concerned, if any.
     """
 
     exit_code = 1
@@ -54,26 +55,26 @@ class ProgramFailed(FieldtwinError):
 
 
 class InputTripped(ProgramFailed):
-    """An input whose policy is ``trip`` went bad: the task stops, its outputs become safe."""
+    """An input whose policy is ``trip`` became bad: the task stops, and its outputs become safe."""
 
 
 class ProgramStuck(ProgramFailed):
-    """A program did not end its scan: the task stops, its outputs become safe."""
+    """A program did not end its scan: the task stops, and its outputs become safe."""
 
 
 class ScanTooLong(FieldtwinError):
-    """Logic ran more loop iterations and calls in one scan than it may: it would not end."""
+    """Logic ran more loop iterations and calls in one scan than are allowed: it is treated as endless."""
 
     exit_code = 1
     blame = Blame.FILE
 
 
 class ScanStuck(BaseException):
-    """Raised inside logic that does not end, by whoever watches over it. No `Exception`, so that no program catches it."""
+    """Raised by a guard inside logic that does not end. It is not an `Exception`, so that no program catches it."""
 
 
 class Role(Enum):
-    """VAR_INPUT, VAR_OUTPUT and VAR of IEC 61131-3. A local is shown to watchers and bound to nothing."""
+    """VAR_INPUT, VAR_OUTPUT and VAR of IEC 61131-3. A local is published for display only and is not bound to a tag."""
 
     INPUT = "input"
     OUTPUT = "output"
@@ -82,8 +83,8 @@ class Role(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Variable:
-    """A declared variable. `initial` is what it is before the first scan; `max_bytes` and `depth` are a message output's;
-    `retain`: its value outlives the process; `limits`: shown to watchers, and what a force has to keep to;
+    """A declared variable. `initial` is its value before the first scan; `max_bytes` and `depth` belong to a message
+    output; `retain`: its value outlives the process; `limits` are shown to users, and a force has to keep to them;
     `words`: the names of its values."""
 
     name: str
@@ -99,7 +100,7 @@ class Variable:
 
 
 def var_input(kind: TagKind, initial: Scalar | None = None) -> Any:
-    """Declare an input. It is None while the plant never had a value and nothing is substituted."""
+    """Declare an input. It is None while the plant has not had a value yet and no substitute applies."""
     return Variable("", Role.INPUT, kind, initial)
 
 
@@ -107,19 +108,21 @@ Limits = tuple[float, float] | None
 
 
 def var_output(kind: TagKind, initial: Scalar | None = None, unit: str = "", limits: Limits = None) -> Any:
-    """Declare an output. While it is None nothing is written to the plant. Bound to a tag it has that one's unit and limits."""
+    """Declare an output. While it is None, nothing is written to the plant. An output that is bound to a tag has the
+    tag's unit and limits."""
     return Variable("", Role.OUTPUT, kind, initial, unit, limits=limits)
 
 
 def var_local(
     kind: TagKind, initial: Scalar | None = None, unit: str = "", limits: Limits = None, words: Sequence[str] = ()
 ) -> Any:
-    """Declare a local variable that watchers see as ``<program>.<name>``, by its `words` (for 0, 1, 2...) where it has some."""
+    """Declare a local variable, published as ``<program>.<name>``. `words`: names of the values 0, 1, 2 and so on, for
+    display."""
     return Variable("", Role.LOCAL, kind, initial, unit, limits=limits, words=tuple(enumerate(words)))
 
 
 def var_retain(kind: TagKind, initial: Scalar | None = None, unit: str = "", limits: Limits = None) -> Any:
-    """Declare a local variable (VAR RETAIN) that a warm start finds as the last scan before left it."""
+    """Declare a local variable (VAR RETAIN) that keeps its value from the last scan over a warm start."""
     return Variable("", Role.LOCAL, kind, initial, unit, retain=True, limits=limits)
 
 
@@ -129,7 +132,7 @@ def message_input() -> Any:
 
 
 def message_output(max_bytes: int = MESSAGE_BYTES, depth: int = MESSAGE_DEPTH) -> Any:
-    """Declare an output of messages: an `Outbox`. Bound to a plant's mailbox it takes that one's size."""
+    """Declare an output of messages: an `Outbox`. If it is bound to a plant's mailbox, it takes the mailbox's size."""
     return Variable("", Role.OUTPUT, TagKind.MESSAGE, max_bytes=max_bytes, depth=depth)
 
 
@@ -142,18 +145,19 @@ class ScanInfo(msgspec.Struct, frozen=True, gc=False):
 
 
 class Outbox:
-    """A message output. Never more than `depth` messages are on their way, so that none is overwritten unread.
+    """A message output. There are never more than `depth` messages under way, so that none is overwritten before it is
+    read.
 
-    `waits` counts sends that were refused because the taker was behind: one a scan that had to wait.
+    `waits` counts sends that were refused because the receiver had not kept up: one per scan that had to wait.
     """
 
     def __init__(self, max_bytes: int, depth: int) -> None:
         self.max_bytes = max_bytes
         self.depth = depth
         self.outstanding = 0
-        """Published and not yet taken; kept by the scan."""
+        """How many messages are published and not yet taken; the scan updates it."""
         self.pending: list[tuple[int, bytes]] = []
-        """Sent in this scan, published at its end."""
+        """Messages that were sent in this scan and are published at its end."""
         self.waits = 0
 
     @property
@@ -162,7 +166,8 @@ class Outbox:
         return max(0, self.depth - self.outstanding - len(self.pending))
 
     def send(self, data: bytes, t_ns: int) -> bool:
-        """Send `data`, whose source time is `t_ns`. False, counted, when there is no room: keep it, try next scan.
+        """Send `data`, whose source time is `t_ns`. Return False, and count it, if there is no room: keep it and try in
+        the next scan.
 
         Raises `Bug` for a message longer than `max_bytes`.
         """
@@ -177,7 +182,8 @@ class Outbox:
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """A line of a program's source. In a code object it is an instruction, whose line is looked up only when it is shown."""
+    """A line of a program's source. In a code object it is an instruction, whose line is looked up only when it is
+    shown."""
 
     path: str = ""
     line: int = 0
@@ -185,7 +191,7 @@ class Place:
     instruction: int = 0
 
     def __str__(self) -> str:
-        """``pump.st:14``; the path alone where the line is not known, "" where neither is."""
+        """Return ``pump.st:14``; the path alone if the line is not known, "" if neither is known."""
         path, line = self.path, self.line
         if self.code is not None:
             path = self.code.co_filename
@@ -195,9 +201,9 @@ class Place:
 
 
 class _Assigned:
-    """An output as a class attribute: keeps the value in the instance, and remembers which instruction assigned it.
+    """An output as a class attribute: it keeps the value in the instance and remembers which instruction assigned it.
 
-    It has no ``__get__``, so that reading an output costs what reading any attribute costs.
+    It has no ``__get__``, so that reading an output costs as little as reading any other attribute.
     """
 
     __slots__ = ("name",)
@@ -216,10 +222,11 @@ class Program(ABC):
 
     __slots__ = ("__dict__", "__weakref__", "_assigned")
     _assigned: dict[str, tuple[CodeType, int]]
-    """By output: the instruction that assigned it last. Not among the variables, which are the program's state."""
+    """By output: the instruction that assigned it last. It is not a variable, because variables are the program's
+    state."""
     variables: ClassVar[dict[str, Variable]] = {}
     source_path: ClassVar[str] = ""
-    """The file that the program was compiled from, where that is not its module's."""
+    """The file from which the program was compiled, if it is not the file of its module."""
     _lookup: Callable[[str], TagValue] | None = None
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
@@ -244,55 +251,62 @@ class Program(ABC):
 
     @abstractmethod
     def execute(self, scan: ScanInfo) -> None:
-        """One scan: read inputs, set outputs, return. What it raises stops the task."""
+        """Execute one scan: read inputs, set outputs, return. An error that it raises stops the task."""
 
     def _whole_state(self, now_ns: int) -> Any:
-        """Return all that the next scans depend on, as something hashable, with moments relative to `now_ns`; None where
-        that is not known, as for logic in Python, which may keep anything anywhere."""
+        """Return all that the next scans depend on, as a hashable value with times relative to `now_ns`.
+
+        Return None if that is unknown, as for logic in Python, which can keep state anywhere.
+        """
         return None
 
     def place(self, name: str) -> Place | None:
-        """The line that assigned output `name` last; None while it has its initial value, or one that was put in."""
+        """Return the line that assigned output `name` last; None while it has its initial value, or one set from
+        outside."""
         assigned = self._assigned.get(name)
         return Place(code=assigned[0], instruction=assigned[1]) if assigned is not None else None
 
     def put(self, name: str, value: Scalar) -> None:
-        """Set a variable from outside the logic: what a force does."""
+        """Set a variable from outside the logic, as a force does."""
         self.__dict__[name] = value
         self._assigned.pop(name, None)
 
     def retained(self) -> dict[str, Any]:
-        """What a warm start needs: numbers, strings, lists and maps of those by variable."""
+        """Return what a warm start needs, by variable: numbers, strings, and lists and maps of those."""
         return {v.name: self.__dict__[v.name] for v in self.variables.values() if v.retain}
 
     def retain_layout(self) -> Any:
-        """What must be the same for a retained value to mean the same: JSON-able."""
+        """Return what must be unchanged for a retained value to keep its meaning, as data for JSON."""
         return [[v.name, v.kind.value] for v in self.variables.values() if v.retain]
 
     def retain_bytes(self) -> int:
-        """The most that `retained` takes as MessagePack, whatever the values."""
+        """Return the largest size of `retained` as MessagePack, whatever the values."""
         return sum(9 + 5 + len(v.name.encode()) for v in self.variables.values() if v.retain)
 
     def check(self, name: str, value: Scalar) -> None:
-        """Raises `UsageError` where variable `name` cannot hold `value`, though its tag can. Any can, here."""
+        """Raise `UsageError` if variable `name` cannot hold `value`, although its tag can. In this class every variable
+        can."""
         return
 
     def restore(self, kept: dict[str, Any]) -> None:
-        """The inverse of `retained`; variables that are not in `kept` begin with their initial value."""
+        """Restore what `retained` returned; variables that are not in `kept` keep their initial value."""
         for v in self.variables.values():
             if v.retain and v.name in kept:
                 self.__dict__[v.name] = kept[v.name]
 
     def resume(self, known: Mapping[str, Scalar]) -> None:
-        """Before the first scan: go on from what was known of the outputs and locals, as far as it is known. A program whose
-        state is more than its variables overrides this. Raises `UsageError` for a value that a variable cannot hold."""
+        """Before the first scan, continue from known values of the outputs and locals.
+
+        A program whose state is more than its variables overrides this. Raises `UsageError` for a value that a variable
+        cannot hold.
+        """
         for v in self.variables.values():
             if v.role is not Role.INPUT and v.name in known and not isinstance(self.__dict__.get(v.name), Outbox):
                 self.check(v.name, known[v.name])
                 self.put(v.name, known[v.name])
 
     def tag(self, name: str) -> TagValue:
-        """Input `name` with quality, reason and time, as this scan sees it (after its substitute policy)."""
+        """Return input `name` with quality, reason and time, as this scan sees it (after its substitute policy)."""
         if self._lookup is None:
             raise Bug("an input was looked up outside a scan", where=f"{type(self).__name__}.{name}")
         return self._lookup(name)

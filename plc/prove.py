@@ -1,13 +1,14 @@
-"""Proving a program: every state that any inputs can bring it into, breadth first, against what must always hold.
+"""Checks every state that a program can reach with any inputs, breadth first, against what must always hold.
 
-A `Proof` says what may come in (a finite domain a scan: values, qualities, how much time passes), which part of the program's
-state matters, and the invariants. The program itself runs, scan by scan; nothing is modelled twice. Breadth first, so the way
-to the first violation is a shortest one. Bounded: what was not looked at is said, and is no proof.
+A `Proof` defines the possible inputs (a finite domain per scan: values, qualities, how much time passes), which part of
+the program's state matters, and the invariants. The program itself runs, scan by scan; there is no second model. The
+search is breadth first, so the path to the first violation is a shortest one. The search is limited: states that were
+not visited are reported, and then there is no proof.
 
-A proof is only as good as its key: a key that leaves out what decides ends the search too soon. Structured Text needs no key,
-since all of its state is known. The timers and other blocks of a program always count. A key that is given is tested
-afterwards by random ways through the program without any key: a state that the search has not seen makes the result
-"not proved".
+A proof is only as good as its key: a key that leaves out a part of the state that matters ends the search too soon.
+Structured Text needs no key, because all of its state is known. The timers and other blocks of a program are always
+part of the key. A given key is tested afterwards by random paths through the program without any key: a state that the
+search has not seen makes the result "not proved".
 """
 
 from __future__ import annotations
@@ -30,20 +31,20 @@ from fieldtwin.plc.states import StateMachine
 
 MAX_STATES = 200_000
 WALKS, WALK_SCANS = 64, 64
-"""Random ways that test a key, and the scans of each."""
+"""The number of random paths that test a key, and the scans of each."""
 
 
 @dataclass(frozen=True, slots=True)
 class Given:
-    """What one scan is given: inputs by variable (None: BAD, never a value; a `TagValue` with its quality), ms since the scan
-    before, and whether the taker of each message output has emptied its mailbox since."""
+    """The inputs of one scan: values by variable (None: BAD without a value; a `TagValue` with its quality), ms since
+    the previous scan, and whether the receiver of each message output has emptied its mailbox since."""
 
     inputs: tuple[tuple[str, Any], ...]
     ms: float
     taken: bool = True
 
     def describe(self) -> dict[str, Any]:
-        """JSON-able: for a counterexample."""
+        """Return the inputs as data for JSON, for a counterexample."""
         shown = {name: _shown(value) for name, value in self.inputs if value is not None}
         return {"after_ms": self.ms, "inputs": shown, "taken": self.taken}
 
@@ -55,17 +56,18 @@ def _shown(value: Any) -> Any:
 
 
 Invariant = Callable[[Any], bool]
-"""Told the program after a scan: whether all is well."""
+"""Called with the program after a scan; returns whether the invariant holds."""
 
 
 @dataclass(frozen=True)
 class Proof:
     """What is to be proved of a program.
 
-    `make` makes it; `domain` has for each input the values that a scan may bring (a message input's are payloads, None for
-    no message; None for any other is BAD without a value, a `TagValue` one of any quality); `steps_ms` the times between
-    scans; `key` what of the program matters, as something hashable: two states with one key are the same. Structured Text
-    needs none: then all of its state matters. `clogs`: mailboxes may also be full.
+    `make` creates it; `domain` has for each input the values that a scan may bring (those of a message input are
+    payloads, and None for no message; for any other input None is BAD without a value, and a `TagValue` has any
+    quality); `steps_ms` are the times between scans; `key` returns the part of the program that matters, as a hashable
+    value: two states with one key are the same. Structured Text needs no key: then all of its state matters. `clogs`:
+    mailboxes may also be full.
     """
 
     make: Callable[[], Program]
@@ -75,10 +77,10 @@ class Proof:
     steps_ms: tuple[float, ...] = (10.0,)
     clogs: bool = False
     requirement: Mapping[str, str] = field(default_factory=dict)
-    """Where each invariant comes from."""
+    """The source of each invariant."""
 
     def choices(self) -> list[Given]:
-        """All that one scan can be given, the plainest first."""
+        """Return all inputs that one scan can have, the simplest first."""
         names = list(self.domain)
         rows = product(*(self.domain[name] for name in names))
         return [
@@ -88,7 +90,7 @@ class Proof:
 
 
 def machine_key(program: StateMachine) -> Hashable:
-    """Of a state machine: its state, the phase of its timers, its outputs and locals."""
+    """Return the key of a state machine: its state, the phase of its timers, its outputs and locals."""
     phase = min(program.in_state_ms, program.table.longest_ms)
     own = [v.name for v in program.variables.values() if v.role is not Role.INPUT and v.kind is not TagKind.MESSAGE]
     return phase, *(program.__dict__[name] for name in own)
@@ -96,9 +98,10 @@ def machine_key(program: StateMachine) -> Hashable:
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """`broken`: the invariant that does not hold (or the error that a scan raised), and `way` to it, scan by scan.
+    """The result of a search. `broken`: the invariant that does not hold (or the error that a scan raised), and `way`
+    to it, scan by scan.
 
-    `reason`: why it is not proved although nothing is broken.
+    `reason`: why the program is not proved although no invariant is broken.
     """
 
     states: int
@@ -111,7 +114,7 @@ class Result:
 
     @property
     def bounded(self) -> bool:
-        """Whether a bound of the search was reached, so that a larger one may bring a proof."""
+        """Whether a limit of the search was reached, so that a larger limit may lead to a proof."""
         return self.reason.startswith("more than")
 
     @property
@@ -120,9 +123,9 @@ class Result:
 
 
 def prove(proof: Proof, max_states: int = MAX_STATES, max_depth: int = 10_000) -> Result:
-    """Look at everything reachable, or until something is broken, or the bounds are reached.
+    """Visit every reachable state, until an invariant is broken or the limits are reached.
 
-    Raises `UsageError` where `domain` and the program's inputs differ, and where a program in Python has no key.
+    Raises `UsageError` if `domain` and the program's inputs differ, and if a program in Python has no key.
     """
     choices = proof.choices()
     first = _Point(proof.make(), 0, 0, None, None)
@@ -166,7 +169,8 @@ def _check(proof: Proof, program: Program) -> None:
 
 
 def _key(proof: Proof, point: _Point) -> Hashable:
-    """What tells the state of `point` from others: with a key the blocks still count, and the first scan differs always."""
+    """Return the key of the state of `point`. A given key is extended by the blocks, and by whether this is the first
+    scan."""
     program, now_ns = point.program, point.now_ns
     if proof.key is None:
         return point.number == 0, program._whole_state(now_ns)
@@ -175,7 +179,8 @@ def _key(proof: Proof, point: _Point) -> Hashable:
 
 
 def _tested(proof: Proof, choices: Sequence[Given], seen: set[Hashable], whole: Result) -> Result:
-    """`whole`, unless a random way without a key breaks an invariant or comes to a state that the search did not see."""
+    """Return `whole`, unless a random path without a key breaks an invariant or reaches a state that the search did not
+    see."""
     random = Random(0)
     for _ in range(WALKS):
         point = _Point(proof.make(), 0, 0, None, None)
@@ -193,7 +198,8 @@ def _tested(proof: Proof, choices: Sequence[Given], seen: set[Hashable], whole: 
 
 
 def shown(proof: Proof, way: Sequence[Given]) -> dict[str, Any]:
-    """What the program's outputs and locals are at the end of `way`, as far as that got: its last scan may have raised."""
+    """Return the program's outputs and locals at the end of `way`, as far as it was executed: the last scan may have
+    raised an error."""
     point = _Point(proof.make(), 0, 0, None, None)
     for given in way:
         point = point.after(given)
@@ -204,7 +210,7 @@ def shown(proof: Proof, way: Sequence[Given]) -> dict[str, Any]:
 
 
 class _Point:
-    """A program in a state that was reached, and how."""
+    """A program in a state that was reached, and the path to it."""
 
     def __init__(self, program: Program, now_ns: int, number: int, before: _Point | None, given: Given | None) -> None:
         self.program, self.now_ns, self.number = program, now_ns, number
@@ -227,7 +233,7 @@ def _broken(proof: Proof, point: _Point, given: Given) -> str:
         program.execute(ScanInfo(point.now_ns, point.number, point.number == 1))
     except ProgramFailed as e:
         return f"a scan failed: {e}"
-    except Exception as e:  # the logic is the user's: whatever it raises is what was looked for
+    except Exception as e:  # the logic is the user's: any error that it raises is a counterexample
         return f"a scan raised {type(e).__name__}: {e}"
     for name, holds in proof.invariants.items():
         if not holds(program):

@@ -1,8 +1,8 @@
 """The output image of a PLC: what all programs of all tasks publish, as one region with one writer.
 
-Each scan publishes the whole region: its own programs' values as they are now, the others' as their last scan left them.
-Forced outputs are put in, messages are taken from the outboxes, and whatever cannot be a value of its tag is refused with the
-program's name. It must never know when a scan is due.
+Each scan publishes the whole region: the present values of its own programs, and the values of the other programs after
+their last scan. It inserts forced outputs, takes messages from the outboxes, and refuses a value that its tag cannot
+hold, with the program's name. It must not know when a scan is due.
 """
 
 from __future__ import annotations
@@ -32,15 +32,16 @@ from fieldtwin.plc.forces import Forces
 from fieldtwin.plc.program import Outbox, Place, ProgramFailed, Variable
 
 Seen = Callable[[], dict[str, Scalar | None]]
-"""A program's inputs as it read them, by variable."""
+"""Returns a program's inputs as it read them, by variable."""
 
-_GOOD, _NO_REASON = Quality.GOOD, Reason.NONE  # an Enum's members are slow to look up
+_GOOD, _NO_REASON = Quality.GOOD, Reason.NONE  # local names, because looking up an Enum's members is slow
 MAX_CHANGES = 16
-"""Changes of a tag that are remembered, with what the program saw when it made them."""
+"""How many changes of a tag are remembered, with what the program saw when it made them."""
 
 
 class Output:
-    """One published variable: where the program keeps it. `taken` is where INPUTS says how far its messages got."""
+    """One published variable and where the program keeps it. `taken` is the place in INPUTS that shows how far its
+    messages were taken."""
 
     def __init__(self, bound: BoundProgram, variable: Variable, spec: TagSpec, index: int) -> None:
         self.program = bound.program
@@ -59,7 +60,8 @@ class Output:
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """Who last changed a tag, and what it saw: the answer to "why". `inputs` are the program's, as it read them."""
+    """A change of a tag: the program that made it, and what it saw, for the answer to "why". `inputs` are the
+    program's, as it read them."""
 
     tag: str
     t_ns: int
@@ -73,7 +75,7 @@ class Change:
     """The line of the program that assigned `after`."""
 
     def describe(self, now_ns: int) -> dict[str, Any]:
-        """JSON-able."""
+        """Return the change as data for JSON."""
         return {
             "tag": self.tag,
             "age_ms": (now_ns - self.t_ns) / 1e6,
@@ -98,21 +100,21 @@ class OutputImage:
         self.consumed: list[str] = []
         self.changes: dict[str, deque[Change]] = {}
         self.on_change: Callable[[Change], None] | None = None
-        """Told of each change. It may not raise."""
+        """Called with each change. It must not raise."""
         self._readers: dict[str, RegionReader] = {}
         self._read: list[tuple[int, RegionReader, str]] = []
-        """Place, reader and name of each message tag that somebody reads."""
+        """Place, reader and name of each message tag that a program reads."""
         self._forced = False
         """Whether the last publication had forced outputs."""
         self._bind(programs, image.reader(INPUTS).shape)
         self._by_tag = {o.tag: o for o in self.outputs}
         self._plain = [o for o in self.outputs if o.outbox is None]
         self._missing: dict[int, Reason] = {}
-        """Why an output has no value, by its place, where that is not because no program has set it yet."""
+        """Why an output has no value, by its place, if the reason is not that no program has set it yet."""
         self._same = False
-        """Whether what is collected is what was published last, times aside."""
+        """Whether the collected values equal those published last, apart from times."""
         self._room_for: Sequence[Scalar | None] | None = None
-        """INPUTS by which the room in the outboxes was counted; None when messages were sent since."""
+        """The INPUTS from which the room in the outboxes was computed; None if messages were sent since."""
         self._by_owner: dict[str, list[Output]] = {}
         for output in self.outputs:
             self._by_owner.setdefault(output.owner, []).append(output)
@@ -142,7 +144,7 @@ class OutputImage:
                 self.outboxes.append((source, source.outbox))
 
     def _before(self, image: Image) -> dict[str, int]:
-        """What a process before this one had consumed, by message tag."""
+        """Return what an earlier process had consumed, by message tag."""
         before = image.reader(OUTPUTS).snapshot()
         found = {}
         for tag in self.consumed:
@@ -151,7 +153,8 @@ class OutputImage:
         return found
 
     def reads(self, tag: str, reader: RegionReader) -> None:
-        """The messages of `tag` are consumed through `reader`. Raises `FileInvalid` when another reader does already."""
+        """Register `reader` as the consumer of the messages of `tag`. Raises `FileInvalid` if another reader already
+        is."""
         if self._readers.setdefault(tag, reader) is not reader:
             raise FileInvalid(f"messages of {tag} go to programs of two tasks", expected="programs of one task")
         reader.resume(tag, self._resumed[tag])
@@ -172,7 +175,7 @@ class OutputImage:
                     output.program.put(output.name, forced[output.tag].value)
 
     def publish_forces(self) -> None:
-        """From the next publication on forced outputs have their values, although no program runs."""
+        """Apply forced outputs from the next publication on, although no program runs."""
         for output in self._plain:
             force = self.forces.outputs.get(output.tag)
             if force is not None and self._values[output.index] != force.value:
@@ -180,8 +183,8 @@ class OutputImage:
                 self._same = False
 
     def room(self, taken: Sequence[Scalar | None]) -> None:
-        """Learn from INPUTS how far the messages got that were sent."""
-        if taken is self._room_for:  # a reader gives the same columns as long as nothing in them changes
+        """Read from INPUTS how many of the sent messages were taken."""
+        if taken is self._room_for:  # a reader returns the same columns as long as nothing in them changes
             return
         self._room_for = taken
         sent = self.writer.last_sequence
@@ -190,14 +193,14 @@ class OutputImage:
             outbox.outstanding = sent(output.tag) - (got if isinstance(got, int) else 0)
 
     def collect(self, now_ns: int, scan: int, programs: Mapping[str, Seen]) -> None:
-        """Take the values of `programs` as they are; changes are remembered with what the program saw."""
+        """Collect the present values of `programs`; changes are remembered with what the program saw."""
         for owner, outputs in self._by_owner.items():
             seen = programs.get(owner)
             if seen is not None:
                 self._collect(outputs, now_ns, scan, seen)
 
     def _collect(self, outputs: list[Output], now_ns: int, scan: int, seen: Seen) -> None:
-        """Those of one program."""
+        """Collect the values of one program."""
         values, forced, namespace = self._values, self.forces.outputs, outputs[0].namespace
         for output in outputs:
             value = namespace[output.name]
@@ -212,9 +215,9 @@ class OutputImage:
             before = values[output.index]
             if value is before or value == before:
                 if value is None and self._missing.pop(output.index, None) is not None:
-                    self._same = False  # the last value was not a number; this one is none, and that is another reason
+                    self._same = False  # the last value was NaN and this one is missing, so the reason changes
                 continue
-            if value != value:  # not a number must not reach a plant; the gateway reports it
+            if value != value:  # NaN must not be written to a plant; the gateway reports it
                 value, broken = None, output.index not in self._missing
                 self._missing[output.index] = Reason.NOT_A_NUMBER
             else:
@@ -231,7 +234,8 @@ class OutputImage:
             self._same = False
 
     def publish(self, now_ns: int) -> None:
-        """Publish what was collected. Raises `ProgramFailed` naming the program whose value no tag can hold."""
+        """Publish what was collected. Raises `ProgramFailed` with the name of a program whose value does not fit its
+        tag."""
         values = self._values
         messages = {}
         for output, outbox in self.outboxes:
@@ -255,14 +259,16 @@ class OutputImage:
                 values, _GOOD, _NO_REASON, now_ns, messages, but=but, same=self._same, missing=self._missing
             )
         except NotEncodable as e:
-            values[self.writer.shape.index[e.tag]] = None  # so that stopping can publish what is left
+            values[self.writer.shape.index[e.tag]] = None  # so that stopping can publish the other values
             owner = next((output.owner for output in self.outputs if output.tag == e.tag), "?")
             raise ProgramFailed(owner, f"{e.message}; expected {e.expected}; got {e.got}", variable=e.tag) from e
         self._same = True
 
     def origin(self, tag: str, value: Scalar | None) -> tuple[str, str]:
-        """(program, ``FILE:LINE``) that set `tag` to `value` (None: to something that is not a number), by the changes that are
-        remembered. The line is "" where none of them is that change, and they come from more than one line."""
+        """Return (program, ``FILE:LINE``) that set `tag` to `value` (None: to NaN), from the remembered changes.
+
+        The line is "" if none of them is that change and they come from more than one line.
+        """
         changes = self.changes.get(tag, ())
         owner = self._by_tag[tag].owner if tag in self._by_tag else ""
         for change in reversed(changes):
@@ -272,12 +278,12 @@ class OutputImage:
         return owner, places.pop() if len(places) == 1 else ""
 
     def stop(self, now_ns: int) -> None:
-        """Publish that nothing may be acted upon any more: flagged stopped, every tag BAD, values as last."""
+        """Publish that OUTPUTS must no longer be used: flagged stopped, every tag BAD, values unchanged."""
         self._same = False
         self.writer.publish_columns(self._values, Quality.BAD, Reason.NOT_OPERATIONAL, now_ns, None, RegionFlag.STOPPED)
 
     def current(self, tag: str) -> Scalar | None:
-        """What a program's variable is now: its initial value before the first scan."""
+        """Return the present value of a program's variable: its initial value before the first scan."""
         output = self._by_tag[tag]
         value: Scalar | None = output.namespace[output.name]
         return value
@@ -286,13 +292,13 @@ class OutputImage:
         self.writer.release()
 
     def last(self) -> dict[str, Scalar | None]:
-        """Every tag of OUTPUTS as last collected; a message tag's last sequence."""
+        """Return every tag of OUTPUTS as last collected; of a message tag, the last sequence."""
         shown = dict(zip(self.writer.shape.index, self._values, strict=True))
         return shown | {output.tag: self.writer.last_sequence(output.tag) for output, _ in self.outboxes}
 
 
 def find(shape: RegionShape, tag: str) -> tuple[TagSpec, int]:
-    """A tag's place in a region. Raises `FileInvalid`."""
+    """Return a tag's place in a region. Raises `FileInvalid`."""
     index = shape.index.get(tag)
     if index is None:
         raise FileInvalid(f"tag {tag} is not in the process image", expected=f"a tag of region {shape.layout.name}")

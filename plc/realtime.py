@@ -1,25 +1,24 @@
-"""The wall clock of a PLC process: sleeping precisely, and asking the host for what makes that possible.
+"""The wall clock of a PLC process: precise sleeping, and requests to the host for what makes that possible.
 
-One thread does everything. Between two scans it runs the control channel's asyncio loop, but only until `GUARD_NS`
-before the next deadline (asyncio rounds its timers up to 1 ms); the rest is an absolute clock_nanosleep, and the last
-`LEAD_NS` are spun through. The alternative
-was a second thread for the channel: it would hold the interpreter's lock at instants that nobody chooses, for up to the
-length of a JSON encoding, whereas here a request is begun only while there is slack. Cycles too short for the guard
-poll the channel without waiting, every `POLL_NS`.
+One thread does all the work. Between two scans it runs the control channel's asyncio loop, but only until `GUARD_NS`
+before the next deadline (asyncio rounds its timers up to 1 ms). The rest of the wait is an absolute clock_nanosleep,
+and the thread spins through the last `LEAD_NS`. The alternative was a second thread for the channel. It would hold the
+interpreter's lock at unpredictable times, for up to the length of a JSON encoding, whereas here a request is begun only
+while there is slack. In cycles too short for the guard, the channel is polled without waiting, every `POLL_NS`.
 
-Measured for both at a 10 ms cycle with a `get` every 20 ms, on 2 cores shared with other work (load 4 to 7), 10 s a
+Both were measured at a 10 ms cycle with a `get` every 20 ms, on 2 cores shared with other work (load 4 to 7), 10 s per
 run, three runs each in the order ABBAAB; lateness of the scan's start, p50 / p99:
 
-    SCHED_FIFO    this way 46 to 58 us / 0.13 to 0.20 ms      thread 84 to 88 us / 0.43 to 1.1 ms
-    SCHED_OTHER   this way 410 to 852 us / 8.9 to 15 ms       thread 94 to 450 us / 8.3 to 41 ms
+    SCHED_FIFO    one thread 46 to 58 us / 0.13 to 0.20 ms     two threads 84 to 88 us / 0.43 to 1.1 ms
+    SCHED_OTHER   one thread 410 to 852 us / 8.9 to 15 ms      two threads 94 to 450 us / 8.3 to 41 ms
 
-So under SCHED_FIFO this way is better in every run. In the normal class on a crowded host it is not: its median was
-worse, the tails overlap, and four earlier runs of 20 s in a fixed order leaned to the thread; why was not looked into.
-SCHED_FIFO is what is asked for by default. One run of 20 s each on the same host while its load rose from 0.7 to 4, ten
-`get` a second: 10 ms cycle 74 us / 1.1 ms, with SCHED_FIFO 49 us / 96 us; 1 ms cycle 39 us / 6.4 ms and 24 % of periods
-missed, with SCHED_FIFO 39 us / 188 us and 0.5 % missed.
+So under SCHED_FIFO one thread is better in every run. In the normal class on a busy host it is not: its median was
+worse, the tails overlap, and four earlier runs of 20 s in a fixed order favoured the second thread; the cause was not
+investigated. SCHED_FIFO is requested by default. One run of 20 s each, on the same host while its load rose from 0.7 to
+4, with ten `get` per second: 10 ms cycle 74 us / 1.1 ms, with SCHED_FIFO 49 us / 96 us; 1 ms cycle 39 us / 6.4 ms and
+24 % of periods missed, with SCHED_FIFO 39 us / 188 us and 0.5 % missed.
 
-The only module of the PLC that imports ``time``.
+This is the only module of the PLC that imports ``time``.
 """
 
 from __future__ import annotations
@@ -43,10 +42,10 @@ from fieldtwin.plc.task import Driven
 GUARD_NS = 2 * NS_PER_MS
 POLL_NS = 10 * NS_PER_MS
 LEAD_NS, LEAD_SHARE = 60_000, 20
-"""How long before a deadline the process is woken, to be awake by then: a processor that idles needs some 50 us to come back.
-It spins meanwhile, at most a twentieth of what it slept."""
+"""How long before a deadline the process is woken, so that it is awake in time: an idle processor needs some 50 us to
+wake up. The process spins meanwhile, for at most a twentieth of the time that it slept."""
 STEP_NS = 200 * NS_PER_MS
-"""Longest time without looking at whether to stop."""
+"""The longest time without checking whether to stop."""
 
 _CLOCK_MONOTONIC = 1
 _TIMER_ABSTIME = 1
@@ -62,17 +61,17 @@ _libc: Any = ctypes.CDLL(None, use_errno=True) if sys.platform == "linux" else N
 
 
 def monotonic_ns() -> int:
-    """The host's monotonic time, the same for every process."""
+    """Return the host's monotonic time, which is the same for every process."""
     return time.monotonic_ns()
 
 
 def utc_ns() -> int:
-    """The host's UTC in ns since 1970, for records and displays; nothing is timed by it."""
+    """Return the host's UTC in ns since 1970, for records and displays; it is not used for timing."""
     return time.time_ns()
 
 
 def sleep_until_ns(deadline_ns: int) -> None:
-    """Return at `deadline_ns` of `monotonic_ns` or after it; earlier only when a signal came in."""
+    """Return at `deadline_ns` of `monotonic_ns` or after it; earlier only when a signal arrived."""
     if _libc is None:
         time.sleep(max(0, deadline_ns - time.monotonic_ns()) / NS_PER_S)
         return
@@ -82,20 +81,21 @@ def sleep_until_ns(deadline_ns: int) -> None:
 
 @dataclass(frozen=True, slots=True)
 class RealtimeReport:
-    """What the host granted, and what it did not, with the reason."""
+    """What the host granted, and what it refused, with the reason."""
 
     granted: tuple[str, ...]
     refused: tuple[tuple[str, str], ...]
 
     def describe(self) -> dict[str, Any]:
-        """JSON-able."""
+        """Return the report as data for JSON."""
         return {"granted": list(self.granted), "refused": dict(self.refused)}
 
 
 def prepare(priority: int = 10) -> RealtimeReport:
-    """Ask for timer slack 1 ns, locked memory, a frozen heap and, last, SCHED_FIFO at `priority` (0: not asked for).
+    """Request timer slack 1 ns, locked memory, a frozen heap and, last, SCHED_FIFO at `priority` (0: not requested).
 
-    Last, because threads inherit the class. Never raises: a laptop or a container grants less, and the report says so.
+    SCHED_FIFO comes last, because threads inherit the class. Never raises: a laptop or a container grants less, and the
+    report shows it.
     """
     granted, refused = [], []
     for what, ask in (
@@ -119,8 +119,9 @@ def _timer_slack() -> None:
 
 def _lock_memory() -> None:
     _need_linux()
-    # With a limit on locked memory, locking what is still to come would make a later allocation fail: lock what is there.
-    import resource  # not on Windows
+    # With a limit on locked memory, locking future memory would make a later allocation fail, so lock only the present
+    # memory.
+    import resource  # not available on Windows
 
     soft, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
     future = _MCL_FUTURE if soft == resource.RLIM_INFINITY else 0
@@ -151,10 +152,11 @@ def _check(result: int) -> None:
 
 
 class StuckAlarm:
-    """Ends a scan that does not end: a signal, `stuck_ms` after it was armed, raises `ScanStuck` in the logic, again and again.
+    """Ends a scan that does not end: `stuck_ms` after it was armed, a signal raises `ScanStuck` in the logic,
+    repeatedly.
 
-    The main thread's, since that is where signals arrive. Logic that never comes back to the interpreter (a C function that
-    waits for ever) cannot be ended like this: then the gateway misses the heartbeat and makes the outputs safe.
+    It works in the main thread, because signals arrive there. Logic that never returns to the interpreter (a C function
+    that never ends) cannot be ended this way: then the gateway misses the heartbeat and makes the outputs safe.
     """
 
     def __init__(self, stuck_ms: float) -> None:
@@ -180,14 +182,15 @@ class StuckAlarm:
 
 
 def lead(until_due_ns: int) -> int:
-    """How long before a deadline to be awake, in ns, when it is `until_due_ns` away; 0 when it has passed."""
+    """Return how many ns before a deadline to be awake, when it is `until_due_ns` away; 0 when it has passed."""
     return max(0, min(LEAD_NS, until_due_ns // LEAD_SHARE))
 
 
 def run_task(task: Driven, loop: asyncio.AbstractEventLoop, stop_requested: Callable[[], bool]) -> None:
     """Drive `task` on the wall clock, and `loop` in its slack, until `stop_requested()`; outputs are safe afterwards.
 
-    A task that stops by itself leaves the loop running, so that it can be asked why. To end a wait early stop the loop.
+    When a task stops by itself, the loop keeps running, so that its status can be read. To end a wait early, stop the
+    loop.
     """
     task.start()
     polled_ns = 0
@@ -214,7 +217,7 @@ def run_task(task: Driven, loop: asyncio.AbstractEventLoop, stop_requested: Call
 
 
 def _run_loop(loop: asyncio.AbstractEventLoop, for_ns: int) -> None:
-    """Run callbacks for `for_ns`; with 0, what is ready now."""
+    """Run callbacks for `for_ns`; with 0, only those that are ready now."""
     timer = loop.call_later(for_ns / NS_PER_S, loop.stop) if for_ns else loop.call_soon(loop.stop)
     try:
         loop.run_forever()

@@ -1,11 +1,11 @@
 """The paper's ControlLogic (SPEC part 1), and `Relay`, the PLC program that runs it in a scan.
 
-`ControlLogic` is the row to the letter: consumers `sensor` and `transmitter`, producers `response` and `command`, a
-period, a data log and the observatory's state machine. Its payloads are never looked into, but for the period of a
-command. `Relay` connects it to tags: what the mailboxes bring goes to the consumers, what the producers emit goes to
-outputs, and waits in a bounded queue while the transmitter is behind.
+`ControlLogic` implements the row literally: consumers `sensor` and `transmitter`, producers `response` and `command`, a
+period, a data log and the observatory's state machine. It does not interpret payloads, except for the period in a
+command. `Relay` connects it to tags: messages from the mailboxes go to the consumers, and what the producers emit goes
+to outputs. While the transmitter cannot keep up, it waits in a queue of limited length.
 
-Neither may know a protocol, a register or the time of day; `now_ns` is the scan's.
+Neither class may know a protocol, a register or the time of day; `now_ns` is the scan's.
 """
 
 from __future__ import annotations
@@ -31,21 +31,24 @@ LOG_BYTES = 1024
 
 @dataclass(frozen=True, slots=True)
 class LogEntry:
-    """One entry of the data log: ``command``, ``response`` or ``bad command``, its payload, and when (monotonic ns)."""
+    """One entry of the data log: ``command``, ``response`` or ``bad command``, its payload, and its time (monotonic
+    ns)."""
 
     t_ns: int
     kind: str
     data: bytes
 
     def encode(self) -> bytes:
-        """As it leaves in the `log` messages: UTF-8 JSON ``{"t_ns": int, "kind": str, "data": hex}``."""
+        """Return the entry as it is sent in the `log` messages: UTF-8 JSON ``{"t_ns": int, "kind": str, "data":
+        hex}``."""
         return json.dumps({"t_ns": self.t_ns, "kind": self.kind, "data": self.data.hex()}).encode()
 
 
 class DataLog:
-    """Bounded, ordered, time-stamped; duplicates are kept, a full log drops its oldest entry (SPEC ruling 2).
+    """The data log: limited in size, ordered, time-stamped. Duplicates are kept; a full log drops its oldest entry
+    (SPEC ruling 2).
 
-    `total` counts all entries there ever were.
+    `total` counts all entries ever added.
     """
 
     def __init__(self, capacity: int = LOG_CAPACITY) -> None:
@@ -70,7 +73,7 @@ class DataLog:
 class ControlLogic:
     """SPEC row ControlLogic. Init: period 0, log empty, state STANDBY.
 
-    `commands`, `responses` count what was relayed, `bad_commands` what came as a command and was none.
+    `commands` and `responses` count what was relayed, `bad_commands` the received commands that were invalid.
     """
 
     def __init__(self) -> None:
@@ -88,11 +91,11 @@ class ControlLogic:
         return self.machine.period_s
 
     def set_period(self, command: COMMAND) -> None:
-        """SetPeriod: the period and the state that follows from it. Raises `Desync` for a command that is none."""
+        """SetPeriod: set the period and the state that follows from it. Raises `Desync` for an invalid command."""
         self.machine.process_event(command)
 
     def log_data(self, kind: str, data: DATA, now_ns: int) -> None:
-        """LogData. Its precondition is period > 0: asking otherwise is a bug of the caller."""
+        """LogData. Its precondition is period > 0: a call without that is a bug of the caller."""
         if self.period_s <= 0:
             raise Bug("data logged while nothing is sampled", expected="period > 0", got=str(self.period_s))
         self.data_log.append(LogEntry(now_ns, kind, data.data))
@@ -100,8 +103,8 @@ class ControlLogic:
     def send_cmd(self, now_ns: int) -> None:
         """sendCmd: drain the transmitter's queue; each command is consumed, sets the period, and is emitted.
 
-        It is always relayed; logging is what period > 0 guards, with the period after SetPeriod (SPEC ruling 1). What
-        is no command changes nothing and is not relayed: it is counted, and logged under the same guard.
+        A command is always relayed; only logging requires period > 0, with the period after SetPeriod (SPEC ruling 1).
+        An invalid command changes nothing and is not relayed: it is counted, and logged under the same condition.
         """
         for command in self.transmitter.drain():
             try:
@@ -130,19 +133,19 @@ class Relay(Program):
     """The observatory's control logic as a program.
 
     `period_s` is the commanded period, also when it is 0 or negative; 0 before the first command (STANDBY). `response`
-    carries the sensor's payloads unaltered, `log` the data log's entries (`LogEntry.encode`). A full mailbox means
-    wait: responses queue, bounded, the oldest dropped and counted.
+    carries the sensor's payloads unaltered, `log` the data log's entries (`LogEntry.encode`). While a mailbox is full,
+    responses wait in a queue of limited length; the oldest is dropped and counted.
     """
 
     queue_capacity: ClassVar[int] = QUEUE_CAPACITY
-    """Responses that wait for the transmitter."""
+    """How many responses may wait for the transmitter."""
     table = StateTable(
         Transition(ANY, "ACTIVE", when="command > 0"),
         Transition(ANY, "STANDBY", when="command = 0"),
         Transition(ANY, "OFF", when="command < 0"),
         states=tuple(STATE_CODES),
     )
-    """The machine as it is drawn; fieldtwin.gateway.core.statemachine is what runs it."""
+    """The state machine for drawing; fieldtwin.gateway.core.statemachine runs it."""
     command: tuple[Message, ...] = message_input()
     sample: tuple[Message, ...] = message_input()
     period_s: int = var_output(TagKind.INT, initial=0, unit="s")
@@ -168,7 +171,7 @@ class Relay(Program):
         self._too_long = 0
 
     def resume(self, known: Mapping[str, Scalar]) -> None:
-        """The state follows from the period that was commanded last."""
+        """Set the state from the period that was commanded last."""
         period = known.get("period")
         if isinstance(period, int):
             self.logic.machine.process_event(encode_period(period))
@@ -193,7 +196,7 @@ class Relay(Program):
         queue = self._outgoing.queue
         while queue:
             if len(queue[0].data) > self.response.max_bytes:
-                self._too_long += 1  # the transmitter could never take it
+                self._too_long += 1  # the transmitter could never send it
             elif not self.response.send(queue[0].data, now_ns):
                 return
             self._outgoing.consume()
@@ -203,7 +206,7 @@ class Relay(Program):
         if log.total == self._log_sent:
             return
         first = log.total - len(log)
-        if self._log_sent < first:  # overwritten before anybody took them
+        if self._log_sent < first:  # entries were overwritten before they were sent
             self._log_lost += first - self._log_sent
             self._log_sent = first
         while self._log_sent < log.total and self.log.room:

@@ -1,8 +1,8 @@
-"""What is proved of the observatory's relay: SPEC part 1, row ControlLogic, with rulings 1, 2, 5 and 6.
+"""The proof of the observatory's relay: SPEC part 1, row ControlLogic, with rulings 1, 2, 5 and 6.
 
-Over every command that matters (its sign is what decides, so -1, 0, 1 and the limits of the type; and what is no command),
-responses that come or not, and mailboxes that are emptied or not. The queue and the data log are bounded at three, so that
-all their fillings are seen.
+It covers every command that matters (its sign decides, so -1, 0, 1 and the limits of the type; and invalid commands),
+responses that arrive or not, and mailboxes that are emptied or not. The queue and the data log are limited to three
+entries, so that all their fill levels are reached.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _SHORT, _TOO_LONG = b"a", b"b" * 300
 
 
 class Watched(Relay):
-    """The relay, with what the invariants need to know of its past."""
+    """The relay, with the history that the invariants need."""
 
     queue_capacity = 3
 
@@ -38,12 +38,13 @@ class Watched(Relay):
 
     @property
     def unaccounted(self) -> int:
-        """Responses that were taken and neither left, nor wait, nor were counted as dropped."""
+        """How many responses were taken and neither sent, nor waiting, nor counted as dropped."""
         return self.responses - self.sent - self.waiting - self._outgoing.dropped - self._too_long
 
     @property
     def key(self) -> Hashable:
-        """Counters grow for ever and decide nothing; the sign, the queues' fillings and the mailboxes' do."""
+        """The part of the state that matters: the sign, and the fill levels of queues and mailboxes. Counters grow
+        without limit and do not affect the behaviour."""
         sign = (self.period_s > 0) - (self.period_s < 0)
         waiting = tuple(response.data for response in self._outgoing.queue)
         unsent = self.logic.data_log.total - self._log_sent

@@ -1,12 +1,13 @@
-"""Everything that a PLC runs: its programs in their tasks, one after the other by priority, restarted where that helps.
+"""All that a PLC runs: its programs in their tasks, one after the other by priority, restarted where that helps.
 
 Tasks are cyclic (INTERVAL) or run once at each rising edge of a tag (SINGLE), as in IEC 61131-3, 6.8.2. They share one
-thread: a task is never interrupted; of those that are due the one with the smallest PRIORITY number goes first, and of equals
-the one that has waited longest. If one stops by itself all stop, with the outputs safe. After a stop by the watchdog or a
-scan that did not end, the programs are made anew and begin warm, at most `max_restarts` times in a row. A program runs only after
-its inputs have been good once (fieldtwin.plc.start), also after a restart.
+thread, so a task is never interrupted. Of the tasks that are due, the one with the smallest PRIORITY number runs first;
+among equals, the one that has waited longest. If one task stops by itself, all tasks stop, with the outputs safe. After
+a stop by the watchdog, or a scan that did not end, the programs are created anew and start warm, at most `max_restarts`
+times in a row. A program runs only after its inputs have been good once (fieldtwin.plc.start), also after a restart.
 
-Driven like a `CyclicTask`: by `deadline_ns` and `run_once`, on the wall clock or in virtual time, and never knows which.
+The runner is driven like a `CyclicTask`: by `deadline_ns` and `run_once`, on the wall clock or in virtual time, and
+does not know which.
 """
 
 from __future__ import annotations
@@ -33,16 +34,16 @@ from fieldtwin.plc.task import CyclicTask, Guard, StopReason, TaskConfig, TaskSt
 
 RESTARTABLE = (StopReason.WATCHDOG, StopReason.STUCK)
 STEADY_NS = 60 * NS_PER_S
-"""Running this long makes earlier restarts forgotten."""
+"""After this running time, earlier restarts no longer count."""
 _NEVER_NS = 2**62
-_STOPPED = TaskState.STOPPED  # an Enum's members are slow to look up
+_STOPPED = TaskState.STOPPED  # a local name, because looking up an Enum's members is slow
 _EVENT_MS = 1e9
-_ROUNDING = 1e-9  # intervals such as 0.3 ms are no whole multiples of each other in binary
+_ROUNDING = 1e-9  # intervals such as 0.3 ms are not exact multiples of each other in binary
 
 
 @dataclass
 class Entry:
-    """A task, its scan, and for a SINGLE one what its trigger was when that was looked at last."""
+    """A task, its scan, and for a SINGLE task the state of its trigger at the last check."""
 
     spec: TaskSpec
     scan: Scan
@@ -55,8 +56,8 @@ class Entry:
 
 
 class Runner:
-    """All tasks over an attached image. Raises `FileInvalid` for a configuration that cannot run, `Unreachable` where what
-    is retained cannot be kept."""
+    """All tasks over an attached image. Raises `FileInvalid` for a configuration that cannot run, and `Unreachable` if
+    retained variables cannot be kept."""
 
     def __init__(
         self,
@@ -66,7 +67,7 @@ class Runner:
         guard: Guard | None = None,
         on_change: Callable[[Change], None] | None = None,
     ) -> None:
-        """`on_change` is told whenever a program changes an output or a local."""
+        """`on_change` is called whenever a program changes an output or a local."""
         self.config = config
         self.forces = Forces()
         self.restarts = 0
@@ -74,10 +75,10 @@ class Runner:
         self._last_stop = ""
         self.entries: list[Entry] = []
         self._triggered: list[Entry] = []
-        """Those of them that are SINGLE."""
+        """The entries of SINGLE tasks."""
         self.programs: list[BoundProgram] = []
         self.sources: list[Source] = []
-        """The files that the programs were made from."""
+        """The files from which the programs were made."""
         self.outputs: OutputImage
         self.retained: Retained
         self.starts: Starts
@@ -99,8 +100,9 @@ class Runner:
     # -- assembly -----------------------------------------------------------------------------------------------------
 
     def _made(self) -> list[BoundProgram]:
-        """The programs, new. Raises `FileInvalid` also where they no longer fit the process image."""
-        together: dict[Any, Any] = {}  # new with the programs: global variables begin with their initial values, too
+        """Create the programs anew. Also raises `FileInvalid` if they no longer fit the process image."""
+        # created with the programs, so that global variables also begin with their initial values
+        together: dict[Any, Any] = {}
         programs = [p.bind(self.config.python_path, together) for p in self.config.programs]
         for new, old in zip(programs, self.programs, strict=False):
             if _interface(new) != _interface(old):
@@ -180,7 +182,7 @@ class Runner:
 
     @property
     def running(self) -> bool:
-        """Whether there is anything to wait for: a scan, or a restart."""
+        """Whether there is a scan or a restart to wait for."""
         return self._ended is None and self._began
 
     @property
@@ -192,7 +194,7 @@ class Runner:
         return min(entry.task.deadline_ns for entry in self.entries)
 
     def run_once(self) -> None:
-        """What is due first: one scan, or a restart."""
+        """Carry out what is due first: one scan, or a restart."""
         if self._ended is not None or not self._began:
             raise Bug("a scan of a PLC that does not run")
         now_ns = self._now_ns()
@@ -229,7 +231,8 @@ class Runner:
             self._on_stopped(entry)
 
     def _look_for_delay(self, entry: Entry) -> None:
-        """Note which task still ran when `entry` became due: a late scan is not always the fault of the task that is late."""
+        """Note which task was still running when `entry` became due: a late scan is not always the fault of the late
+        task."""
         before = self._ran
         if before is not None and before is not entry:
             held_up = before.task.ended_ns > entry.task.deadline_ns
@@ -241,7 +244,8 @@ class Runner:
             entry.task.held_up_by = ""
 
     def _next(self, now_ns: int) -> Entry:
-        """Of the tasks that are due the one of the highest priority; where none is, the one that will be first."""
+        """Return the task of the highest priority of those that are due; if none is due, the task that will be due
+        first."""
         due = [e for e in self.entries if e.task.deadline_ns <= now_ns]
         if not due:
             return min(self.entries, key=lambda e: e.task.deadline_ns)
@@ -251,7 +255,7 @@ class Runner:
         for entry in self._triggered:
             value = scan.value(entry.single)
             if value is None:
-                continue  # not known now: that it was false before it is true again would be a guess
+                continue  # the value is unknown, and a rising edge must not be guessed
             now = bool(value)
             if now and not entry.before:
                 entry.task.deadline_ns = self._now_ns()
@@ -271,14 +275,15 @@ class Runner:
     def _restart_by_itself(self, stopped: Entry) -> None:
         try:
             self.restart()
-        except FieldtwinError as e:  # no way to go on: it stays stopped, and says why
+        except FieldtwinError as e:  # the programs cannot be created, so the PLC stays stopped and reports why
             stopped.task.error = e
             self._ended, self._restart_ns = StopReason.FAILED, _NEVER_NS
 
     def restart(self, *, cold: bool = False) -> None:
-        """Make the programs anew, with what is retained unless `cold`, and start, paused if they were. Forces stay.
+        """Create the programs anew, with retained variables unless `cold`, and start; a paused PLC stays paused. Forces
+        stay.
 
-        Raises `FileInvalid`, and nothing has changed, where the programs cannot be made (their files may have been edited).
+        Raises `FileInvalid`, without any change, if the programs cannot be created (their files may have been edited).
         """
         programs, paused = self._made(), self.paused
         for entry in self.entries:
@@ -297,7 +302,7 @@ class Runner:
         self._start_all()
 
     def stop(self) -> None:
-        """On request: all tasks stopped, outputs safe. What had stopped already stays as it is."""
+        """Stop all tasks on request, with the outputs safe. A PLC that has already stopped keeps its stop reason."""
         for entry in self.entries:
             entry.task.stop()
         if self._ended is None:
@@ -310,7 +315,7 @@ class Runner:
 
     @property
     def error(self) -> FieldtwinError | None:
-        """Why it stopped by itself."""
+        """Why the PLC stopped by itself."""
         return self._stopped.task.error if self._stopped else None
 
     @property
@@ -322,30 +327,31 @@ class Runner:
         return any(e.task.paused for e in self.entries)
 
     def pause(self, on: bool) -> None:
-        """Stop executing, or go on; outputs stay as they are, and are still being published."""
+        """Stop executing, or continue; outputs keep their values and are still published."""
         self._stepped = 0
         for entry in self.entries:
             entry.task.paused, entry.task.steps = on, 0
 
     def limit(self, limits: Mapping[str, tuple[float, float] | None]) -> None:
-        """From now on these tags have other smallest and largest values than the image's layout says; None: none. Tags that
-        the image does not hold are passed over."""
+        """Set new limits for these tags in place of those in the image's layout; None: no limits. Tags that the image
+        does not hold are ignored."""
         self._limits |= limits
 
     def as_limited(self, spec: TagSpec) -> TagSpec:
-        """`spec` with the limits that its tag has by now."""
+        """Return `spec` with the present limits of its tag."""
         return replace(spec, limits=self._limits[spec.name]) if spec.name in self._limits else spec
 
     def check_step(self) -> None:
-        """Raises `UsageError` while it is not paused."""
+        """Raise `UsageError` unless the PLC is paused."""
         if not self.paused:
             raise UsageError("a PLC is stepped while it is paused", hint="pause it first")
 
     def step(self, count: int) -> dict[str, int]:
-        """While paused, execute `count` scans of the fastest cyclic task, and of each other one as many as fall due in that
-        time: of a task of 100 ms beside one of 10 ms every tenth. A task with a trigger runs when a step triggers it.
+        """While paused, execute `count` scans of the fastest cyclic task, and of each other cyclic task as many as fall
+        due in that time: if a task of 10 ms is stepped, a task of 100 ms runs in every tenth step. A SINGLE task runs
+        when a step triggers it.
 
-        The scans of each cyclic task, by its name. Raises `UsageError` while it is not paused.
+        Return the scans of each cyclic task, by its name. Raises `UsageError` unless the PLC is paused.
         """
         self.check_step()
         cyclic = [e for e in self.entries if not e.single]
@@ -360,18 +366,19 @@ class Runner:
 
     @property
     def stepping(self) -> int:
-        """Scans that are still to be executed while paused."""
+        """How many scans are still to be executed while paused."""
         return sum(e.task.steps for e in self.entries) if self._stopped is None and self._ended is None else 0
 
     def force(
         self, tag: str, value: Scalar, by: str = "", record: Callable[[Scalar | None, Scalar], None] | None = None
     ) -> None:
-        """Raises `UsageError` for an unknown tag, a value that it cannot hold, or one outside an output's limits.
+        """Force a tag. Raises `UsageError` for an unknown tag, a value that it cannot hold, or one outside an output's
+        limits.
 
-        Inputs may be forced beyond theirs: logic is to be seen with what a broken sensor says. `record` is told the old and
-        the new value before anything changes.
+        Inputs may be forced beyond their limits, so that the logic can be tested with the values of a broken sensor.
+        `record` is called with the old and the new value before anything changes.
         """
-        # A tag of both regions is an output that is read back: the command is what is forced.
+        # A tag of both regions is an output that is read back: the force applies to the command.
         for region in sorted(self._image.layout.regions, key=lambda r: r.name == INPUTS):
             for spec in region.tags:
                 if spec.name == tag:
@@ -389,25 +396,27 @@ class Runner:
         return self.input(tag).value if inputs else self.outputs.last()[tag]
 
     def _variables_of(self, tag: str, inputs: bool) -> list[tuple[Program, str]]:
-        """Which variables of programs a tag stands for."""
+        """Return the variables of programs that belong to a tag."""
         if inputs:
             return [(b.program, v) for b in self.programs for v, binding in b.inputs.items() if binding.tag == tag]
         return [(b.program, v.name) for b in self.programs for v, published in b.published() if published == tag]
 
     def waits(self, tag: str) -> str:
-        """What the program that writes output or local `tag` waits for before it starts; empty where it has started."""
+        """Return what the program that writes output or local `tag` waits for before it starts; empty if it has
+        started."""
         owner = next((b.name for b in self.programs if tag in (t for _, t in b.published())), "")
         return next((start.reason() for start in self.starts.waiting if start.name == owner), "")
 
     def why(self, tag: str) -> list[dict[str, Any]]:
-        """The last changes of an output or local, the newest first. Raises `UsageError` for what no program writes."""
+        """Return the last changes of an output or local, the newest first. Raises `UsageError` for a tag that no
+        program writes."""
         if tag not in self.outputs.last():
             raise UsageError(f"no program writes {tag!r}", expected="an output or local of a program")
         now_ns = self._now_ns()
         return [change.describe(now_ns) for change in reversed(self.outputs.changes.get(tag, ()))]
 
     def origin(self, tag: str, value: Scalar | None) -> tuple[str, str]:
-        """`OutputImage.origin`; a path below the system's folder is relative to it."""
+        """Return `OutputImage.origin`; a path inside the system's folder is relative to it."""
         program, place = self.outputs.origin(tag, value)
         for folder in self.config.python_path:
             place = place.removeprefix(folder.rstrip("/") + "/")
@@ -419,7 +428,7 @@ class Runner:
         return self._stopped is not None or self._ended is not None
 
     def _as_read(self, value: TagValue) -> TagValue:
-        """An input as the PLC knows it now: one that nothing reads any more is not good, whatever it was."""
+        """Return an input as the PLC knows it now: while no task reads inputs, their quality is bad."""
         if not self.halted:
             return value
         return TagValue(value.value, Quality.BAD, Reason.NOT_OPERATIONAL, value.t_ns)
@@ -428,13 +437,13 @@ class Runner:
         return {tag: self._as_read(value) for tag, value in self.entries[0].scan.inputs().items()}
 
     def seen_otherwise(self, tag: str) -> dict[str, TagValue]:
-        """Of all tasks: `Scan.seen_otherwise`."""
-        if self.halted:  # no program sees anything
+        """Return `Scan.seen_otherwise` of all tasks."""
+        if self.halted:  # no program reads inputs
             return {}
         return {name: seen for entry in self.entries for name, seen in entry.scan.seen_otherwise(tag).items()}
 
     def input(self, tag: str) -> TagValue:
-        """`Scan.input` of the first task."""
+        """Return `Scan.input` of the first task."""
         return self._as_read(self.entries[0].scan.input(tag))
 
     @property
@@ -449,7 +458,8 @@ class Runner:
         return total
 
     def describe(self) -> dict[str, Any]:
-        """JSON-able: the first task's figures as those of the whole, and each task's own."""
+        """Return the state as data for JSON: the first task's figures for the whole PLC, and each task's own
+        figures."""
         now_ns = self._now_ns()
         shown = self._stopped or self.entries[0]
         described = shown.task.describe()
@@ -484,5 +494,5 @@ def _inside(spec: TagSpec, value: Scalar) -> None:
 
 
 def _interface(bound: BoundProgram) -> list[tuple[str, str, str, int, int]]:
-    """What the process image depends on."""
+    """Return the properties of a program on which the process image depends."""
     return [(v.name, v.role.value, v.kind.value, v.max_bytes, v.depth) for v in bound.program.variables.values()]

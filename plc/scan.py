@@ -1,15 +1,15 @@
 """The scan of one task: read the input image once, execute the task's programs, publish the output image once.
 
-One consistent snapshot and one frozen time a scan. Pure: `Scan.execute(now_ns)` is told the time, touches the image
-and the programs, and nothing else. It must never know a clock, a cycle, a process or a protocol.
+Each scan uses one consistent snapshot and one frozen time. Pure: `Scan.execute(now_ns)` is given the time, and uses
+only the image and the programs. It must not know a clock, a cycle, a process or a protocol.
 
-When the gateway's heartbeat in the image is older than its limit, or its region says stopped, every input is BAD /
-GATEWAY_DEAD, whatever quality the image shows. Then, and for every input that is BAD by itself, the input's policy
-says what the program sees (`InputBinding.if_bad`). A forced input is SIMULATED, whatever the image shows. Messages are
-events, not states: they are handed over whole, in order, exactly once, whatever the quality of their tag.
+When the gateway's heartbeat in the image is older than its limit, or its region is flagged stopped, every input is BAD
+/ GATEWAY_DEAD, whatever quality the image shows. Then, and for every input that is BAD by itself, the input's policy
+decides what the program sees (`InputBinding.if_bad`). A forced input is SIMULATED, whatever the image shows. Messages
+are events, not states: they are passed on unchanged, in order, exactly once, whatever the quality of their tag.
 
-A program that has not started (fieldtwin.plc.start) is not executed, and nothing of it is published. Messages wait as long as a
-program that takes messages has not started.
+A program that has not started (fieldtwin.plc.start) is not executed, and nothing of it is published. Messages wait
+while a program that takes messages has not started.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ from fieldtwin.plc.start import ProgramStart
 
 _BAD = int(Quality.BAD)
 MAX_SHOWN, MAX_SHOWN_BYTES = 4, 24
-"""Of the messages that a scan took, what is remembered with a change that it made."""
+"""How many messages of a scan, and how many bytes of each, are remembered with a change that the scan made."""
 
 
 class _Input:
-    """One bound input: where it is in the image, where the program sees it, and what it sees while that is BAD."""
+    """One bound input: its place in the image and in the program, and what the program sees while it is BAD."""
 
     def __init__(
         self, owner: str, program: Program, variable: Variable, spec: TagSpec, index: int, binding: InputBinding
@@ -58,19 +58,19 @@ class _Input:
         self.hold = binding.if_bad == "hold"
         self.trip = binding.if_bad == "trip"
         self.known: Scalar | None = None
-        """The last value that was not BAD. An input trips only after it had one."""
+        """The last value that was not BAD. An input can trip only after it had one."""
         self.substitute = substitute(spec, binding.if_bad)
         self.held: tuple[Scalar | None, int] | None = None
 
     def apply(self, seen: TagValue) -> TagValue:
-        """What the program sees in place of `seen`."""
+        """Return what the program sees in place of `seen`."""
         if seen.quality is not Quality.BAD:
             return seen
         if self.substitute is not None:
             return TagValue(self.substitute, Quality.SUBSTITUTED, seen.reason, seen.t_ns)
         if self.hold and self.held is not None:
             return TagValue(self.held[0], Quality.UNCERTAIN, seen.reason, self.held[1])
-        if seen.value is None and self.known is not None:  # a gateway that was restarted has not read it yet
+        if seen.value is None and self.known is not None:  # a restarted gateway has not read it yet
             return TagValue(self.known, seen.quality, seen.reason, seen.t_ns)
         return seen
 
@@ -78,11 +78,11 @@ class _Input:
 class Scan:
     """The programs of one task over an attached image.
 
-    `outputs` is the output image of all tasks; without one, the scan has its own. With `outputs_first` a scan begins by
-    publishing what the scan before computed: outputs then change at the cycle's start, whatever the logic's length.
-    `starts` says by name which programs may run; without it all may.
-    After a restart of the process messages go on behind the last one that OUTPUTS says was consumed. Raises `FileInvalid`
-    when a binding's tag is not in the image.
+    `outputs` is the output image of all tasks; without it, the scan has its own. With `outputs_first`, a scan begins by
+    publishing what the previous scan computed, so that outputs change at the start of the cycle, however long the logic
+    runs. `starts` tells by name which programs may run; without it all may. After a restart of the process, messages
+    continue after the last one that OUTPUTS reports as consumed. Raises `FileInvalid` when a binding's tag is not in
+    the image.
     """
 
     def __init__(
@@ -96,11 +96,11 @@ class Scan:
         starts: Mapping[str, ProgramStart] | None = None,
     ) -> None:
         self.number = 0
-        """Scans executed, the one that runs included."""
+        """How many scans were executed, including the one that runs."""
         self._not_run: list[tuple[BoundProgram, ProgramStart]] = []
-        """Programs that have not executed a scan yet, where they have to wait for that."""
+        """The programs that have not executed a scan yet, with their start conditions."""
         self._waiting: frozenset[str] = frozenset()
-        """The names of those that had not started when this was last looked at."""
+        """The names of the programs that had not started at the last check."""
         self.gateway_alive = False
         self.output_image = outputs or OutputImage(image, programs)
         self._outputs_first = outputs_first
@@ -108,7 +108,7 @@ class Scan:
         self._programs = tuple(programs)
         self._reader = image.reader(INPUTS)
         self._onlooker = image.reader(INPUTS)
-        """Reads INPUTS while messages have to stay where they are."""
+        """Reads INPUTS while messages must not be consumed."""
         if starts is not None:
             self._not_run = [(bound, starts[bound.name]) for bound in programs]
         self._plain: list[_Input] = []
@@ -157,7 +157,8 @@ class Scan:
     # -- the cycle ----------------------------------------------------------------------------------------------
 
     def execute(self, now_ns: int) -> None:
-        """One scan at `now_ns` (monotonic, the same clock as the gateway's). Raises `ProgramFailed`, publishing nothing."""
+        """Execute one scan at `now_ns` (monotonic, the same clock as the gateway's). Raises `ProgramFailed`, publishing
+        nothing."""
         self.number += 1
         if self._outputs_first:
             self.output_image.publish(now_ns)
@@ -174,7 +175,7 @@ class Scan:
             self.output_image.publish(now_ns)
 
     def _execute_started(self, now_ns: int) -> None:
-        """A scan of the programs that have started, while others have not, or for the first time."""
+        """Execute a scan of the programs that have started, while others have not, or for the first time."""
         waiting = self._read_for_started(now_ns)
         self.output_image.force()
         first = {bound.name: start for bound, start in self._not_run if start.started}
@@ -188,8 +189,8 @@ class Scan:
         self._not_run = [(bound, start) for bound, start in self._not_run if not start.ran]
 
     def _read_for_started(self, now_ns: int) -> frozenset[str]:
-        """Read the inputs while programs wait, and return their names. Messages stay where they are as long as one that takes
-        messages waits."""
+        """Read the inputs while programs wait, and return the names of those programs. Messages are not consumed while
+        a program that takes messages waits."""
         waiting = self._waiting = frozenset(bound.name for bound, start in self._not_run if not start.started)
         held_back = any(item.owner in waiting for item in self._messages)
         self._read(now_ns, self._onlooker if held_back else self._reader)
@@ -204,8 +205,11 @@ class Scan:
         return len(self._not_run) == len(self._programs) > 0 and not any(start.started for _, start in self._not_run)
 
     def hold(self, now_ns: int) -> None:
-        """Instead of a scan, while the task is paused or all of its programs wait for their start: inputs are looked at, messages
-        stay where they are, outputs stay and are still being published. A force counts although the program waits."""
+        """Publish without a scan, while the task is paused or all of its programs wait for their start.
+
+        Inputs are read without consuming messages; outputs keep their values and are still published. A force also
+        applies while the program waits.
+        """
         if self.waiting:
             self._read_for_started(now_ns)
             self.output_image.publish_forces()
@@ -215,7 +219,7 @@ class Scan:
         self.output_image.publish(now_ns)
 
     def stop(self, now_ns: int) -> None:
-        """Publish that nothing in OUTPUTS may be acted upon any more: flagged stopped, every tag BAD, values as last."""
+        """Publish that OUTPUTS must no longer be used: flagged stopped, every tag BAD, values unchanged."""
         self.output_image.stop(now_ns)
 
     def release(self) -> None:
@@ -281,7 +285,7 @@ class Scan:
         return self._seen_at(item.index)
 
     def value(self, tag: str) -> Scalar | None:
-        """A tag of either region, as this scan last knew it; None while an input is bad."""
+        """Return a tag of either region, as this scan last knew it; None while an input is bad."""
         index = self._reader.shape.index.get(tag)
         if index is not None:
             force = self.output_image.forces.inputs.get(tag)
@@ -290,11 +294,13 @@ class Scan:
         return self.output_image.last().get(tag)
 
     def inputs(self) -> dict[str, TagValue]:
-        """Every tag of INPUTS as the last scan found it, before substitution and forces: all BAD while the gateway is dead."""
+        """Return every tag of INPUTS as the last scan read it, before substitution and forces: all BAD while the
+        gateway is dead."""
         return {name: self._seen_at(i) for name, i in self._reader.shape.index.items()}
 
     def seen_otherwise(self, tag: str) -> dict[str, TagValue]:
-        """The variables (``program.variable``) that see something else than what input `tag` is, since it is bad: by policy."""
+        """Return the variables (``program.variable``) whose value differs from that of input `tag`, because it is bad
+        and their policy replaces it."""
         found: dict[str, TagValue] = {}
         for item in self._by_tag.get(tag, ()):
             there = self._looked_up(item)
@@ -304,15 +310,17 @@ class Scan:
         return found
 
     def input(self, tag: str) -> TagValue:
-        """A tag of INPUTS as the last scan found it, before substitution and forces: BAD while the gateway is dead."""
+        """Return a tag of INPUTS as the last scan read it, before substitution and forces: BAD while the gateway is
+        dead."""
         return self._seen_at(self._reader.shape.index[tag])
 
     def outputs(self) -> dict[str, Scalar | None]:
-        """Every tag of OUTPUTS as last published by a scan that succeeded; a message tag's last sequence."""
+        """Return every tag of OUTPUTS as published by the last successful scan; of a message tag, the last sequence."""
         return self.output_image.last()
 
     def counters(self) -> dict[str, int]:
-        """Messages missed on the way in and refused on the way out, looks at the image that failed."""
+        """Return the messages that were missed on input and refused on output, and the reads of the image that
+        failed."""
         return {
             "messages_missed": sum(self._reader.missed.values()),
             "mailbox_waits": sum(outbox.waits for _, outbox in self.output_image.outboxes),
@@ -322,22 +330,23 @@ class Scan:
 
 
 def _run(bound: BoundProgram, info: ScanInfo) -> None:
-    """One scan of a program. Raises `ProgramFailed`."""
+    """Execute one scan of a program. Raises `ProgramFailed`."""
     try:
         bound.program.execute(info)
-    except (Exception, SystemExit, ScanStuck) as e:  # the logic is the user's: whatever it raises stops the task
+    except (Exception, SystemExit, ScanStuck) as e:  # the logic is the user's: any error that it raises stops the task
         raise failed(bound, e) from e
 
 
 def _as_text(messages: tuple[Message, ...]) -> str | None:
-    """The messages that a scan took, in hex and shortened, for people who ask why; None for none."""
+    """Return the messages that a scan took, in hex and shortened, for display; None if there were none."""
     shown = [m.data[:MAX_SHOWN_BYTES].hex() + ("..." if len(m.data) > MAX_SHOWN_BYTES else "") for m in messages]
     more = [f"{len(shown) - MAX_SHOWN} more"] if len(shown) > MAX_SHOWN else []
     return ", ".join(shown[:MAX_SHOWN] + more) or None
 
 
 def failed(bound: BoundProgram, error: BaseException) -> ProgramFailed:
-    """Which program, which line: the innermost line of the program's own file, else the innermost of all."""
+    """Return the error with program and line: the innermost line in the program's own file, otherwise the innermost
+    line."""
     made = type(bound.program)
     own = made.source_path or getattr(sys.modules.get(made.__module__), "__file__", None)
     path, line, inside = "", 0, False
@@ -347,7 +356,8 @@ def failed(bound: BoundProgram, error: BaseException) -> ProgramFailed:
         if here == own or not inside:
             path, line, inside = here, tb.tb_lineno, here == own
         tb = tb.tb_next
-    if made.source_path and not inside:  # on the way in or out, where no line of the engineer's runs
+    # the error is in the conversion of inputs or outputs, not in a line that the user wrote
+    if made.source_path and not inside:
         path, line = made.source_path, 0
     if isinstance(error, ScanStuck | ScanTooLong):
         reason = error.message if isinstance(error, ScanTooLong) else str(error)

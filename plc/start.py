@@ -1,14 +1,16 @@
 """When a program may run for the first time: after each of its inputs has been good once.
 
-A program that runs earlier computes with values that were never read, and the gateway would write the result to the plant. Until
-a program starts, its logic is not executed, its timers do not run, and its outputs have no value. The wait has a limit; what
-happens then is the program's policy. Once started, a program stays started: what it sees of a bad input is the input's `if_bad`.
+A program that runs earlier computes with values that were never read, and the gateway would write the result to the
+plant. Until a program starts, its logic is not executed, its timers do not run, and its outputs have no value. The wait
+has a limit; the program's policy decides what happens then. Once started, a program stays started: what it sees of a
+bad input is defined by the input's `if_bad`.
 
-Inputs that carry messages are events and have no quality, so no program waits for them. An input that is another program's
-variable counts as good once that program has executed a scan. Where two programs read each other, both wait for the inputs of
-both, and the one that runs first sees the other's initial values; so does a reader of a program in a SINGLE task.
+Inputs that carry messages are events and have no quality, so no program waits for them. An input that is another
+program's variable counts as good once that program has executed a scan. If two programs read each other, both wait for
+the inputs of both, and the one that runs first sees the other's initial values; so does a reader of a program in a
+SINGLE task.
 
-Pure: the time is passed in. This module must never know a task's cycle or a protocol.
+Pure: the time is passed in. This module must not know a task's cycle or a protocol.
 """
 
 from __future__ import annotations
@@ -26,9 +28,9 @@ from fieldtwin.plc.forces import Forces
 from fieldtwin.plc.program import Role
 
 TIMEOUT_MS = 10_000.0
-"""How long a program waits for its inputs before its policy decides, in ms, where the configuration does not say."""
+"""How long a program waits for its inputs before its policy decides, in ms, if the configuration does not set it."""
 MAX_NAMED = 8
-"""Missing inputs that one message names; it counts the others."""
+"""How many missing inputs one message names; it counts the others."""
 _UNCERTAIN = int(Quality.UNCERTAIN)
 
 AtTimeout = Literal["wait", "stop", "start_anyway"]
@@ -45,9 +47,9 @@ class InputsMissing(FieldtwinError):
 class StartPolicy:
     """How long a program waits for its inputs (`timeout_ms`, from 0 ms), and what happens then.
 
-    ``wait``: it goes on waiting, and the status says that it is overdue. ``stop``: the PLC stops, with its outputs safe.
-    ``start_anyway``: it starts with what there is. Whatever the policy, the program does not wait any longer for an input whose
-    `if_bad` is a number, because the number takes its place.
+    ``wait``: it continues to wait, and the status shows that it is overdue. ``stop``: the PLC stops, with its outputs
+    safe. ``start_anyway``: it starts with the inputs that it has. Whatever the policy, the program then no longer waits
+    for an input whose `if_bad` is a number, because the number replaces it.
     """
 
     timeout_ms: float = TIMEOUT_MS
@@ -57,7 +59,8 @@ class StartPolicy:
 class ProgramStart:
     """The start of one program. `started`: it may run; `ran`: it has executed a scan.
 
-    `missing` maps each input tag that has not been good yet to the reason. `without` is what was missing when it started.
+    `missing` maps each input tag that has not been good yet to the reason. `without` is what was missing when it
+    started.
     """
 
     __slots__ = (
@@ -73,7 +76,7 @@ class ProgramStart:
         self.producers: tuple[ProgramStart, ...] = ()
         """The programs that have to execute a scan before this one does."""
         self.all_producers: tuple[ProgramStart, ...] = ()
-        """The programs that this one depends upon, directly or through others."""
+        """The programs on which this one depends, directly or through others."""
         self.started = self.ran = self.overdue = False
         self.since_ns: int | None = None
         self.without: dict[str, Reason] = {}
@@ -91,18 +94,18 @@ class ProgramStart:
         return blocked + [p for p in self.producers if not p.ran and p not in blocked]
 
     def start(self) -> None:
-        """From now on the program runs."""
+        """Let the program run from now on."""
         self.started, self.without = True, dict(self.missing)
 
     def reason(self) -> str:
-        """What the program waits for, in words."""
+        """Return in words which inputs and programs the program waits for."""
         tags = [f"{tag} ({self.missing[tag]})" for tag in self.needed]
         tags += [f"program {p.name}" for p in self.waits_for]
         more = len(tags) - MAX_NAMED
         return ", ".join(tags[:MAX_NAMED]) + (f" and {more} more" if more > 0 else "")
 
     def error(self) -> InputsMissing:
-        """What to tell when the time is over."""
+        """Return the error to report when the time is over."""
         return InputsMissing(
             f"program {self.name} has not started: it waits for {self.reason()}",
             expected=f"every input good once within {self.policy.timeout_ms / 1000:g} s",
@@ -111,7 +114,7 @@ class ProgramStart:
         )
 
     def describe(self, now_ns: int) -> dict[str, Any]:
-        """Plain data for JSON, while the program waits."""
+        """Return plain data for JSON, while the program waits."""
         since_ns = now_ns if self.since_ns is None else self.since_ns
         return {
             "inputs": {tag: str(self.missing[tag]) for tag in self.needed},
@@ -156,12 +159,13 @@ class Starts:
             )
 
     def _producers_of(self, bound: BoundProgram) -> list[str]:
-        """The programs whose variables are inputs of `bound`."""
+        """Return the programs whose variables are inputs of `bound`."""
         tags = [binding.tag for binding in bound.inputs.values() if binding.tag not in self._reader.shape.index]
         return list(dict.fromkeys(tag.partition(".")[0] for tag in tags if tag.partition(".")[0] in self.all))
 
     def look(self, now_ns: int) -> None:
-        """Look at the inputs that are missing and start what can start. Raises `InputsMissing` where the policy is ``stop``."""
+        """Check the inputs that are missing and start the programs that can start. Raises `InputsMissing` if the policy
+        is ``stop``."""
         snapshot = self._reader.snapshot()
         alive = snapshot.counter > 0 and now_ns - snapshot.t_ns <= self._limit_ns and not snapshot.stopped
         index = self._reader.shape.index
@@ -172,7 +176,7 @@ class Starts:
                     del start.missing[tag]
                 elif alive:
                     start.missing[tag] = Reason(snapshot.reasons[at])
-                elif snapshot.counter > 0:  # else the gateway has not published anything yet, and may be about to
+                elif snapshot.counter > 0:  # otherwise the gateway has not published anything yet, and may be about to
                     start.missing[tag] = Reason.GATEWAY_DEAD
             if start.since_ns is None:
                 start.since_ns = now_ns
@@ -193,11 +197,12 @@ class Starts:
 
     @property
     def error(self) -> InputsMissing | None:
-        """What the first program that is overdue waits for; None where none is."""
+        """The error of the first program that is overdue; None if no program is."""
         return next((start.error() for start in self.waiting if start.overdue), None)
 
     def describe(self, now_ns: int) -> dict[str, Any]:
-        """Plain data for JSON: ``waiting`` by program, and ``started_without`` the inputs that were missing at its start."""
+        """Return plain data for JSON: ``waiting`` by program, and ``started_without``, the inputs that were missing at
+        its start."""
         return {
             "waiting": {start.name: start.describe(now_ns) for start in self.missing_something},
             "started_without": {
@@ -212,7 +217,8 @@ class Starts:
 
 
 def _plant_inputs(bound: BoundProgram, index: Mapping[str, int]) -> dict[str, bool]:
-    """The tags of the plant that inputs of `bound` are, with whether a number replaces each while it is bad."""
+    """Return the tags of the plant that inputs of `bound` are bound to, with whether a number replaces each while it is
+    bad."""
     found: dict[str, bool] = {}
     for variable in bound.variables(Role.INPUT):
         binding = bound.inputs.get(variable.name)
@@ -223,7 +229,7 @@ def _plant_inputs(bound: BoundProgram, index: Mapping[str, int]) -> dict[str, bo
 
 
 def _reachable(name: str, direct: Mapping[str, Sequence[str]]) -> list[str]:
-    """Every program that `name` depends upon, directly or through others; itself included where it does."""
+    """Return every program on which `name` depends, directly or through others; including itself if it does."""
     found: list[str] = []
     waiting = list(direct[name])
     while waiting:

@@ -1,18 +1,18 @@
 """The cyclic task: a scan on absolute deadlines, its lateness, its watchdog.
 
-Deadlines are start + k x cycle and never move. A task that is late runs once and goes on with the next deadline that is
-still to come: missed periods are skipped and counted, never made up for in a burst.
+Deadlines are start + k x cycle and never move. A task that is late runs once and continues with the next deadline in
+the future: missed periods are skipped and counted, and not made up for in a burst.
 
     READY --start--> RUNNING --stop------------------------------> STOPPED (requested)
                         | ---inputs missing, policy is stop------> STOPPED (not started; fieldtwin.plc.start)
                         | ---`stop_after` overruns in a row------> STOPPED (watchdog)
-                        | ---a program raises--------------------> STOPPED (failed; `error` says where)
-                        | ---a scan does not end-----------------> STOPPED (stuck; `error` says where)
-                        | ---an input that must not goes bad-----> STOPPED (tripped)
+                        | ---a program raises an error-----------> STOPPED (failed; `error` has the place)
+                        | ---a scan does not end-----------------> STOPPED (stuck; `error` has the place)
+                        | ---a `trip` input becomes bad----------> STOPPED (tripped)
 
-On every way to STOPPED the outputs are published as stopped, which makes the gateway write their safe values. The task
-waits for nothing by itself: whoever drives it sleeps until `deadline_ns` and calls `run_once`. So the same object runs
-on the wall clock (fieldtwin.plc.realtime) and in a loop under virtual time (`run_on_clock`). It must never know which.
+On every path to STOPPED the outputs are published as stopped, which makes the gateway write their safe values. The task
+itself does not wait: its driver sleeps until `deadline_ns` and calls `run_once`. So the same object runs on the wall
+clock (fieldtwin.plc.realtime) and in a loop under virtual time (`run_on_clock`). It must not know which.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from fieldtwin.plc.program import InputTripped, ProgramStuck, ScanStuck
 
 
 class Executable(Protocol):
-    """What a task runs: fieldtwin.plc.scan.Scan."""
+    """The object that a task runs: fieldtwin.plc.scan.Scan."""
 
     def execute(self, now_ns: int) -> None: ...
 
@@ -42,7 +42,7 @@ class Executable(Protocol):
 
 
 class Guard(Protocol):
-    """Watches over a scan that may never end: armed before it, disarmed after it."""
+    """Guards against a scan that never ends: armed before it, disarmed after it."""
 
     def arm(self) -> None: ...
 
@@ -50,7 +50,7 @@ class Guard(Protocol):
 
 
 class Driven(Protocol):
-    """What is driven: fieldtwin.plc.runner.Runner, CyclicTask."""
+    """The object that is driven: fieldtwin.plc.runner.Runner, CyclicTask."""
 
     @property
     def running(self) -> bool: ...
@@ -71,7 +71,7 @@ class TaskState(Enum):
     STOPPED = "stopped"
 
 
-_RUNNING = TaskState.RUNNING  # an Enum's members are slow to look up
+_RUNNING = TaskState.RUNNING  # a local name, because looking up an Enum's members is slow
 
 
 class StopReason(Enum):
@@ -86,8 +86,9 @@ class StopReason(Enum):
 
 @dataclass(frozen=True, slots=True)
 class TaskConfig:
-    """`cycle_ms` between deadlines; a scan that starts more than `late_ms` after its deadline, or ends after the next one,
-    is an overrun, and `stop_after` overruns in a row stop the task (0: never). `name` is the task's, for messages."""
+    """The configuration of a task. `cycle_ms` is the time between deadlines. A scan that starts more than `late_ms`
+    after its deadline, or ends after the next one, is an overrun, and `stop_after` overruns in a row stop the task (0:
+    never). `name` is the task's, for messages."""
 
     cycle_ms: float
     late_ms: float = 5.0
@@ -113,11 +114,11 @@ class CyclicTask:
     ) -> None:
         self.config = config
         self.paused = False
-        """While paused each deadline holds the outputs instead of running the logic, but for `steps` scans. So it does while none
-        of the task's programs has started."""
+        """While paused, each deadline publishes the outputs instead of running the logic, except for `steps` scans. The
+        same applies while none of the task's programs has started."""
         self.steps = 0
         self.held_up_by = ""
-        """What ran when the next scan became due, set by a runner of several tasks; empty: nothing that it knows of."""
+        """What was running when the next scan became due, set by a runner of several tasks; empty: nothing known."""
         self.ended_ns = 0
         """When the last scan ended."""
         self._guard = guard
@@ -128,7 +129,7 @@ class CyclicTask:
         self.duration = Histogram()
         self.scans = self.missed_periods = self.overruns = 0
         self.deadline_ns = 0
-        """When the next scan is due; meaningful while RUNNING."""
+        """When the next scan is due; valid while RUNNING."""
         self._scan = scan
         self._now_ns = now_ns
         self._cycle_ns = round(config.cycle_ms * NS_PER_MS)
@@ -140,14 +141,14 @@ class CyclicTask:
         return self.state is _RUNNING
 
     def start(self) -> None:
-        """READY to RUNNING: the first scan is due one cycle from now."""
+        """Go from READY to RUNNING: the first scan is due one cycle from now."""
         if self.state is not TaskState.READY:
             raise Bug("a task is started once", got=self.state.value)
         self.state = TaskState.RUNNING
         self.deadline_ns = self._now_ns() + self._cycle_ns
 
     def run_once(self) -> None:
-        """The scan that is due. Afterwards `deadline_ns` is the next one to wait for, or the task is STOPPED."""
+        """Run the scan that is due. Afterwards `deadline_ns` is the next one to wait for, or the task is STOPPED."""
         if self.state is not _RUNNING:
             raise Bug("a scan of a task that does not run", got=self.state.value)
         began_ns = self._now_ns()
@@ -191,11 +192,11 @@ class CyclicTask:
             finally:
                 guard.disarm()
         except ScanStuck as e:  # between two programs
-            guard.disarm()  # it may have come while the alarm was being taken back
+            guard.disarm()  # the alarm may have expired while it was being disarmed
             raise ProgramStuck("(all)", f"the scan did not end: {e}") from e
 
     def stop(self) -> None:
-        """Stop on request: outputs safe. A task that has stopped already stays as it is."""
+        """Stop on request, with outputs safe. A task that has already stopped stays unchanged."""
         if self.state is not TaskState.STOPPED:
             self._stop(StopReason.REQUESTED)
 
@@ -225,7 +226,7 @@ class CyclicTask:
         self._scan.stop(self._now_ns())
 
     def describe(self) -> dict[str, Any]:
-        """JSON-able: state, reason, error, counters, lateness and duration in microseconds."""
+        """Return state, reason, error, counters, and lateness and duration in microseconds, as data for JSON."""
         state = self.state.value
         if self.running and (self.paused or self._scan.waiting):
             state = "paused" if self.paused else "waiting"
@@ -245,7 +246,8 @@ class CyclicTask:
 
 
 async def run_on_clock(task: Driven, clock: Clock) -> None:
-    """Drive `task` in the running loop until it is stopped: what a virtual clock does. Cancelling it makes outputs safe."""
+    """Drive `task` in the running loop until it is stopped, as a virtual clock does. Cancelling it makes outputs
+    safe."""
     task.start()
     try:
         while task.running:

@@ -1,6 +1,5 @@
-"""Expressions to Python, with their types checked. What has to happen before an expression (calls with outputs) is written
-to the `Writer` first, in order.
-"""
+"""Compiles expressions to Python and checks their types. Code that has to run before an expression (calls with outputs)
+is written to the `Writer` first, in order."""
 
 from __future__ import annotations
 
@@ -27,9 +26,9 @@ from fieldtwin.plc.st.standard import FUNCTIONS
 from fieldtwin.plc.st.time_arithmetic import with_time
 
 MAX_DEEP = 80
-"""Calls, parentheses and indices inside each other."""
+"""How deep calls, parentheses and indices may be nested."""
 MAX_OPEN = 40
-"""Brackets inside each other in the Python of one line: what is deeper is worked out on a line before."""
+"""How deep brackets may be nested in one line of Python: a deeper part is computed on a line before it."""
 _LOGIC = {"AND": "&", "&": "&", "OR": "|", "XOR": "^", "AND_THEN": "and", "OR_ELSE": "or"}
 
 
@@ -47,12 +46,13 @@ class Expressions:
         self.controls: list[str] = []
         """The control variables of the FOR loops around the statement."""
         self.program_inputs: set[str] = set()
-        """Where a PROGRAM is compiled: the inputs whose quality can be asked for."""
+        """The inputs whose quality can be queried, when a PROGRAM is compiled."""
 
     # -- assignment compatibility ---------------------------------------------------------------------------------------
 
     def coerced(self, value: Value, target: ty.Type, pos: t.Pos, what: str = "") -> str:
-        """Python expression of `value` as a `target`. Raises `FileInvalid` where it needs a named conversion."""
+        """Return the Python expression of `value` as a `target`. Raises `FileInvalid` if a named conversion is
+        needed."""
         source = ty.plain(value.type)
         if not ty.fits(value.type, target):
             hint = f"{source}_TO_{ty.plain(target)}" if _convertible(source) and _convertible(ty.plain(target)) else ""
@@ -91,12 +91,14 @@ class Expressions:
         return int(value.constant)
 
     def settled(self, value: Value, pos: t.Pos) -> Value:
-        """`value` with what it is worth, where only constants may stand: ``N - 1`` of a typed constant N, too."""
+        """Return `value` with its computed constant, where only constants are allowed: for instance ``N - 1`` of a
+        typed constant N."""
         of_a_scan = "_c." in value.code or bool(self.out.lines)
         if value.constant is not None or of_a_scan or not isinstance(ty.plain(value.type), ty.Elementary):
             return value
         try:
-            worth = eval(value.code, {"_v": values})  # only what this compiler wrote: literals and calls of `values`
+            # safe: this compiler wrote the code, which holds only literals and calls of `values`
+            worth = eval(value.code, {"_v": values})
         except values.LogicError as e:
             self.env.fail(pos, e.message)
         return Value(repr(worth), value.type, worth)
@@ -119,7 +121,7 @@ class Expressions:
             self._deep -= 1
 
     def _flat(self, value: Value, pos: t.Pos) -> Value:
-        """`value`, worked out on a line before if Python could not read so many brackets."""
+        """Return `value`; if Python cannot parse that many nested brackets, compute it on a line before."""
         if value.code.count("(") + value.code.count("[") <= MAX_OPEN or _open(value.code) <= MAX_OPEN:
             return value
         name = self.out.temporary()
@@ -127,7 +129,7 @@ class Expressions:
         return Value(name, value.type, value.constant)
 
     def known(self, expr: t.Expr, result: float) -> Value:
-        """A constant without a type that was worked out here."""
+        """Return a constant without a type that was computed by the compiler."""
         if isinstance(result, int) and not -(2**63) <= result < 2**64:
             self.env.fail(expr.pos, "a whole number that no type holds")
         if isinstance(result, float) and not isfinite(result):
@@ -173,7 +175,7 @@ class Expressions:
         return Value(wrapped(f"-{value.code}", kind), kind)
 
     def _binary(self, expr: t.Binary) -> Value:
-        """A chain of operators from its left end, so that its length is not depth."""
+        """Compile a chain of operators from its left end, so that a long chain does not nest deeply."""
         chain, first = [expr], expr.left
         while isinstance(first, t.Binary):
             chain.append(first)
@@ -217,7 +219,7 @@ class Expressions:
     def _only_if_needed(
         self, expr: t.Binary, left: Value, right: Value, prepared: list[tuple[str, int]]
     ) -> tuple[Value, Value]:
-        """Both sides where the right one takes lines of its own: they are run only if the left one does not decide."""
+        """Return both sides if the right one needs its own lines: they run only if the left one does not decide."""
         name = self.out.temporary()
         self.out.line(f"{name} = {left.code}", expr.pos)
         decided = "not " if expr.op == "OR_ELSE" else ""
@@ -230,7 +232,7 @@ class Expressions:
     def _logic(self, expr: t.Binary, left: Value, right: Value) -> Value:
         a, b = left.constant, right.constant
         untyped = isinstance(left.type, ty.AnyInt) and isinstance(right.type, ty.AnyInt)
-        if untyped and expr.op in ("AND", "&", "OR", "XOR") and min(a, b) >= 0:  # the context gives the width
+        if untyped and expr.op in ("AND", "&", "OR", "XOR") and min(a, b) >= 0:  # the context determines the width
             return self.known(expr, a & b if expr.op in ("AND", "&") else a | b if expr.op == "OR" else a ^ b)
         kind = ty.common(left.type, right.type)
         if kind is None or not ty.is_kind(kind, "bool", "bits"):
@@ -408,14 +410,14 @@ class Expressions:
         return Value(f"{result}[0]" if more else result, signature.returns)
 
     def take(self, argument: t.Argument, value: Value) -> None:
-        """``name => target``."""
+        """Compile ``name => target``."""
         assert argument.target is not None
         if argument.inverted:
             value = Value(f"(not {value.code})", value.type)
         self.assign(argument.target, value, argument.pos)
 
     def assign(self, ref: t.Ref, value: Value, pos: t.Pos) -> None:
-        """Write an assignment. A bit of a variable is put in with the others kept."""
+        """Write an assignment. An assignment to a bit of a variable keeps the other bits."""
         if ref.selectors and isinstance(ref.selectors[-1], t.Bit):
             whole = self.writable(t.Ref(ref.pos, ref.name, ref.selectors[:-1]))
             self._bit(whole, ref.selectors[-1])
@@ -429,7 +431,7 @@ class Expressions:
             return
         target = self.writable(ref)
         code = self.coerced(value, target.type, pos, f"assigned to {ref.name}")
-        if isinstance(target.type, ty.Array):  # in place: a VAR_IN_OUT may stand for it
+        if isinstance(target.type, ty.Array):  # in place, because a VAR_IN_OUT may refer to it
             self.out.line(f"_v.fill({target.code}, {code})", pos)
         elif isinstance(target.type, ty.Struct):
             self.out.line(f"_v.put({target.code}, {code})", pos)
@@ -453,8 +455,8 @@ class Expressions:
     def in_out(
         self, expr: t.Expr | None, name: str, kind: ty.Type, call: t.Call, of: str, cells: dict[str, str]
     ) -> str:
-        """Python expression of what is handed over for VAR_IN_OUT `name` of `of`. `cells` gets the variables of the
-        function itself that are handed over, with the object that stands for each until `take_back`."""
+        """Return the Python expression of the argument for VAR_IN_OUT `name` of `of`. A function's own variables are
+        passed in cells: `cells` receives each variable with its cell, until `take_back`."""
         if not isinstance(expr, t.Ref):
             self.env.fail(call.pos, f"VAR_IN_OUT {name} of {of} needs a variable")
         target = self.writable(expr)
@@ -473,13 +475,13 @@ class Expressions:
         return reference
 
     def take_back(self, cells: dict[str, str], pos: t.Pos) -> None:
-        """After the call: the variables that were handed over in cells take their values."""
+        """After the call, assign the values in the cells back to the variables."""
         for code, cell in cells.items():
             self.out.line(f"{code} = {cell}.v", pos)
 
 
 def _open(code: str) -> int:
-    """How many brackets are open at the deepest place; those in strings count too, which does no harm."""
+    """Return the greatest nesting depth of brackets. Those in strings count too, which does no harm."""
     open_, most = 0, 0
     for char in code:
         if char in "([":
@@ -505,7 +507,7 @@ def _into(p: Parameter, signature: Signature) -> str:
 
 
 def _literal(value: float, kind: ty.Type) -> str:
-    """A constant without a type of its own, as one of `kind`, which it fits."""
+    """Return a constant without a type as a literal of `kind`, in which it fits."""
     if not isinstance(kind, ty.Elementary):
         return repr(value)
     if kind.kind == "bool":

@@ -1,8 +1,8 @@
 """What compiled Structured Text calls at run time: arithmetic of fixed widths, checks, strings, conversions.
 
-Integers wrap around like two's complement; division truncates towards zero; REAL rounds to 32 bits after each operation.
-What has no result (division by zero, an index outside its array, a root of a negative number) raises `LogicError`, which
-stops the task with its outputs safe. Pure.
+Integers wrap around like two's complement; division truncates towards zero; REAL rounds to 32 bits after each
+operation. An operation without a result (division by zero, an index outside its array, a root of a negative number)
+raises `LogicError`, which stops the task with its outputs safe. Pure.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
 from fieldtwin.gateway.core.errors import Blame, FieldtwinError
 from fieldtwin.plc.st.references import Cell, Cut, Element, Member
 
-__all__ = ["Cell", "Cut", "Element", "LogicError", "Member"]  # and all that compiled code calls by its name
+__all__ = ["Cell", "Cut", "Element", "LogicError", "Member"]  # and all names that compiled code calls
 
 _FLOAT = struct.Struct("<f")
 _WHOLE = re.compile(r"[+-]?[0-9][0-9_]{0,39}", re.ASCII)
@@ -36,7 +36,7 @@ class LogicError(FieldtwinError):
 
 
 def real(x: float) -> float:
-    """Rounded to 32 bits; beyond their range infinite, as IEC 60559 says."""
+    """Return `x` rounded to 32 bits; beyond their range infinity, as in IEC 60559."""
     try:
         rounded: float = _FLOAT.unpack(_FLOAT.pack(x))[0]
     except OverflowError:
@@ -63,13 +63,13 @@ def divide_real(a: float, b: float) -> float:
 
 
 def modulo(a: int, b: int) -> int:
-    """The sign is the dividend's; a MOD 0 is 0 (IEC 61131-3, Table 29)."""
+    """Return the remainder, with the sign of the dividend; a MOD 0 is 0 (IEC 61131-3, Table 29)."""
     return 0 if b == 0 else a - b * divide(a, b)
 
 
 def power(a: float, b: float) -> float:
     try:
-        result = float(a) ** float(b)  # never of integers, whose powers have no end
+        result = float(a) ** float(b)  # never of integers, whose powers can grow without limit
     except OverflowError:
         return math.inf
     except ZeroDivisionError as e:
@@ -98,12 +98,14 @@ def steps(first: int, last: int, by: int) -> range:
 
 
 def beyond(taken: range) -> int:
-    """What the control variable of a FOR is after the loop: the first value past the limit, the initial value if none was in."""
+    """Return the value of a FOR's control variable after the loop: the first value past the limit, or the initial value
+    if the loop did not run."""
     return taken[-1] + taken.step if taken else taken.start
 
 
 def unaltered(taken: range, control: Callable[[], int]) -> Iterator[int]:
-    """The values of a control variable that POUs called in the loop can reach. Raises `LogicError` where one altered it."""
+    """Yield the values of a control variable that POUs called in the loop can access. Raises `LogicError` if one
+    altered it."""
     for value in taken:
         yield value
         if control() != value:
@@ -113,20 +115,21 @@ def unaltered(taken: range, control: Callable[[], int]) -> Iterator[int]:
 
 
 def copied(x: list[Any]) -> list[Any]:
-    """An array of its own: elements that are objects or arrays are copied too."""
+    """Return a copy of an array; elements that are objects or arrays are copied too."""
     return [copied(e) if isinstance(e, list) else e.copy() if hasattr(e, "copy") else e for e in x]
 
 
 def shaped(x: list[Any], sizes: tuple[int, ...]) -> list[Any]:
-    """The elements of an array of several dimensions from a list of them, the last index changing fastest."""
+    """Return the elements of an array of several dimensions from a flat list of them, the last index changing
+    fastest."""
     for size in reversed(sizes):
         x = [x[i : i + size] for i in range(0, len(x), size)]
     return x
 
 
 def put(target: Any, source: Any) -> None:
-    """Assign a structure: `target` and what is inside it stay the objects that they are, since a VAR_IN_OUT may stand for
-    them. `source` is a copy."""
+    """Assign a structure in place: `target` and the objects inside it stay the same objects, because a VAR_IN_OUT may
+    refer to them. `source` is a copy."""
     for name in target.__slots__:
         held = getattr(target, name)
         if isinstance(held, list):
@@ -138,7 +141,7 @@ def put(target: Any, source: Any) -> None:
 
 
 def fill(target: list[Any], source: list[Any]) -> None:
-    """Assign an array, likewise."""
+    """Assign an array in place, as `put` does."""
     if target and not isinstance(target[0], list) and not hasattr(target[0], "copy"):
         target[:] = source
         return
@@ -163,12 +166,12 @@ def set_bit(x: int, bit: int, on: bool) -> int:
 
 
 def shift_left(x: int, n: int, bits: int) -> int:
-    """SHL: zeros come in from the right. A negative count is an error (IEC 61131-3, Table 30)."""
+    """SHL: zeros are shifted in from the right. A negative count is an error (IEC 61131-3, Table 30)."""
     return (x << _count(n)) & ((1 << bits) - 1) if n < bits else 0
 
 
 def shift_right(x: int, n: int, bits: int) -> int:
-    """SHR: zeros come in from the left."""
+    """SHR: zeros are shifted in from the left."""
     return x >> _count(n) if n < bits else 0
 
 
@@ -188,7 +191,8 @@ def _count(n: int) -> int:
 
 
 def of_bcd(x: int, high: int) -> int:
-    """The number whose decimal digits are the hexadecimal digits of `x`. Raises `LogicError` for A to F, or above `high`."""
+    """Return the number whose decimal digits are the hexadecimal digits of `x`. Raises `LogicError` for A to F, or
+    above `high`."""
     digits = f"{x:x}"
     if not digits.isdecimal():
         raise LogicError("a bit string that is not binary coded decimal", got=f"16#{digits.upper()}")
@@ -198,7 +202,7 @@ def of_bcd(x: int, high: int) -> int:
 
 
 def to_bcd(x: int, bits: int) -> int:
-    """The decimal digits of `x`, four bits each. Raises `LogicError` where `bits` do not hold them."""
+    """Return the decimal digits of `x`, four bits each. Raises `LogicError` if `bits` cannot hold them."""
     if not 0 <= x < 10 ** (bits // 4):
         raise LogicError("a value that does not fit its type", expected=f"0 to {10 ** (bits // 4) - 1}", got=str(x))
     return int(str(x), 16)
@@ -208,7 +212,7 @@ def to_bcd(x: int, bits: int) -> int:
 
 
 def of_real(name: str, x: float) -> float:
-    """One of math's functions; what has no result is a `LogicError`."""
+    """Return the result of one of math's functions. Raises `LogicError` if it has none."""
     try:
         return float(getattr(math, name)(x))
     except OverflowError:
@@ -218,7 +222,7 @@ def of_real(name: str, x: float) -> float:
 
 
 def to_integer(x: float, low: int, high: int) -> int:
-    """Rounded to the nearest, ties to the even one (IEC 60559). What does not fit is a `LogicError`."""
+    """Return `x` rounded to the nearest integer, ties to even (IEC 60559). Raises `LogicError` if it does not fit."""
     if math.isfinite(x) and low <= (whole := round(x)) <= high:
         return whole
     raise LogicError("a value that does not fit its type", expected=f"{low} to {high}", got=str(x))
@@ -239,7 +243,7 @@ def time_over(ns: int, divisor: float) -> int:
 
 
 def branch(x: int, lows: tuple[int, ...], highs: tuple[int, ...], branches: tuple[int, ...]) -> int:
-    """CASE with many labels: which branch has `x`, -1 if none. `lows` in order."""
+    """CASE with many labels: return the branch for `x`, or -1. `lows` are in order."""
     at = bisect_right(lows, x) - 1
     return branches[at] if at >= 0 and x <= highs[at] else -1
 
@@ -257,7 +261,7 @@ def right(s: str, length: int) -> str:
 
 
 def find(s: str, what: str) -> int:
-    """0 where it is not, and for an empty one."""
+    """Return the position from 1; 0 if it is not found, and for an empty string."""
     return s.find(what) + 1 if what else 0
 
 
@@ -278,7 +282,7 @@ def replaced(s: str, what: str, length: int, position: int) -> str:
 
 
 def code_of(s: str, position: int) -> int:
-    """The character at `position` as a number; 0 where the string has none."""
+    """Return the character at `position` as a number; 0 if the string is shorter."""
     return ord(s[position - 1]) if 0 < position <= len(s) else 0
 
 
@@ -291,7 +295,7 @@ def real_text(x: float, digits: int) -> str:
 
 
 def duration_text(ns: int, prefix: str) -> str:
-    """``T#1h2m3s4ms``, the largest units first, none that is zero."""
+    """Return ``T#1h2m3s4ms``, the largest units first, without units that are zero."""
     rest, out = abs(ns), []
     for unit, size in (
         ("d", 86_400 * NS_PER_S),
@@ -328,8 +332,8 @@ def _moment(ns: int) -> datetime:
 
 
 def number_of(text: str, low: int, high: int) -> int:
-    """Return the number that a string holds, as a literal: ``-12``, ``1_000``, ``16#FF``, ``2#1010``; spaces around it are
-    ignored. Raises `LogicError` for what is no number or does not fit."""
+    """Return the number that a string holds as a literal: ``-12``, ``1_000``, ``16#FF``, ``2#1010``; spaces around it
+    are ignored. Raises `LogicError` for a text that is not a number or does not fit."""
     digits = text.strip()
     based = _BASED.fullmatch(digits)
     try:

@@ -1,6 +1,6 @@
-"""What a scenario's verdict says of the scenario: its case id, whom it judges, its class of danger.
+"""Metadata of a scenario's result: its case id, the role under test, and its impact level.
 
-It knows no bench and runs nothing.
+This module uses no bench and runs nothing.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from fieldtwin.scenarios.words import Step, word_of
 
 SUFFIX = ".scenario.yaml"
 ROLE = "controller"
-"""Whom a scenario judges: the gateway and PLC of the system, or the one that its probes watch."""
+"""The role under test: the gateway and PLC of the system, or the controller that the scenario's probes read."""
 _DANGER = {"send": Danger.WRITE, "set": Danger.WRITE, "fault": Danger.DISRUPT, "clear": Danger.DISRUPT}
-"""Of steps; all others observe."""
+"""Impact levels of steps; all other steps observe."""
 
 
 def case_of(path: Path) -> str:
-    """The case id: the file's name without its suffix."""
+    """Return the case id: the file's name without its suffix."""
     return path.name.removesuffix(SUFFIX)
 
 
 def dangers(scenario: Scenario) -> Iterator[tuple[Danger, str]]:
-    """Each step and probe with its class, and how people find it."""
+    """Yield each step and probe as its impact level and a description for people."""
     for n, step in enumerate(scenario.form.steps, 1):
         yield _danger_of(step), f"step {n}"
     for probe in scenario.probes:
@@ -39,12 +39,12 @@ def _danger_of(step: Step) -> Danger:
 
 
 def danger_of(scenario: Scenario) -> Danger:
-    """The highest of all its steps and probes."""
+    """Return the highest impact level of all its steps and probes."""
     return max((danger for danger, _ in dangers(scenario)), key=lambda d: d.rank, default=Danger.OBSERVE)
 
 
 def result_of(scenario: Scenario, target: str, verdict: Verdict, **more: Any) -> ScenarioResult:
-    """A result that says whose it is; `more` are the other fields of `ScenarioResult`."""
+    """Return a result with the scenario's metadata; `more` are the other fields of `ScenarioResult`."""
     return ScenarioResult(
         scenario.form.scenario,
         verdict,

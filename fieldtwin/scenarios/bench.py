@@ -1,7 +1,8 @@
-"""What a scenario drives: a running system, wherever it runs. Targets differ in what they can do, and say so.
+"""The interface to a running system that a scenario drives, wherever it runs. Targets declare what they can do.
 
-`virtual` is a prototype in virtual time, in this process; `local` one as processes on this host; `compose` one in containers;
-`real` a plant. A step that asks for more than `can` holds is skipped, with the reason; it never passes.
+`virtual` is a prototype in virtual time, in this process; `local` is one as processes on this host; `compose` is one in
+containers; `real` is a plant. A step that needs a capability that is not in `can` is skipped, with the reason; it never
+passes.
 """
 
 from __future__ import annotations
@@ -17,31 +18,32 @@ from fieldtwin.scenarios.trace import Trace
 
 
 class Can(Enum):
-    """What a target may be able to do. The values are the words of a scenario's `needs`."""
+    """Capabilities of a target. The values are the words of a scenario's `needs`."""
 
     INJECT_FAULT = "inject_fault"
     SEND_COMMAND = "send_command"
     SET_VALUE = "set_value"
     SEE_WIRE = "see_wire"
     SEE_HELD = "see_held"
-    """What the devices held: the oracle can judge."""
+    """Read the values that the devices held, against which the oracle compares."""
     EXACT_TIME = "exact_time"
-    """Lateness of the host never shows."""
+    """The host's lateness never affects the run."""
     PROBE = "probe"
     FRESH_START = "fresh_start"
-    """PLC, simulations and devices begin anew before the scenario (`start: fresh`)."""
+    """Restart PLC, simulations and devices before the scenario (`start: fresh`)."""
     JUDGE_RUN = "judge_run"
-    """What a run is judged by (`judge: run`): every value that was published as good is compared with what its device held."""
+    """Apply the checks of `run` (`judge: run`): every value published as good is compared with what its device held."""
 
 
 Part = Literal["plc", "gateway", "field"]
-"""The parts of a system that a scenario needs running."""
+"""The parts of a system that must run for a scenario."""
 
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """A tag or a program's variable now. `quality` is good, uncertain, bad, substituted or simulated; `age_s` that of the value,
-    `updates` how often it was published since the start; both 0 for a variable."""
+    """The current value of a tag or of a program's variable. `quality` is good, uncertain, bad, substituted or
+    simulated; `age_s` is the value's age, and `updates` how often it was published since the start; both are 0 for a
+    variable."""
 
     value: Any
     quality: str
@@ -51,7 +53,7 @@ class Reading:
 
 
 def variable(value: Any, *, runs: bool) -> Reading:
-    """Return the reading of a program's variable. That of a PLC that does not run is bad: nobody may act on it."""
+    """Return the reading of a program's variable. If the PLC does not run, it is bad: the value must not be used."""
     return Reading(value, "good" if runs else "bad", "" if runs else "not_operational", 0.0, 0)
 
 
@@ -59,8 +61,8 @@ def variable(value: Any, *, runs: bool) -> Reading:
 class Stopped:
     """A part of the system under test that does not run: the PLC, the gateway or the simulated field devices.
 
-    `what` is the error, `where` the file and line of the logic that failed, if logic did. `bound_s`: a host that was late by a
-    part of this time may have caused it; 0 if the host's lateness cannot be the cause.
+    `what` is the error, `where` the file and line of the logic that failed, if logic did. `bound_s`: a host that was
+    late by a part of this time may have caused it; 0 if the host's lateness cannot be the cause.
     """
 
     part: Part
@@ -70,11 +72,13 @@ class Stopped:
 
 
 class NothingKnown(FieldtwinError):
-    """The judge itself was interrupted: what it saw says nothing about the system, and the scenario is INCONCLUSIVE."""
+    """The test runner itself was interrupted: its observations prove nothing about the system, and the scenario is
+    INCONCLUSIVE.
+    """
 
 
 class Bench(Protocol):
-    """A running system. Raises `FieldtwinError` when the system is gone."""
+    """A running system. Raises `FieldtwinError` if the system is gone."""
 
     @property
     def target(self) -> str:
@@ -86,15 +90,15 @@ class Bench(Protocol):
 
     @property
     def allowed(self) -> Danger:
-        """What steps may do to it at most: `expect`, `wait` and `pause` observe, probes read, `send` and `set` write, `fault`
-        and `clear` disrupt."""
+        """The highest impact level that steps may have: `expect`, `wait` and `pause` observe, probes read, `send` and
+        `set` write, `fault` and `clear` disrupt."""
         ...
 
     @property
     def trace(self) -> Trace: ...
 
     def now_s(self) -> float:
-        """Seconds since the start."""
+        """Return the seconds since the start."""
         ...
 
     async def sleep_until_s(self, t_s: float) -> None:
@@ -102,11 +106,13 @@ class Bench(Protocol):
         ...
 
     def names(self) -> list[str]:
-        """What `reading` knows: DEVICE.TAG and PROGRAM.VARIABLE."""
+        """Return the names that `reading` accepts: DEVICE.TAG and PROGRAM.VARIABLE."""
         ...
 
     def reading(self, name: str) -> Reading | None:
-        """As it was when the last `sleep_until_s` returned. None: never published. Raises `UsageError` for an unknown name."""
+        """Return the reading as of the last return of `sleep_until_s`. None: never published. Raises `UsageError` for
+        an unknown name.
+        """
         ...
 
     def why_unknown(self, name: str) -> str:
@@ -118,42 +124,45 @@ class Bench(Protocol):
         ...
 
     def not_started(self) -> str:
-        """Return which programs wait for their inputs and have not started, with what is missing; empty where all run."""
+        """Return which programs wait for their inputs and have not started, with what is missing; empty if all run."""
         ...
 
     def late_ms(self) -> float:
-        """How late the last scan was by the host's own making; 0 in virtual time."""
+        """Return by how many ms the last scan was late because of the host; 0 in virtual time."""
         ...
 
     def host_late_s(self, since_s: float) -> float:
-        """The longest that the host, by its own load, kept us or a scan waiting since `since_s`; 0 in virtual time."""
+        """Return the longest time since `since_s` for which the host's load delayed this process or a scan; 0 in
+        virtual time.
+        """
         ...
 
     def host_late_total_s(self, since_s: float) -> tuple[float, float]:
-        """All lateness since `since_s`, together, in seconds: that of the judge's own sleeps, which is the host's alone, and all
-        that was seen, which may also be the system's. Both 0 in virtual time."""
+        """Return the sum of all lateness since `since_s`, in seconds, as two numbers: that of this process's own
+        sleeps, which only the host can cause, and all that was observed, which the system may also cause. Both are 0 in
+        virtual time."""
         ...
 
     async def send(self, period_s: int) -> None:
-        """The far end commands a period."""
+        """Let the remote client command a period."""
         ...
 
     async def set_value(self, device: str, tag: str, value: float | str | bool | None) -> None:
-        """From now on the device holds `value` for `tag`, whatever its recording says; None: no longer."""
+        """Make the device hold `value` for `tag` from now on, whatever its recording says; None ends that."""
         ...
 
     async def inject(self, fault: dict[str, Any]) -> None:
-        """Put a fault in: `id`, `name`, what it aims at and its parameters, as in a fault file."""
+        """Inject a fault: `id`, `name`, its aim and its parameters, as in a fault file."""
         ...
 
     async def clear(self, id: str) -> None:
-        """Take the fault away."""
+        """Clear the fault."""
         ...
 
     async def struck(self) -> list[Struck]:
-        """Return how often each fault struck that was put in through this bench, in the order in which they were put in."""
+        """Return how often each fault struck that was injected through this bench, in the order of injection."""
         ...
 
     async def held(self, name: str) -> list[tuple[float, bytes]]:
-        """What the device held for a tag: since when (s since the start), and the raw bytes."""
+        """Return the values that the device held for a tag: the start of each (s since the start), and its raw bytes."""
         ...

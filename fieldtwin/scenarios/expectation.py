@@ -1,4 +1,6 @@
-"""Whether one expectation holds now: of a tag, or of what was seen on a device's wire. Answers with (expected, got), or None."""
+"""Checks one expectation now: of a tag, or of the requests seen on a device's bus. Returns (expected, got), or None if
+it holds.
+"""
 
 from __future__ import annotations
 
@@ -16,13 +18,13 @@ from fieldtwin.twin.site.system import System
 
 Said = tuple[str, str] | None
 LIKE_S = 0.5
-"""How long before a value's own time its device may have held it: a reply takes its time on the wire."""
+"""How long before a value's own time, in seconds, its device may have held it: the reply takes some time on the bus."""
 
 
 @dataclass
 class Watched:
-    """What an expectation can look at: the bench, since when, and the exchanges that were seen. `stimulus_s`: when the system
-    was last told something; exchanges count from then."""
+    """The data that an expectation can use: the bench, the start of the check, and the exchanges seen. `stimulus_s` is
+    the time of the last stimulus to the system; exchanges count from then."""
 
     bench: Bench
     system: System
@@ -38,7 +40,7 @@ class Watched:
 
 
 async def judge_tag(expect: Expect, watched: Watched) -> Said:
-    """Value, quality, likeness and rate of a tag now."""
+    """Check value, quality, likeness and rate of a tag now."""
     assert expect.tag is not None
     reading = watched.bench.reading(expect.tag)
     if expect.updates_per_s is not None:
@@ -55,7 +57,7 @@ async def judge_tag(expect: Expect, watched: Watched) -> Said:
 
 
 def is_secret(system: System, name: str) -> bool:
-    """Whether nobody is to see the value of DEVICE.TAG."""
+    """Return whether the value of DEVICE.TAG must not be shown."""
     device, _, tag = name.rpartition(".")
     found = system.devices[device].profile.tags.get(tag) if device in system.devices else None
     return found is not None and found.secret
@@ -63,7 +65,7 @@ def is_secret(system: System, name: str) -> bool:
 
 async def _judge_value(expect: Expect, watched: Watched, reading: Reading) -> Said:
     assert expect.tag is not None
-    if expect.quality is not None and reading.value is None:  # it has not gone bad: it never was anything else
+    if expect.quality is not None and reading.value is None:  # it has not turned bad: it never had a value
         return f"{expect.tag} {expect.quality}", f"no value yet, {reading.quality} ({reading.reason.replace('_', ' ')})"
     if expect.quality is not None and reading.quality != expect.quality:
         return f"{expect.tag} {expect.quality}", f"{reading.quality} ({reading.reason})"
@@ -76,7 +78,7 @@ async def _judge_value(expect: Expect, watched: Watched, reading: Reading) -> Sa
 
 
 async def _like_held(expect: Expect, watched: Watched, value: object, reading_age_s: float) -> Said:
-    """The tag against what its device holds, or held when the tag was read."""
+    """Compare the tag with what its device holds, or held when the tag was read."""
     assert expect.tag is not None
     device, _, name = expect.tag.rpartition(".")
     tag = watched.system.devices[device].profile.tags[name]
@@ -91,7 +93,7 @@ async def _like_held(expect: Expect, watched: Watched, value: object, reading_ag
 
 
 def held_since(held: Sequence[tuple[float, bytes]], since_s: float) -> list[bytes]:
-    """Return what a device held at any time from `since_s` on. What it began to hold before that, it still held then.
+    """Return what a device held at any time from `since_s` on, including the value that it had begun to hold before.
 
     `held` gives each value with the time from which it was held, in order.
     """
@@ -106,7 +108,9 @@ def _near(value: object, truth: object, tolerance: float) -> bool:
 
 
 def judge_wire(expect: Expect, watched: Watched) -> Said:
-    """How often something was asked on a device's wire since the last stimulus; or how often a second, since the step began."""
+    """Check how often something was requested on a device's bus since the last stimulus, or its rate per second since
+    the step began.
+    """
     assert expect.wire is not None
     since_s = watched.since_s if expect.requests_per_s is not None else watched.stimulus_s
     seen = [
@@ -132,7 +136,7 @@ def judge_wire(expect: Expect, watched: Watched) -> Said:
 
 def wire_matches(form: Expect | WireForm, exchange: Exchange) -> bool:
     """Return whether an exchange has the form's function, access, register and value, as far as the form names them. A
-    stray frame is not a request, so it never has them."""
+    stray frame is not a request, so it never matches."""
     if exchange.is_stray:
         return False
     if form.function is not None and exchange.function != form.function:
@@ -145,12 +149,12 @@ def wire_matches(form: Expect | WireForm, exchange: Exchange) -> bool:
 
 
 def inside(number: float, bounds: Bounds) -> bool:
-    """Whether a number is within bounds."""
+    """Return whether a number is within bounds."""
     return (bounds.min is None or number >= bounds.min) and (bounds.max is None or number <= bounds.max)
 
 
 def bounds_text(bounds: Bounds) -> str:
-    """Bounds in words: ``at least 1 and at most 3``."""
+    """Return bounds in words: ``at least 1 and at most 3``."""
     if bounds.min == bounds.max:
         return f"{bounds.min:g}" if bounds.min is not None else "any"
     parts = [f"at least {bounds.min:g}"] if bounds.min is not None else []

@@ -1,7 +1,7 @@
-"""What a scenario asserts: ``quality(ctd.pressure) != 'good' or age(ctd.pressure) <= 1.5 s``.
+"""The expressions of scenarios: ``quality(ctd.pressure) != 'good' or age(ctd.pressure) <= 1.5 s``.
 
-A small part of Python's expressions, read with its parser and evaluated here; nothing is ever executed. Names are tags and
-programs' variables; numbers may have a unit of time and are then seconds.
+They are a small part of Python's expressions, parsed with Python's parser and evaluated here; no code is ever executed.
+Names are tags and programs' variables; numbers may have a unit of time and are then converted to seconds.
 """
 
 from __future__ import annotations
@@ -19,13 +19,17 @@ from fieldtwin.gateway.core.nearest import did_you_mean
 from fieldtwin.gateway.core.values import Quality, Reason
 
 FUNCTIONS = ("quality", "age", "value", "updates", "reason")
-"""Of a tag: its quality in words, seconds since its source's time, its value, how often it was published, why it is bad."""
+"""Functions of a tag: its quality in words, the seconds since its source's time, its value, how often it was published,
+and the reason why it is bad.
+"""
 QUALITIES = tuple(str(quality) for quality in Quality)
 WORDS = {"quality": QUALITIES, "reason": tuple(str(reason).replace(" ", "_") for reason in Reason)}
-"""What these functions can say."""
+"""The possible results of these functions."""
 NO_WORDS: Mapping[str, Collection[str]] = {}
 _OWN = ("plc.late", "command_pending")
-"""``plc.late``: by how many seconds the last scan was late; ``command pending``: the far end commanded within 5 s."""
+"""``plc.late``: the seconds by which the last scan was late; ``command pending``: the remote client commanded within 5
+s.
+"""
 LONGEST = 1000
 DEEPEST = 50
 _UNIT_S = {"ms": 0.001, "s": 1.0, "min": 60.0, "h": 3600.0}
@@ -47,7 +51,9 @@ _ARITHMETIC: dict[type[ast.operator], Callable[[Any, Any], Any]] = {
 
 
 class NotUnderstood(UsageError):
-    """What is no expression, or names what is not known, and where in its text: `at_column` characters behind its begin."""
+    """The text is not an expression, or contains an unknown name. `at_column` is the position of the error: characters
+    after the start of the text.
+    """
 
     at_column = 0
 
@@ -57,14 +63,15 @@ class NotUnderstood(UsageError):
 
 
 Look = Callable[[str, str], Any]
-"""``look(function, name)`` returns what is known of a tag or variable now, or None if that is unknown."""
+"""``look(function, name)`` returns the current value of a function of a tag or variable, or None if it is unknown."""
 
 
 class Expression:
-    """`text`, read once. `names`: the tags and variables that it is about. Raises `UsageError` for what it is not.
+    """An expression, parsed once from `text`. `names` are the tags and variables in it. Raises `UsageError` for an
+    invalid expression.
 
-    `words`: what a name can only be, where that is known; to compare it with another text is a mistake. `prefix` is put before
-    each name when it is looked at: in a network the name of the system, with a dot.
+    `words` gives, for some names, all values that they can have; comparing such a name with a different text is an
+    error. `prefix` is put before each name when it is evaluated: in a network, the name of the system and a dot.
     """
 
     def __init__(
@@ -77,9 +84,9 @@ class Expression:
         self.text = text
         self.names: list[str] = []
         self.times_s = [float(m[2]) * _UNIT_S[m[3]] for m in _TOKEN.finditer(text) if m[2] is not None]
-        """The times that stand in it."""
+        """The times that it contains, in seconds."""
         self.asks_lateness = False
-        """Whether it is about ``plc.late``."""
+        """Whether it contains ``plc.late``."""
         self._known = known
         self._words = words
         self._prefix = prefix
@@ -98,8 +105,8 @@ class Expression:
     def evaluate(self, look: Look) -> Any:
         """Return its value now, or None if the value is unknown.
 
-        An operation on an unknown operand is unknown, and so is one without a result, such as a division by zero. `and` and `or`
-        follow Kleene's three-valued logic: ``false and unknown`` is false, ``true or unknown`` is true.
+        An operation on an unknown operand is unknown, and so is one without a result, such as a division by zero. `and`
+        and `or` follow Kleene's three-valued logic: ``false and unknown`` is false, ``true or unknown`` is true.
         """
         prefix = self._prefix
         if not prefix:
@@ -112,11 +119,11 @@ class Expression:
 
     @property
     def is_constant(self) -> bool:
-        """Whether it looks at nothing, and so is always the same."""
+        """Whether it contains no tag or variable, and therefore never changes."""
         return not any(isinstance(node, ast.Name | ast.Attribute | ast.Call) for node in ast.walk(self._tree))
 
     def _column(self, at: int) -> int:
-        """Where in `text` stands what is at character `at` of what Python's parser got."""
+        """Return the position in `text` that corresponds to character `at` of the text given to Python's parser."""
         grown = 0
         for match in _TOKEN.finditer(self.text, self._lead):
             begins = match.start() - self._lead + grown
@@ -129,7 +136,7 @@ class Expression:
         return min(self._lead + at - grown, len(self.text))
 
     def _at(self, node: ast.expr) -> int:
-        """Python counts bytes of UTF-8."""
+        """Return the position of a node in `text`. Python's parser counts bytes of UTF-8."""
         return self._column(len(self._plain.encode()[: node.col_offset].decode(errors="ignore")))
 
     def _check(self, node: ast.expr, depth: int) -> None:
@@ -174,7 +181,7 @@ class Expression:
         self._check_name(self._name(node.args[0]), node.args[0])
 
     def _check_words(self, asked: ast.expr, text: ast.expr) -> None:
-        """A text that the other side of a comparison can never be."""
+        """Refuse a text that the other side of a comparison can never equal."""
         if not isinstance(text, ast.Constant) or not isinstance(text.value, str):
             return
         words: Collection[str] = ()
@@ -241,7 +248,7 @@ def _value(node: ast.expr, look: Look) -> Any:
         return None if inner is None or isinstance(inner, str) else -inner
     if isinstance(node, ast.BinOp):
         left, right = _value(node.left, look), _value(node.right, look)
-        texts = isinstance(left, str) or isinstance(right, str)  # Python would repeat and join them
+        texts = isinstance(left, str) or isinstance(right, str)  # Python would repeat and join texts
         return None if texts else _applied(_ARITHMETIC[type(node.op)], left, right)
     assert isinstance(node, ast.Compare)
     values = [_value(part, look) for part in (node.left, *node.comparators)]
@@ -250,7 +257,7 @@ def _value(node: ast.expr, look: Look) -> Any:
 
 
 def _known(value: Any) -> Any:
-    """Return the value, or None for NaN, which stands for "no number"."""
+    """Return the value, or None for NaN, which means "no number"."""
     return None if isinstance(value, float) and isnan(value) else value
 
 

@@ -1,4 +1,6 @@
-"""A scenario file, read and checked against its system: every error with file, line, column and the nearest known word."""
+"""Reads a scenario file and checks it against its system: every error has file, line, column and the nearest known
+word.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,7 @@ _TOGETHER = {
     "rate": ("wire", "access", "function", "register", "value", "requests_per_s", "during"),
     "that": ("that", "within", "during"),
 }
-"""The keys of an expectation, by what it is about."""
+"""The permitted keys of an expectation, by its subject."""
 
 
 @dataclass(frozen=True)
@@ -44,27 +46,27 @@ class Scenario:
     always: tuple[Expression, ...]
     never: tuple[Expression | WireForm, ...]
     known: tuple[str, ...] = ()
-    """What expressions may name."""
+    """The names that expressions may contain."""
     own: tuple[str, ...] = ()
-    """Of these, what is the system's."""
+    """Those of `known` that belong to the system."""
     words: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    """What those of them can only be that have words for their values: the states of programs."""
+    """The possible words of each name whose value is a word: the states of programs."""
     probes: tuple[Probe, ...] = ()
     profiles: tuple[Path, ...] = ()
     network: Network | None = None
-    """Of which `system` is the whole, if it is a network's scenario."""
+    """The network, if it is a network's scenario; `system` is then the network's `whole`."""
     used: set[str] = field(default_factory=set, compare=False)
-    """The tags and variables that it is about."""
+    """The tags and variables that the scenario uses."""
     invariants: Invariants = field(default_factory=Invariants)
-    """What the system file, or each system file of the network, says that holds in every scenario."""
+    """The invariants of the system file, or of each system file of the network."""
 
     def line(self, *loc: Key) -> str:
-        """FILE:LINE of a part of it."""
+        """Return FILE:LINE of a part of the scenario."""
         line, _ = self.file.positions.get(loc, (1, 1))
         return f"{self.path}:{line}"
 
     def expression(self, text: str, *loc: Key) -> Expression:
-        """`text` as an expression. Raises `FileInvalid` at its spot."""
+        """Return `text` as an expression. Raises `FileInvalid` with its place."""
         try:
             expression = Expression(text, self.known, self.words)
         except UsageError as e:
@@ -74,7 +76,9 @@ class Scenario:
         return expression
 
     def _inside(self, error: FileInvalid, text: str, offset: int) -> FileInvalid:
-        """The error where it is inside the expression, if that stands in one line as it is."""
+        """Return the error with its exact place inside the expression, if the file has the expression unchanged in one
+        line.
+        """
         try:
             line = self.path.read_text(encoding="utf-8").splitlines()[(error.line or 1) - 1]
         except (OSError, IndexError):
@@ -89,8 +93,8 @@ class Scenario:
 
 
 def names_of(system: System, network: Network | None = None) -> dict[str, tuple[str, ...]]:
-    """What can be asked for: DEVICE.TAG and PROGRAM.VARIABLE; in a network behind the name of their system. Of a program's state
-    the words that it can be, of all else none."""
+    """Return the names that expressions may contain: DEVICE.TAG and PROGRAM.VARIABLE, in a network after the name of
+    their system. The value is a tuple of the words that a program's state can be, and empty for all other names."""
     from fieldtwin.twin.plant.physical import image_layout
 
     if network is not None:
@@ -115,7 +119,7 @@ def invariants_of(system: System, network: Network | None = None) -> Invariants:
 
 
 def load_scenario(path: Path, profiles: tuple[Path, ...] = ()) -> Scenario:
-    """Read and check. Raises `FileInvalid`, `UsageError`."""
+    """Read a scenario and check it. Raises `FileInvalid`, `UsageError`."""
     file = load(path)
     _check_one_thing(file)
     form = validate(file, ScenarioForm)
@@ -170,7 +174,7 @@ def load_scenario(path: Path, profiles: tuple[Path, ...] = ()) -> Scenario:
 
 
 def _check_one_thing(file: YamlFile) -> None:
-    """Each step one of the words, before their contents are looked at: two of them are a hyphen forgotten."""
+    """Check, before the contents, that each step has only one word. Two words are usually caused by a missing hyphen."""
     steps = file.data.get("steps")
     for n, step in enumerate(steps if isinstance(steps, list) else ()):
         said = [word for word in step if word in WORDS] if isinstance(step, dict) else []
@@ -179,7 +183,7 @@ def _check_one_thing(file: YamlFile) -> None:
 
 
 def _system(file: YamlFile, form: ScenarioForm, profiles: tuple[Path, ...]) -> tuple[System, Network | None]:
-    """The system that it names, beside it or shipped, or the whole of the network."""
+    """Return the system that the file names, from its folder or the shipped ones, or the `whole` of the network."""
     folder = Path(file.path).parent
     beside = folder / form.system
     named = str(beside) if beside.exists() else form.system.removesuffix(".yaml")
@@ -220,7 +224,7 @@ _IMPLIED = {"send": Can.SEND_COMMAND, "set": Can.SET_VALUE, "fault": Can.INJECT_
 
 
 def needs_of(step: Step) -> list[Can]:
-    """What a target must be able to do for a step."""
+    """Return the capabilities of a target that a step needs."""
     needs = [need for word, need in _IMPLIED.items() if getattr(step, word) is not None]
     if step.expect is not None and step.expect.wire is not None:
         needs.append(Can.SEE_WIRE)
@@ -263,7 +267,7 @@ def _check_set(scenario: Scenario, said: Set, loc: tuple[Key, ...]) -> None:
 
 
 def _aim(scenario: Scenario, spec: FaultSpec) -> None:
-    """Raises `WrongAim` for what is not there, in the system or between the systems of a network."""
+    """Check a fault's aim. Raises `WrongAim` if it is neither in the system nor between the systems of a network."""
     if scenario.network is not None:
         check_network_fault(scenario.network, spec)
     else:
@@ -271,7 +275,7 @@ def _aim(scenario: Scenario, spec: FaultSpec) -> None:
 
 
 def _check_of_network(file: YamlFile, form: ScenarioForm) -> None:
-    """What is of one system only."""
+    """Refuse keys that apply to one system only."""
     for key in ("probes", "prototype"):
         if getattr(form, key):
             raise file.error(
@@ -312,7 +316,7 @@ def _check_expect(scenario: Scenario, expect: Expect, loc: tuple[Key, ...]) -> N
 
 
 def _check_register(scenario: Scenario, device: str, register: str | None, value: object, loc: tuple[Key, ...]) -> None:
-    """A tag of the device, which a value needs: of no register it is never seen."""
+    """Check that `register` is a tag of the device. A `value` needs a register: without one it would never match."""
     if register is not None:
         tags = list(scenario.system.devices[device].profile.tags)
         _known(scenario.file, (*loc, "register"), f"tag of {device}", register, tags)
@@ -321,7 +325,7 @@ def _check_register(scenario: Scenario, device: str, register: str | None, value
 
 
 def _check_numbers(file: YamlFile, expect: Expect, loc: tuple[Key, ...]) -> None:
-    """Times, and bounds that something can be within, and something not."""
+    """Check the times, and that the bounds can be both met and missed."""
     if expect.during is not None and _time(file, (*loc, "during"), expect.during) <= 0:
         raise file.error((*loc, "during"), "what is looked at for no time is not seen", expected="during: 10s")
     if expect.within is not None:
@@ -336,7 +340,7 @@ def _check_numbers(file: YamlFile, expect: Expect, loc: tuple[Key, ...]) -> None
 
 
 def _looks(scenario: Scenario, text: str, loc: tuple[Key, ...]) -> Expression:
-    """An expression that is about the system, so that it can come out either way."""
+    """Return an expression that names something of the system, so that it can be true or false."""
     expression = scenario.expression(text, *loc)
     if expression.is_constant:
         raise scenario.file.error(loc, "this looks at nothing", expected="a tag or a variable in it", got=text)
@@ -353,7 +357,7 @@ def _check_bounds(file: YamlFile, loc: tuple[Key, ...], bounds: Bounds | None) -
 
 
 def _check_whole_run(scenario: Scenario) -> None:
-    """What holds over the whole run: `within`, `rate`, `cycle`."""
+    """Check the rules of the whole run: `within`, `rate`, `cycle`."""
     file, form = scenario.file, scenario.form
     for n, within in enumerate(form.within):
         _looks(scenario, within.after, ("within", n, "after"))

@@ -1,4 +1,6 @@
-"""The invariants of a system file: rules that hold in every run, scenario and campaign, read and checked against the system."""
+"""The invariants of a system file: rules that hold in every run, scenario and campaign, read and checked against the
+system.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,9 @@ from fieldtwin.twin.site.system import System
 
 @dataclass(frozen=True)
 class Stated:
-    """An expression that is always (`wanted` True) or never (False) true. `number` is what reports call it, `where` FILE:LINE."""
+    """An expression that must be true always (`wanted` True) or never (False). `number` is its name in reports, `where`
+    FILE:LINE.
+    """
 
     number: str
     where: str
@@ -24,7 +28,7 @@ class Stated:
 
 @dataclass(frozen=True)
 class Followed:
-    """`then` is true within `limit_s` of each time that `after` becomes true."""
+    """The rule that `then` becomes true within `limit_s` of each time that `after` becomes true."""
 
     number: str
     where: str
@@ -48,16 +52,18 @@ class Invariants:
 
     @property
     def names(self) -> set[str]:
-        """The tags and variables that they look at."""
+        """The tags and variables that the invariants use."""
         every = [one.expression for one in self.stated]
         every += [part for one in self.followed for part in (one.after, one.then)]
         return {name for expression in every for name in expression.names}
 
 
 def load_invariants(system: System, names: Mapping[str, tuple[str, ...]], prefix: str = "") -> Invariants:
-    """Read the invariants of a system file. `names`: what expressions may name, with the words that a state can be.
+    """Read the invariants of a system file. `names` are the names that expressions may contain, with the words that a
+    state can be.
 
-    `prefix`: the system's name in its network, with a dot; the names of the result begin with it. Raises `FileInvalid`.
+    `prefix` is the system's name in its network, with a dot; the names of the result begin with it. Raises
+    `FileInvalid`.
     """
     form = system.invariants
     words = {name: states for name, states in names.items() if states}

@@ -1,7 +1,7 @@
-"""What is known of the system under test: for expressions, and in words for reports.
+"""The known values of the system under test: for expressions, and in words for reports.
 
-A tag's quality is unknown until the tag has had a value: a tag that was never published has not gone bad. What a report says is
-taken from the bench and from the trace, so that both agree.
+A tag's quality is unknown until the tag has had a value: a tag that was never published has not turned bad. The texts
+for reports are taken from the bench and from the trace, so that both agree.
 """
 
 from __future__ import annotations
@@ -18,21 +18,23 @@ from fieldtwin.scenarios.trace import Event, Kind
 from fieldtwin.twin.site.system import System
 
 PENDING_S = 5.0
-"""How long ``command pending`` is true after the remote client's command."""
+"""How long ``command pending`` is true after the remote client's command, in seconds."""
 
 
 class Knowledge:
-    """What is known of one running system. `known`: what expressions may name. `hear` takes each event of the trace."""
+    """The known values of one running system. `known` are the names that expressions may contain. `hear` takes each
+    event of the trace.
+    """
 
     def __init__(self, system: System, known: Collection[str], bench: Bench) -> None:
         self._system = system
         self._known = known
         self._bench = bench
-        self._sent_s = float("-inf")  # none was sent yet
+        self._sent_s = float("-inf")  # no command was sent yet
         self._last: dict[str, Event] = {}
         """By tag or variable: the latest event about it."""
         self._valued: set[str] = set()
-        """Those that have had a value."""
+        """Tags and variables that have had a value."""
 
     def hear(self, event: Event) -> None:
         """Remember an event of the trace."""
@@ -46,7 +48,9 @@ class Knowledge:
         self._sent_s = self._bench.now_s()
 
     def look(self, function: str, name: str) -> Any:
-        """Return what `function` says of `name` now, or None if that is unknown: a `fieldtwin.scenarios.expression.Look`."""
+        """Return the current value of `function` for `name`, or None if it is unknown: a
+        `fieldtwin.scenarios.expression.Look`.
+        """
         if name == "plc.late":
             return self._bench.late_ms() / 1000
         if name == "command_pending":
@@ -63,12 +67,12 @@ class Knowledge:
         return all(self._bench.reading(name) is not None for name in expression.names)
 
     def of_expression(self, expression: Expression) -> str:
-        """Return in words what is known of everything that the expression names."""
+        """Return in words the current values of all names in the expression."""
         late = [f"scans up to {self._bench.late_ms():.3g} ms late"] if expression.asks_lateness else []
         return "; ".join([*late, *([self.of(expression.names)] if expression.names else [])])
 
     def of(self, names: Iterable[str]) -> str:
-        """Return in words what is known of tags and variables. Other names are left out."""
+        """Return in words the current values of tags and variables. Other names are left out."""
         known = [name for name in dict.fromkeys(names) if name in self._known]
         return "; ".join(f"{name}: {self._in_words(name)}" for name in known)
 

@@ -1,4 +1,6 @@
-"""The last exchanges on the wire before a check failed, as lines for people: the evidence of a verdict that is not PASSED."""
+"""The last exchanges on the bus before a check failed, as lines for people: the evidence of a verdict that is not
+PASSED.
+"""
 
 from __future__ import annotations
 
@@ -9,16 +11,17 @@ from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.report.model import CheckResult, Verdict
 
 SECONDS = 5
-"""How long before the failed check an exchange may have ended and still be shown."""
+"""Longest time in seconds between the end of a shown exchange and the failed check."""
 MOST = 10
-"""Exchanges that are shown: the last ones. The first line says how many were left out."""
+"""Largest number of exchanges that are shown: the last ones. The first line says how many were left out."""
 
 
 def last_exchanges(exchanges: Iterable[Exchange], check: CheckResult, devices: Collection[str]) -> list[str]:
-    """Return what was on the wire in the last `SECONDS` until `check` was decided, a heading first, ordered by request.
+    """Return the exchanges on the bus in the last `SECONDS` until `check` was decided, a heading first, ordered by
+    request.
 
-    If the check is about `devices`, only their exchanges count. A check that names none of them, or whose devices were silent, is
-    shown with the exchanges of all devices. Values of secret tags stay hidden, as in every decoded text.
+    If the check is about `devices`, only their exchanges are shown. If it names none of them, or those devices were
+    silent, the exchanges of all devices are shown. Values of secret tags stay hidden, as in every decoded text.
     """
     at_ns = check.t_ns or 0
     near = [e for e in exchanges if e.t_ns <= at_ns and e.end_ns >= at_ns - SECONDS * NS_PER_S]
@@ -44,10 +47,12 @@ def line_of(exchange: Exchange) -> str:
 
 
 def deciding(checks: Sequence[CheckResult], verdict: Verdict) -> CheckResult | None:
-    """Return the check that gave a scenario its `verdict`, or None where it was not a check: nothing was expected at all."""
+    """Return the check that gave a scenario its `verdict`, or None if the reason was not a check, but that nothing was
+    expected.
+    """
     return next((check for check in checks if check.verdict is verdict and check.t_ns is not None), None)
 
 
 def _device_of(name: str, devices: Collection[str]) -> str:
-    """Return the device that a check's name (DEVICE, DEVICE.TAG or PROGRAM.VARIABLE) belongs to, "" for none."""
+    """Return the device to which a check's name (DEVICE, DEVICE.TAG or PROGRAM.VARIABLE) belongs; "" if there is none."""
     return next((part for part in (name, name.rpartition(".")[0]) if part in devices), "")

@@ -1,8 +1,9 @@
-"""What a host that was late means for a deadline.
+"""How a late host affects a deadline.
 
-Off virtual time the system under test and its judge share a host. The judge measures by how much its own sleeps ended too late:
-that is the host alone, and it is subtracted. A reaction that came later than that, but within all lateness that was seen (answers
-that took long, scans that began late), proves nothing: that may be the host or the system. One that is later still has failed.
+Outside virtual time, the system under test and the test runner share a host. The runner measures by how much its own
+sleeps ended too late: only the host can cause that, and it is subtracted. A reaction that came later than that, but
+within all lateness that was observed (slow answers, late scans), proves nothing: the host or the system may be the
+cause. A reaction that is later still has failed.
 """
 
 from __future__ import annotations
@@ -14,15 +15,18 @@ from fieldtwin.scenarios.bench import Bench, Can
 from fieldtwin.scenarios.expression import Expression
 
 BUDGET = 2.0
-"""The time budget of a late host: a check takes at most so many times its own time longer. After that nobody knows."""
+"""The time budget of a late host: a check takes at most this many times its own time longer. After that it is
+INCONCLUSIVE.
+"""
 LOOK_S = 0.03
-"""A reaction is seen by the next look, and later than it was."""
+"""The interval in seconds after which a reaction is seen at the latest, because checks look periodically."""
 
 
 @dataclass(frozen=True)
 class Allowance:
-    """Of one deadline, in seconds: `own_s` is subtracted; until `any_s` the judge waits. `exhausted`: the host was later than the
-    budget. `applies`: whether lateness can be subtracted from this check at all."""
+    """The allowance for one deadline, in seconds: `own_s` is subtracted, and the runner waits until `any_s`.
+    `exhausted`: the host was later than the budget. `applies`: whether lateness can be subtracted from this check at
+    all."""
 
     limit_s: float = 0.0
     own_s: float = 0.0
@@ -31,15 +35,15 @@ class Allowance:
     applies: bool = False
 
     def in_time(self, took_s: float) -> bool:
-        """Whether a reaction after `took_s` was in time, the host's own lateness subtracted."""
+        """Return whether a reaction after `took_s` was in time, after subtracting the host's own lateness."""
         return not self.applies or took_s <= self.limit_s + self.own_s + LOOK_S
 
 
 def allowance(bench: Bench, since_s: float, limit_s: float, expressions: Iterable[Expression] = ()) -> Allowance:
-    """Of a deadline of `limit_s` seconds that runs since `since_s`.
+    """Return the allowance for a deadline of `limit_s` seconds that began at `since_s`.
 
-    Nothing is subtracted on a plant, which answers for its own lateness, nor from a check that asks how late scans are, nor where
-    an expression names a time itself (``age(T) <= 2 s``): that time cannot be prolonged.
+    Nothing is subtracted on a plant, which is responsible for its own lateness, nor from a check of the lateness of
+    scans, nor if an expression contains a time itself (``age(T) <= 2 s``): that time cannot be prolonged.
     """
     named = any(one.asks_lateness or one.times_s for one in expressions)
     if named or limit_s <= 0 or bench.target == "real" or Can.EXACT_TIME in bench.can:

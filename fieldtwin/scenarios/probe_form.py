@@ -1,9 +1,9 @@
-"""``probes:`` of a scenario: registers of any controller that are watched through Modbus, under names for expressions.
+"""``probes:`` of a scenario: registers of any controller that are read over Modbus, under names for expressions.
 
     probes:
       crane: {endpoint: "tcp://192.0.2.7:502", unit: 1, every: 200ms, registers: {height: {at: 30001, type: float32}}}
 
-Registers are written as the tags of a device profile (docs/files.md); they are read, never written.
+Registers are written like the tags of a device profile (docs/files.md); they are read, never written.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ _VARIABLE = re.compile(r"\$\{([A-Za-z_][A-Za-z0-9_]*)\}")
 
 
 class ProbeForm(BaseModel):
-    """A probe. `endpoint`, in which ``${NAME}`` stands for a variable of the environment, or `serve`: what the system's own
-    gateway serves under that name."""
+    """A probe. `endpoint` may contain ``${NAME}`` for an environment variable. `serve` is used instead of it to read
+    what the system's own gateway serves under that name."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
@@ -44,7 +44,7 @@ class ProbeForm(BaseModel):
 
 @dataclass(frozen=True)
 class Probe:
-    """A probe, checked. Its registers are the tags of `profile`; an expression calls them ``NAME.REGISTER``."""
+    """A checked probe. Its registers are the tags of `profile`; expressions name them ``NAME.REGISTER``."""
 
     name: str
     profile: DeviceProfile
@@ -54,10 +54,12 @@ class Probe:
     every_s: float
     timeout_s: float
     written: str = ""
-    """The endpoint as it is written, where it names variables of the environment: `at` says where it is then."""
+    """The endpoint as written, if it contains environment variables; `at` resolves it."""
 
     def at(self, environ: Mapping[str, str]) -> Probe:
-        """The probe, its endpoint resolved. Raises `UsageError` for a variable that is not set, and for what is no endpoint."""
+        """Return the probe with its endpoint resolved. Raises `UsageError` for an unset variable or an invalid
+        endpoint.
+        """
         if not self.written:
             return self
         where = f"the probe {self.name!r}"
@@ -76,7 +78,9 @@ class Probe:
 
 
 def read_probe(file: YamlFile, name: str, form: ProbeForm, served: list[str]) -> Probe:
-    """Raises `FileInvalid` at what is wrong. `served` are the names of what the system serves."""
+    """Check a probe. Raises `FileInvalid` with the place of the error. `served` are the names of what the system
+    serves.
+    """
     loc: tuple[Key, ...] = ("probes", name)
     if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
         raise file.error(loc, "a probe's name", expected="small letters, digits and _", got=name)
@@ -112,7 +116,7 @@ def _modbus(endpoint: Endpoint, where: str) -> Endpoint:
 
 
 def _profile(file: YamlFile, loc: tuple[Key, ...], name: str, form: ProbeForm) -> DeviceProfile:
-    """The registers as a profile of their own, whose every line stands in the scenario."""
+    """Return the registers as a separate profile, whose positions refer to the scenario file."""
     data = {
         "device": f"probe/{name.replace('_', '-')}",
         "source": "a scenario",

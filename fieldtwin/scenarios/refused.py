@@ -1,8 +1,8 @@
-"""The always-on check of a scenario: no output of a program is refused. A scenario names the tags for which it expects otherwise.
+"""The always-on check of a scenario: no output of a program is refused, except for the tags that the scenario names.
 
-A refusal breaks the check where the program or the configuration is wrong (a value outside its limits, a tag that may not be
-written) and, until the scenario has put a fault in, where the device refused. What is refused by design (a read-only plant), what
-is tried again and what a client asked for breaks nothing; traces and reports show it.
+A refusal breaks the check if the program or the configuration is wrong (a value outside its limits, a tag that may not
+be written). Until the scenario has injected a fault, a refusal by the device breaks it too. A refusal by design (a
+read-only plant), a write that is tried again and a client's request break nothing; traces and reports show them.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ MOST_TOLD = 10
 
 
 class RefusedOutputs:
-    """The check of one scenario: it hears the trace's events; `look` returns what breaks it now."""
+    """The check of one scenario: it takes the trace's events, and `look` returns what breaks it now."""
 
     def __init__(self, scenario: Scenario) -> None:
         self._scenario = scenario
         self._allowed = tuple(scenario.form.refused)
         self._disturbed = False
-        """Whether the scenario has put in a fault: from then on a device may refuse."""
+        """Whether the scenario has injected a fault: from then on a device may refuse."""
         self._seen: Counter[str] = Counter()
         """Refusals by tag, of those that could break the check."""
         self._broken: Violation | None = None
@@ -34,7 +34,7 @@ class RefusedOutputs:
         """The first refusal of each tag and cause that does not break the check."""
 
     def hear(self, event: Event) -> None:
-        """An event of the trace."""
+        """Process an event of the trace."""
         if event.kind is Kind.FAULT:
             self._disturbed = True
         if event.kind is not Kind.REFUSED:
@@ -50,11 +50,13 @@ class RefusedOutputs:
             self._broken = Violation(NUMBER, EXPECTED, got, (event.where,), 0.0, event.t_ns / 1e9, place)
 
     def look(self) -> Violation | None:
-        """The first refusal that breaks the check; None while nothing does."""
+        """Return the first refusal that breaks the check; None if there is none."""
         return self._broken
 
     def results(self, now_ns: int) -> list[CheckResult]:
-        """A check for each tag whose refusal the scenario expects, and one that tells of the refusals that break no rule."""
+        """Return a check for each tag whose refusal the scenario expects, and one that lists the refusals that break no
+        rule.
+        """
         found = []
         if self._others:
             tags = tuple(dict.fromkeys(key.partition(" ")[0] for key in self._others))

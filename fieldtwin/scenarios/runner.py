@@ -1,7 +1,7 @@
-"""Runs a scenario on a bench: step after step, while what must always and never hold is looked at.
+"""Runs a scenario on a bench: step after step, while the rules of the whole run are checked.
 
-A step that fails ends the scenario; what comes behind it was not reached. It knows no target: what one cannot do is SKIPPED, what
-its host's lateness makes worthless INCONCLUSIVE, and neither ever passes.
+A step that fails ends the scenario; the later steps are not reached. The runner does not depend on the target: what a
+target cannot do is SKIPPED, what its host's lateness makes worthless is INCONCLUSIVE, and neither ever passes.
 """
 
 from __future__ import annotations
@@ -34,24 +34,26 @@ from fieldtwin.scenarios.whole_run import WholeRun
 from fieldtwin.scenarios.words import Expect, Step, word_of
 
 TICK_S = 0.02
-"""How often is looked while something is waited for."""
+"""Interval in seconds at which conditions are checked while the runner waits."""
 RECENT_S = 2.0
-"""How long ago the host's lateness may have been and still show in what is looked at now."""
+"""Seconds for which lateness of the host can still affect what is checked now."""
 KNOWN_WITHIN_S = 5.0
-"""How long an expression may take to become known when a step begins to look at it: programs have not run yet at the start."""
+"""Seconds that an expression may take to become known when a step begins to check it: programs have not run yet at the
+start.
+"""
 KEPT = 20_000
 LAST_WRITE_S = 0.25
-"""How long the gateway may take to write, or to refuse, what the PLC commanded, and to tell of it."""
+"""Seconds that the gateway may take to write, or to refuse, what the PLC commanded, and to report it."""
 LAST_REACTION_MOST_S = 2.0
-"""The longest time that a scenario goes on after its last step so that the PLC can react to what that step has seen."""
+"""The longest time in seconds for which a scenario continues after its last step, so that the PLC can react to it."""
 LATE_SHARE = 0.1
-"""A host that was late by more than this part of the time that a check is about has proved nothing."""
+"""If the host was late by more than this part of the time that a check is about, the check has proved nothing."""
 
 
 @dataclass
 class _Broken(Exception):
-    """A check that says no: the verdict, what was expected, what came. `bound_s`: the time that it is about, 0 for none;
-    `since_s`: from when on the host's lateness counts, where that is not the step's begin."""
+    """A check that does not hold: the verdict, the expected and the actual value. `bound_s` is the time that it is
+    about, 0 for none; `since_s` is the time from which the host's lateness counts, if that is not the step's start."""
 
     verdict: Verdict
     expected: str
@@ -61,19 +63,21 @@ class _Broken(Exception):
 
 
 class _RuleBroken(Exception):
-    """A rule of the whole run says no, during a step or after the last."""
+    """A rule of the whole run does not hold, during a step or after the last."""
 
     def __init__(self, rule: CheckResult) -> None:
         self.rule = rule
 
 
 def _wanted(what: str, within_s: float) -> str:
-    """Return what a step waits for, in words: ``ctd.pressure > 3 within 2 s``, or ``... now`` where it may take no time."""
+    """Return what a step waits for, in words: ``ctd.pressure > 3 within 2 s``, or ``... now`` if it may take no time."""
     return f"{what} within {within_s:g} s" if within_s else f"{what} now"
 
 
 def _too_late(expected: str, got: str, bound_s: float, allowed: Allowance) -> _Broken:
-    """A deadline that is over. Where the lateness of the host was waited for as well, the system is what failed."""
+    """Return the failure of a missed deadline. If the host's lateness has already been waited for, the system has
+    failed.
+    """
     if allowed.exhausted:
         return _Broken(
             Verdict.INCONCLUSIVE, expected, f"{got}; this host was late by itself for more than {allowed.any_s:.3f} s"
@@ -91,24 +95,25 @@ def gone(error: FieldtwinError, t_ns: int) -> CheckResult:
 
 
 def last_reaction_s(scenario: Scenario) -> float:
-    """Return how long the rules of the whole run are looked at after the last step, in seconds: two scans of the slowest task and
-    a write. Without it a step that is met at once would end the scenario before the PLC has reacted, and an output that is
-    refused then would never be seen."""
+    """Return how long the rules of the whole run are checked after the last step, in seconds: two scans of the slowest
+    task and a write. Otherwise a step that is met at once would end the scenario before the PLC has reacted, and the
+    refusal of its output would never be seen."""
     plc = scenario.system.plc
     cycles_ms = [task.interval_ms for task in plc.tasks.values() if task.interval_ms is not None]
     return min(LAST_REACTION_MOST_S, 2 * max(cycles_ms, default=plc.cycle_ms) / 1000 + LAST_WRITE_S)
 
 
 def fault_id(n: int, step: Step) -> str:
-    """Return the id of the fault that step `n` (from 0) puts in."""
+    """Return the id of the fault that step `n` (from 0) injects."""
     assert step.fault is not None
     return str(step.fault.get("id") or f"step {n + 1}")
 
 
 @dataclass(frozen=True)
 class ByChance:
-    """Random faults of a campaign, put in before the first step. The steps then only drive the system: what they expect is not
-    judged, and neither are rates and cycles. All other rules are judged until `until_s` at least, in seconds of the run."""
+    """Random faults of a campaign, injected before the first step. The steps then only drive the system: their
+    expectations, rates and cycles are not judged. All other rules are judged at least until `until_s`, in seconds of
+    the run."""
 
     faults: tuple[dict[str, Any], ...]
     until_s: float
@@ -126,7 +131,7 @@ class Runner:
         self._decoder = Decoder(scenario.system)
         self._dropped = 0
         self._remark = ""
-        """What the verdict of the current step is to be read with."""
+        """A remark on the verdict of the current step."""
         self._stimulus_s = 0.0
         self._by_chance = by_chance
         self._knowledge = Knowledge(scenario.system, scenario.known, bench)
@@ -135,12 +140,12 @@ class Runner:
         self._whole = WholeRun(scenario, bench, self._knowledge, self._invariants, by_chance=by_chance is not None)
         self._refused = RefusedOutputs(scenario)
         bench.trace.listen(self._on_event)
-        for event in bench.trace.events:  # of the look when the bench opened, before the first step
+        for event in bench.trace.events:  # events from the opening of the bench, before the first step
             if event.kind is Kind.REFUSED:
                 self._refused.hear(event)
 
     async def run(self) -> ScenarioResult:
-        """Run all steps and return the verdict. A part of the system that is gone makes it an ERROR with that reason."""
+        """Run all steps and return the verdict. If a part of the system is gone, the verdict is ERROR with that reason."""
         scenario = self.scenario
         refused = refusal(scenario, self.bench.target, self.bench.can, self.bench.allowed)
         verdict, reason = Verdict.PASSED, ""
@@ -148,7 +153,7 @@ class Runner:
             verdict, reason = Verdict.SKIPPED, refused
         else:
             verdict, reason = await self._judged()
-            if verdict is not Verdict.ERROR:  # else there may be nobody left to ask
+            if verdict is not Verdict.ERROR:  # after an ERROR the system may no longer answer
                 verdict, reason = await self._count_faults(verdict, reason)
         return result_of(
             scenario,
@@ -165,7 +170,9 @@ class Runner:
         )
 
     def _evidence(self, verdict: Verdict) -> tuple[str, ...]:
-        """Return what was on the wire before the check that gave the scenario a `verdict` that is no pass."""
+        """Return the exchanges on the bus before the check that gave the scenario its `verdict`; none after a pass or a
+        skip.
+        """
         check = deciding(self.results, verdict)
         if verdict in (Verdict.PASSED, Verdict.SKIPPED) or check is None:
             return ()
@@ -177,7 +184,7 @@ class Runner:
     async def _judged(self) -> tuple[Verdict, str]:
         """Run the steps, then the whole-run rules to their end; return the verdict and its reason."""
         try:
-            for fault in self._by_chance.faults if self._by_chance is not None else ():  # each knows its time
+            for fault in self._by_chance.faults if self._by_chance is not None else ():  # each contains its own time
                 await self.bench.inject({**fault, "optional": True})
             for n, step in enumerate(self.scenario.form.steps):
                 result = await self._step(n, step)
@@ -194,7 +201,7 @@ class Runner:
         except NothingKnown as e:
             self.results.append(replace(gone(e, self._now_ns()), verdict=Verdict.INCONCLUSIVE))
             return Verdict.INCONCLUSIVE, str(e)
-        except FieldtwinError as e:  # the bench: a part of the system is gone
+        except FieldtwinError as e:  # raised by the bench: a part of the system is gone
             self.results.append(gone(e, self._now_ns()))
             return Verdict.ERROR, str(e)
 
@@ -274,7 +281,7 @@ class Runner:
         return result
 
     def _about(self, n: int, step: Step) -> tuple[str, ...]:
-        """The tags, variables or device that a step looks at; whatever came of it."""
+        """Return the tags, variables or device that a step checks, whatever its result."""
         if step.wait is not None:
             return tuple(self.scenario.expression(step.wait.until, "steps", n, "wait", "until").names)
         if step.expect is None:
@@ -284,7 +291,9 @@ class Runner:
         return (step.expect.wire or step.expect.tag or "",)
 
     def _judged_on_time(self, broken: _Broken, since_s: float) -> tuple[Verdict, str, str]:
-        """What is broken; where the host itself was late by a good part of the time that it is about, nobody knows."""
+        """Return the verdict on a broken check. If the host was late by a large part of the time that it is about, it
+        is INCONCLUSIVE.
+        """
         late_s = self.bench.host_late_s(since_s if broken.since_s is None else broken.since_s)
         if broken.verdict is Verdict.FAILED and broken.bound_s and late_s > LATE_SHARE * broken.bound_s:
             got = f"{broken.got}; but this host was {late_s * 1000:.0f} ms late by itself"
@@ -327,11 +336,13 @@ class Runner:
                 got = unknown + self._knowledge.of_expression(expression)
                 raise _too_late(_wanted(expression.text, within_s), got, self._bound(expression, within_s), allowed)
             await self._tick(deadline_s)
-        if self.bench.now_s() - unknown_until_s > TICK_S:  # else it was in time as soon as it was known
+        if self.bench.now_s() - unknown_until_s > TICK_S:  # otherwise it was in time as soon as it was known
             self._met(_wanted(expression.text, within_s), since_s, within_s, [expression])
 
     def _met(self, expected: str, since_s: float, within_s: float, expressions: Iterable[Expression] = ()) -> None:
-        """A check was met. After its own time that needs the lateness of this host as the reason."""
+        """Accept a check that was met. If it took longer than its own time, the lateness of this host must be the
+        reason.
+        """
         took_s = self.bench.now_s() - since_s
         if not within_s or took_s <= within_s:
             return
@@ -362,7 +373,8 @@ class Runner:
             said = judge_wire(expect, watched)
             if said is not None:
                 raise _Broken(Verdict.FAILED, *said, max(within_s, during_s))
-            if not self._whole.requests[expect.wire]:  # too few is no evidence on a wire that nobody has seen working
+            # Too few exchanges prove nothing if the bus was never seen working.
+            if not self._whole.requests[expect.wire]:
                 got = f"no exchange with {expect.wire} was seen since the start"
                 raise _Broken(Verdict.INCONCLUSIVE, f"exchanges with {expect.wire}", got)
             return
@@ -381,7 +393,7 @@ class Runner:
         self._met(_wanted(expect.tag, within_s), since_s, within_s)
         if expect.updates_per_s is None:
             end_s = self.bench.now_s() + during_s
-            while self.bench.now_s() < end_s:  # and it stays so
+            while self.bench.now_s() < end_s:  # the value must stay so
                 await self._tick(end_s)
                 if (said := await judge_tag(expect, watched)) is not None:
                     raise _Broken(Verdict.FAILED, *said, during_s)
@@ -399,7 +411,7 @@ class Runner:
         self._looked_all_the_time(end_s - during_s, during_s)
 
     def _looked_all_the_time(self, since_s: float, during_s: float) -> None:
-        """What lasts must have been looked at: not while this host did something else."""
+        """A lasting condition must have been checked all the time: raise if this host was late meanwhile."""
         late_s = self.bench.host_late_s(since_s)
         if during_s and late_s > LATE_SHARE * during_s:
             raise _Broken(
@@ -410,7 +422,7 @@ class Runner:
 
     @staticmethod
     def _bound(expression: Expression, limit_s: float = 0.0) -> float:
-        """The shortest time that a check is about."""
+        """Return the shortest time that a check is about."""
         return min([t for t in (limit_s, *expression.times_s) if t > 0], default=0.0)
 
     # -- time, and what holds all the time --------------------------------------------------------------------------------
@@ -424,7 +436,7 @@ class Runner:
         self._look_at_all()
 
     def _look_at_all(self) -> None:
-        """Look at the rules of the whole run. Raises `_RuleBroken`."""
+        """Check the rules of the whole run. Raises `_RuleBroken`."""
         said = self._standing.look() or self._refused.look() or self._whole.look()
         if said is None:
             return
@@ -448,7 +460,9 @@ class Runner:
         )
 
     def _of_lateness(self, asked: bool) -> Verdict:
-        """The verdict on a check that asks how late scans are: a plant answers for it, a host that plays one does not."""
+        """Return the verdict on a check of the lateness of scans: a plant is responsible for it, a host that simulates
+        one is not.
+        """
         ours = asked and Can.EXACT_TIME not in self.bench.can and self.bench.target != "real"
         return Verdict.INCONCLUSIVE if ours else Verdict.FAILED
 
@@ -460,7 +474,7 @@ class Runner:
         standing = self._standing.results(now_ns, self._whole.requests)
         for rule in (*standing, *self._refused.results(now_ns), *self._whole.results(now_ns)):
             self.results.append(rule)
-            if rule.vacuous and self._by_chance is not None:  # the campaign asks whether any of its seeds judged it
+            if rule.vacuous and self._by_chance is not None:  # the campaign checks whether any of its seeds judged it
                 continue
             if rule.verdict is not Verdict.PASSED and verdict is not Verdict.FAILED:
                 verdict, reason = rule.verdict, f"{rule.number}: {rule.text}: {rule.got}"
@@ -474,7 +488,7 @@ class Runner:
         return verdict, reason
 
     def _judges(self) -> bool:
-        """Whether anything in it could have failed."""
+        """Return whether anything in the scenario could have failed."""
         form = self.scenario.form
         if self._invariants:
             return True

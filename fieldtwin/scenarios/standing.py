@@ -1,7 +1,8 @@
-"""What a scenario requires of the whole run besides its steps: `always`, `never`, and that every part of the system runs.
+"""The rules of a scenario for the whole run besides its steps: `always`, `never`, and that every part of the system
+runs.
 
-These rules are looked at whenever the runner looks. A rule that is unknown is neither kept nor broken: a rule that was never
-known, or was unknown for a while after it was known, is INCONCLUSIVE at the end.
+These rules are checked whenever the runner looks. A rule that is unknown is neither kept nor broken: a rule that was
+never known, or was unknown for a while after it was known, is INCONCLUSIVE at the end.
 """
 
 from __future__ import annotations
@@ -24,7 +25,9 @@ from fieldtwin.scenarios.words import WireForm
 
 
 class Standing:
-    """The standing rules of one scenario. `look` returns the first that is broken now; `results` is asked once, at the end."""
+    """The standing rules of one scenario. `look` returns the first that is broken now; `results` is called once, at the
+    end.
+    """
 
     def __init__(self, scenario: Scenario, bench: Bench, knowledge: Knowledge, invariants: Invariants) -> None:
         form = scenario.form
@@ -45,7 +48,7 @@ class Standing:
         self._expressions += [always_rule(stated) for stated in invariants.stated]
 
     def saw(self, exchange: Exchange) -> None:
-        """Take an exchange that was seen on a device's wire."""
+        """Take an exchange that was seen on a device's bus."""
         for rule in self._wires:
             rule.watched.append(exchange)
 
@@ -73,17 +76,17 @@ class Standing:
 
 @dataclass
 class AlwaysRule:
-    """An expression that must always (`wanted` True) or never (False) be true, from when everything that it names was read."""
+    """An expression that must always (`wanted` True) or never (False) be true, as soon as all its names have been read."""
 
     number: str
     expression: Expression
     wanted: bool
     where: str
     since_s: float | None = None
-    """From when on it was judged."""
+    """Time from which it was judged."""
     looks: int = 0
     unknown_s: float | None = None
-    """When it was unknown for the first time after that."""
+    """Time at which it was unknown for the first time after that."""
     unknown_looks: int = 0
 
     def look(self, now_s: float, knowledge: Knowledge) -> Violation | None:
@@ -141,18 +144,19 @@ def always_rule(stated: Stated) -> AlwaysRule:
 
 @dataclass
 class _NeverOnWire:
-    """An exchange that must never be seen on a device's wire, unless an expression is true then."""
+    """An exchange that must never be seen on a device's bus, unless an expression is true at that time."""
 
     number: str
     form: WireForm
     unless: Expression | None
     where: str
     watched: deque[Exchange] = field(default_factory=deque)
-    """Seen since the last look."""
+    """Exchanges seen since the last look."""
     _excused: bool = False
 
     def look(self, now_s: float, knowledge: Knowledge) -> Violation | None:
-        # What was seen since the last look may be older than this moment: the excuse of either end counts, if it is known.
+        # An exchange may be older than this look: `unless` counts if it is known to be true at this look or the one
+        # before.
         now = self.unless is not None and self.unless.truth(knowledge.look) is True
         excused, self._excused = now or self._excused, now
         while self.watched:
@@ -182,7 +186,7 @@ class _NeverOnWire:
 
 
 class _Running:
-    """Every part of the system runs, except for those that the scenario says stop (`stopped:`), and these do stop."""
+    """The rule that every part of the system runs, except for those in `stopped:`, which must stop."""
 
     number = "running"
 
@@ -203,7 +207,7 @@ class _Running:
         return Violation(self.number, text, stopped.what, (), stopped.bound_s, now_s, stopped.where)
 
     def result(self, now_ns: int) -> CheckResult | None:
-        """Return None where the scenario says nothing of it and everything ran. A program that never started did not run."""
+        """Return None if the scenario has no `stopped:` and everything ran. A program that never started did not run."""
         waits = self._bench.not_started()
         if waits and "plc" not in self._may_stop:
             text = f"{_NAMES['plc']} runs"

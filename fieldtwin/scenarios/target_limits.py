@@ -1,4 +1,4 @@
-"""Whether a target can run a scenario, and whether the user allows it. Nothing is run to find out."""
+"""Checks whether a target can run a scenario, and whether the user permits it, without running anything."""
 
 from __future__ import annotations
 
@@ -16,7 +16,9 @@ NO_FRESH_START = (
 
 
 def refusal(scenario: Scenario, target: str, can: Collection[Can], allowed: Danger) -> str:
-    """Why a target cannot do what the scenario is made of, or may not have it done to it; empty when all is well."""
+    """Return why a target lacks a capability for the scenario, or why its impact level is not permitted; empty if all
+    is well.
+    """
     lacking = [need.value for need in scenario.needs if need not in can]
     if lacking:
         steps = [

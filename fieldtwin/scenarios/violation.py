@@ -1,4 +1,4 @@
-"""A rule of a scenario that was broken, with the moment that it was broken at."""
+"""A broken rule of a scenario, with the time at which it was broken."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Violation:
-    """A broken rule. `since_s`: when the time that it looked at began; `where`: the rule's file and line, or that of the logic
-    that failed. `bound_s`: the time that the rule is about; a host that was late by a part of it has proved nothing."""
+    """A broken rule. `since_s` is the start of the time that it checked; `where` is the rule's file and line, or that
+    of the logic that failed. `bound_s` is the time that the rule is about: if the host was late by a part of it,
+    nothing is proved."""
 
     number: str
     expected: str
@@ -19,4 +20,4 @@ class Violation:
     where: str = ""
     asks_lateness: bool = False
     nobody_knows: bool = False
-    """The host was late, and whether the rule is broken cannot be told."""
+    """The host was late, so it cannot be decided whether the rule is broken."""

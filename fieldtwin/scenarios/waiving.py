@@ -1,6 +1,6 @@
 """Waivers of scenarios, in the form of `fieldtwin.conformance.waivers`.
 
-The id is a file's name without .scenario.yaml, or what the scenario calls itself.
+The id is a file's name without .scenario.yaml, or the name in the scenario.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ _WAIVED = "waived: "
 
 
 def ids_of(path: Path, name: str) -> tuple[str, str]:
-    """What a waiver may call a scenario."""
+    """Return the ids that a waiver may use for a scenario."""
     return case_of(path), name
 
 
 def waive(result: ScenarioResult, waivers: Waivers, today: date) -> ScenarioResult:
-    """Under its waiver a failure is SKIPPED, and says why; under one that expired everything is a failure."""
+    """Apply a waiver: a waived failure is SKIPPED, with the reason; under an expired waiver every result is a failure."""
     waiver = waivers.of(*ids_of(Path(result.file), result.name))
     if waiver is None:
         return result
@@ -38,7 +38,7 @@ def waive(result: ScenarioResult, waivers: Waivers, today: date) -> ScenarioResu
 
 
 def all_well(results: Iterable[ScenarioResult]) -> bool:
-    """Whether every scenario passed, or failed under a waiver, and one at least passed."""
+    """Return whether every scenario passed, or failed under a waiver, and at least one passed."""
     found = list(results)
     waived = [r.verdict is Verdict.SKIPPED and r.reason.startswith(_WAIVED) for r in found]
     passed = [r.verdict is Verdict.PASSED for r in found]

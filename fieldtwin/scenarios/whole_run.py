@@ -1,7 +1,7 @@
-"""What a scenario wants of the whole run: one thing after another in time, rates, cycles. Looked at whenever the runner looks.
+"""The rules of a scenario for the whole run: sequences in time, rates, cycles. Checked whenever the runner looks.
 
-Pure: it is told the time, asks `look` what is known, and hears the trace's events. What is broken it says; who that ends is not
-its business.
+Pure: it gets the time, reads known values with `look`, and takes the trace's events. It reports broken rules; the
+caller decides what they end.
 """
 
 from __future__ import annotations
@@ -26,11 +26,13 @@ from fieldtwin.scenarios.violation import Violation
 from fieldtwin.scenarios.words import Cycle, Rate
 
 SAMPLES = 500
-"""Looks that a rate remembers: its windows begin that much apart at most."""
+"""Number of samples that a rate remembers; it is the resolution of its windows."""
 
 
 class WholeRun:
-    """All of them, of one scenario. `look` returns the first that is broken now; `results` is asked once, at the end."""
+    """All these rules of one scenario. `look` returns the first that is broken now; `results` is called once, at the
+    end.
+    """
 
     def __init__(
         self, scenario: Scenario, bench: Bench, knowledge: Knowledge, invariants: Invariants, *, by_chance: bool = False
@@ -62,19 +64,19 @@ class WholeRun:
             _Cycle(f"cycle {n}", scenario.line("cycle", n - 1), one, _condition(scenario, one, "cycle", n - 1))
             for n, one in enumerate(form.cycle, 1)
         ]
-        if by_chance:  # of a system that is disturbed at random
+        if by_chance:  # rates and cycles do not apply to a system with random faults
             self._rates, self._cycles = [], []
         self._bench = bench
         self._knowledge = knowledge
 
     def hear(self, event: Event) -> None:
-        """An event of the trace."""
+        """Process an event of the trace."""
         for cycle in self._cycles:
             cycle.hear(event)
 
     @property
     def pending_until_s(self) -> float:
-        """Until when the run must go on for every `within` to be decided; 0 when none is open."""
+        """Time until which the run must continue so that every `within` is decided; 0 if none is open."""
         return max((one.due_s for one in self.withins if one.due_s is not None), default=0.0)
 
     def look(self) -> Violation | None:
@@ -112,7 +114,7 @@ class WholeRun:
                 vacuous = rule.never_came
                 if (
                     vacuous and rule.invariant and rule.known
-                ):  # it stands for every run, and most do not see its occasion
+                ):  # it applies to every run, and `after` never comes true in most
                     verdict = Verdict.PASSED
             yield CheckResult(
                 rule.number, rule.text, verdict, now_ns, 0, got=got, where=rule.where, names=rule.names, vacuous=vacuous
@@ -130,10 +132,10 @@ def within_rule(followed: Followed) -> WithinRule:
 
 @dataclass
 class WithinRule:
-    """`then` within `limit_s` of each time that `after` becomes true.
+    """The rule that `then` becomes true within `limit_s` of each time that `after` becomes true.
 
-    `then` must be seen to be true in time: unknown is not enough. If `after` was unknown for a while after it was known, an
-    occasion may have been missed, and the rule is INCONCLUSIVE.
+    `then` must be seen to be true in time: unknown is not enough. If `after` was unknown for a while after it was
+    known, an occasion may have been missed, and the rule is INCONCLUSIVE.
     """
 
     number: str
@@ -142,7 +144,7 @@ class WithinRule:
     then: Expression
     limit_s: float
     invariant: bool = False
-    """Whether it stands in the system file."""
+    """Whether it is an invariant of the system file."""
     times: int = 0
     due_s: float | None = None
     _before: bool | None = None
@@ -210,7 +212,7 @@ class WithinRule:
 
 @dataclass
 class _Rate:
-    """So often a second, in every stretch of `over_s` in which the condition was true all the time."""
+    """A rate per second that must hold in every period of `over_s` in which the condition was true all the time."""
 
     number: str
     where: str
@@ -219,7 +221,7 @@ class _Rate:
     condition: Expression | None
     judged: int = 0
     seen: bool = False
-    """Whether the tag was ever published, or the device ever asked: else a rate of 0 is no evidence."""
+    """Whether the tag was ever published, or the device ever asked: otherwise a rate of 0 proves nothing."""
     _samples: deque[tuple[float, int]] = field(default_factory=lambda: deque(maxlen=SAMPLES * 2))
 
     @property
@@ -266,7 +268,7 @@ class _Rate:
 
 
 class _Cycle:
-    """Changes of a name so far apart; or scans so late at most."""
+    """The rule on the time between changes of a name, or on the lateness of scans."""
 
     def __init__(self, number: str, where: str, form: Cycle, condition: Expression | None) -> None:
         self.number = number
@@ -294,13 +296,14 @@ class _Cycle:
     def hear(self, event: Event) -> None:
         if event.where != self.form.changes_of or event.kind not in (Kind.TAG, Kind.STATE):
             return
-        if event.kind is Kind.TAG and not self._read:  # what is read counts from now on, not what a program commands
+        # From the first read on, only the read values count, not commanded ones.
+        if event.kind is Kind.TAG and not self._read:
             self._read, self._value, self._last_s = True, None, None
             self._between.clear()
         elif event.kind is Kind.STATE and self._read:
             return
         value = event.data.get("value")
-        if value is None or value != value:  # unknown: a gap, and no change
+        if value is None or value != value:  # unknown: a gap, not a change
             self._value = self._last_s = None
             return
         if value == self._value:

@@ -1,4 +1,4 @@
-"""The words of a scenario file, and what may stand behind them: strict forms, which know no system."""
+"""The words of a scenario file and the forms of their contents: strict, and independent of any system."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ class _Form(BaseModel):
 
 
 class Send(_Form):
-    """The far end commands a period."""
+    """Send: the remote client commands a period."""
 
     from_: str = Field(default="shore", alias="from")
     period_s: int
 
 
 class Set(_Form):
-    """A device holds a value: DEVICE.TAG; null: what it says by itself again."""
+    """Set: a device holds a value for DEVICE.TAG; null ends that."""
 
     tag: str
     value: Number | bool | str | None
@@ -41,7 +41,7 @@ class Bounds(_Form):
 
 
 class WireForm(_Form):
-    """What is seen on a device's wire."""
+    """A pattern of exchanges on a device's bus."""
 
     wire: str
     access: Literal["read", "write"] | None = None
@@ -52,7 +52,7 @@ class WireForm(_Form):
 
 
 class Expect(_Form):
-    """One thing that must be so. `tag` and its kin, or `wire` and its kin, or `that`."""
+    """One expectation: `tag` and its keys, or `wire` and its keys, or `that`."""
 
     tag: str | None = None
     value: Number | bool | str | None = None
@@ -72,7 +72,7 @@ class Expect(_Form):
 
 
 class Step(_Form):
-    """One of these."""
+    """A step: exactly one of these keys."""
 
     send: Send | None = None
     set: Set | None = None
@@ -84,7 +84,7 @@ class Step(_Form):
 
 
 class Within(_Form):
-    """Each time that `after` becomes true, `then` is so `within` a time."""
+    """Each time that `after` becomes true, `then` must become true `within` a time."""
 
     after: str
     then: str
@@ -92,7 +92,7 @@ class Within(_Form):
 
 
 class Rate(_Form):
-    """How often a tag is published, or a device asked, in any stretch of `over`; `while` says when it counts."""
+    """How often a tag is published, or a device asked, in any period of `over`; `while` says when it counts."""
 
     tag: str | None = None
     updates_per_s: Bounds | None = None
@@ -103,7 +103,7 @@ class Rate(_Form):
 
 
 class Cycle(_Form):
-    """How far apart the changes of a tag or variable are; or, without one, how late a scan of the PLC may begin."""
+    """The time between changes of a tag or variable; or, without one, how late a scan of the PLC may begin."""
 
     changes_of: str | None = None
     min: Time | None = None
@@ -120,11 +120,11 @@ class ScenarioForm(_Form):
     prototype: str | None = None
     seed: int | None = None
     start: Literal["fresh"] | None = None
-    """PLC, simulations and devices begin anew first, on every target."""
+    """Restart PLC, simulations and devices first, on every target."""
     needs: list[str] = []
     stopped: list[Literal["plc"]] = []
-    """Parts of the system that stop in this scenario. Without it a part that stops fails the scenario; with it, a part that does
-    not stop."""
+    """Parts of the system that stop in this scenario. Without it, a part that stops fails the scenario; with it, a part
+    that does not stop."""
     always: list[str] = []
     never: list[str | WireForm] = []
     within: list[Within] = []
@@ -133,7 +133,7 @@ class ScenarioForm(_Form):
     refused: list[str] = []
     """Tags whose outputs are expected to be refused, each at least once. Any other refused output fails the scenario."""
     judge: Literal["run"] | None = None
-    """Besides, by what a run in virtual time is judged by."""
+    """Also apply the checks of a `run` in virtual time."""
     probes: dict[str, ProbeForm] = {}
     steps: list[Step] = Field(min_length=1, max_length=10_000)
 
@@ -142,5 +142,5 @@ WORDS = ("send", "set", "fault", "clear", "wait", "expect", "pause")
 
 
 def word_of(step: Step) -> str:
-    """Which of the words a step is."""
+    """Return the word of a step."""
     return next(word for word in WORDS if getattr(step, word) is not None)

@@ -227,15 +227,15 @@ class PtyEnd(ByteConnection):
         self._loop.remove_reader(self._master)
         self._loop.remove_writer(self._master)
         self._on_writable()
-        os.close(self._master)
-        os.close(self._spare)
-        self._master = self._spare = -1
-        self._reading = False
-        try:
+        try:  # before the port is closed: its number may be another program's at once
             if os.readlink(self.link) == self.device:
                 self.link.unlink()
         except OSError:
             pass  # gone already, or no link any more: not ours to remove
+        os.close(self._master)
+        os.close(self._spare)
+        self._master = self._spare = -1
+        self._reading = False
 
 
 def _make_raw(descriptor: int, pace: SerialSettings | None) -> None:

@@ -11,7 +11,7 @@ from fieldtwin.gateway.core.errors import SdoAborted
 
 
 class Abort(IntEnum):
-    """All codes of the standard. Some only a device can have a reason for: `NodeContext.refusals` gives them."""
+    """All codes of the standard. Some have a cause only in a real device: `NodeContext.refusals` can raise them."""
 
     TOGGLE = 0x05030000
     TIMEOUT = 0x05040000
@@ -82,11 +82,11 @@ MEANINGS = {
 
 
 def abort(index: int, subindex: int, code: Abort) -> SdoAborted:
-    """The error that refuses access to an object, for ``raise abort(...)``."""
+    """Return the error that refuses access to an object, for ``raise abort(...)``."""
     return SdoAborted(index, subindex, int(code), MEANINGS[code], where="emulated node")
 
 
 def abort_frame(error: SdoAborted) -> bytes:
-    """The 8 bytes that abort a transfer."""
+    """Return the 8 bytes that abort a transfer."""
     mux = error.index.to_bytes(2, "little") + bytes([error.subindex])
     return b"\x80" + mux + error.code.to_bytes(4, "little")

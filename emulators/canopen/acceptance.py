@@ -1,8 +1,8 @@
-"""Which frames a node's CAN controller lets in: the acceptance filter that every real one has in hardware.
+"""The acceptance filter of a node's CAN controller, which every real controller has in hardware.
 
-On a bus with a hundred nodes almost every frame is somebody else's. It must never say no to what the node would act on: all
-identifiers that stand in the communication objects pass, those that the node sends on as well (another sender there is an
-error), and so does what is no plain identifier.
+On a bus with a hundred nodes, almost all frames concern other nodes. The filter must never reject a frame that the node
+would act on. It passes all identifiers in the communication objects, including those on which the node sends (a second
+sender there is an error), and all extended and error frames.
 """
 
 from __future__ import annotations
@@ -19,7 +19,10 @@ _CONSUMER_HEARTBEAT = 0x1016
 
 
 class Acceptance:
-    """Called with a frame: whether to let it in. Follows every change of the communication objects and of the node id."""
+    """Called with a frame; returns whether the node receives it.
+
+    It follows changes of communication objects and of the node ID.
+    """
 
     def __init__(self, core: Core) -> None:
         self._core = core

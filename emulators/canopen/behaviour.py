@@ -1,10 +1,11 @@
-"""What a device does behind its objects: the seam between a node (bytes by index) and a device model (numbers).
+"""The interface between a node (bytes by index) and a device model (numbers).
 
-A `DeviceModel` is a function of time: given the moment, what was played and what clients wrote, it says what the device's
-objects hold and when it wants to be asked again. It must never know frames, SDO or PDOs; the node must never know drives.
+A `DeviceModel` is a function of time: from the time, the played values and the values that clients wrote, it determines
+the values of the device's objects and when it must be called again. It must never know frames, SDO or PDOs; the node
+must never know drives.
 
-What a recording plays for an object is what the device gave **with its factory settings**. A model makes of it what the
-device gives with the live ones; an object that the model does not speak of passes through.
+A recording plays the value that the device gave **with its factory settings**. A model converts it to the value that
+the device gives with the live settings. Objects that the model does not mention are passed through.
 """
 
 from __future__ import annotations
@@ -34,29 +35,32 @@ class Objects:
         return self._data.has(index, subindex)
 
     def number(self, index: int, subindex: int = 0, default: Number = 0) -> Number:
-        """The live value; `default` where the node has no such object."""
+        """Return the live value, or `default` if the node has no such object."""
         number = self._data.decoded((index, subindex))
         return default if number is None else number
 
     def whole(self, index: int, subindex: int = 0, default: int = 0) -> int:
-        """The live value of an integer object."""
+        """Return the live value of an integer object."""
         number = self._data.decoded((index, subindex))
         return int(default if number is None else number)
 
     def factory(self, index: int, subindex: int = 0, default: Number = 0) -> Number:
-        """The value that the device left the factory with."""
+        """Return the factory value of the object."""
         entry = self._data.dictionary.entry(index, subindex)
         return default if entry is None else codec.decode(entry.data_type, self._data.factory(index, subindex))
 
     def channels(self, index: int) -> list[int]:
-        """The subindices of an array above 0."""
+        """Return the subindices of an array above 0."""
         found = self._data.dictionary.objects.get(index)
         return sorted(sub for sub in found.entries if sub) if found else []
 
 
 class Situation(msgspec.Struct, frozen=True):
-    """What a model is told. `written` are the objects that SDO clients or RPDOs wrote just now, changed or not; `errors` the
-    EMCY codes that are present in the node, whoever raised them."""
+    """The input of a model.
+
+    `written` are the objects that SDO clients or RPDOs wrote just now, changed or not; `errors` are the EMCY codes that
+    are present in the node, whatever raised them.
+    """
 
     now_ns: int
     objects: Objects
@@ -67,10 +71,12 @@ class Situation(msgspec.Struct, frozen=True):
 
 
 class Outcome(msgspec.Struct, frozen=True):
-    """What a model answers. Objects that the node does not have are left out, numbers are rounded and held within their type.
+    """The output of a model. Objects that the node does not have are ignored; numbers are rounded and limited to their
+    type.
 
-    A change of one of `states` is an event for the TPDOs that map it; `readings` change all the time and are none.
-    `clears` are EMCY codes whose errors are over. `wake_at_ns` is when to be asked next, None for not by itself.
+    A change of one of `states` is an event for the TPDOs that map it; `readings` change all the time and are not
+    events. `clears` are EMCY codes whose errors are over. `wake_at_ns` is the time of the next call, None if no call is
+    needed.
     """
 
     states: Mapping[Key, Number] = msgspec.field(default_factory=dict)
@@ -80,27 +86,33 @@ class Outcome(msgspec.Struct, frozen=True):
 
 
 class DeviceModel(ABC):
-    """A device behind its objects. Pure: whatever it needs is in the `Situation`."""
+    """A model of the device behind the objects. Pure: all inputs are in the `Situation`."""
 
     @abstractmethod
     def power_on(self, situation: Situation) -> None:
-        """The device starts: power-on, or NMT reset node. Objects have their power-on values."""
+        """Start the device: power-on, or NMT reset node. Objects have their power-on values."""
 
     def refuse(self, key: Key, value: Number, objects: Objects) -> Abort | None:
-        """Whether an SDO client may write `value`: the abort code if not. Length and limits of the data sheet hold already."""
+        """Return the abort code if an SDO client may not write `value`, else None.
+
+        Length and limits have been checked before.
+        """
         return None
 
     @abstractmethod
     def step(self, situation: Situation) -> Outcome:
-        """Bring the device to the moment. Asked when it wished, after writes, and before each reading; time never goes back."""
+        """Advance the device to the present time.
+
+        Called when it requested, after writes, and before each read; time never goes back.
+        """
 
 
 Distort = Callable[[Mapping[Key, bytes], int], dict[Key, bytes]]
-"""Given all that a device would hold now, and now_ns: what it holds instead. For faults."""
+"""Called with all values that the device would hold and now_ns; returns the values that it holds instead. For faults."""
 
 
 class Behaviour(Service):
-    """Runs a model inside a node. It is the node's source of values as well (see `service.Source`)."""
+    """Runs a model inside a node. It is also the node's source of values (see `service.Source`)."""
 
     def __init__(
         self, model: DeviceModel, source: Source | None, data: NodeData, distort: Distort | None = None
@@ -111,28 +123,28 @@ class Behaviour(Service):
         self._data = data
         self._objects = Objects(data)
         self.asks_at_ns = NEVER
-        """When the model wants to be asked next."""
+        """When the model must be called next."""
         self._numeric = {key: data_type for key, data_type in data.types.items() if codec.is_number(data_type)}
         self._encoders: dict[Key, Callable[[Number], bytes] | None] = {}
-        """By object, of those that the model spoke of; None for one that the node does not have."""
+        """Encoders by object, for objects that the model has mentioned; None for an object that the node does not have."""
         self._seen: tuple[int, ...] = ()
 
     def connect(self, core: Core, emergency: Emergency, changed: Callable[[Iterable[Key], int], None]) -> None:
-        """What the model's answers move. Once, before anything else."""
+        """Connect the parts of the node that the model's output changes. Call it once, before anything else."""
         self._core = core
         self._emergency = emergency
         self._changed = changed
 
     def __call__(self, now_ns: int) -> dict[Key, bytes]:
-        """The values of this moment, by the recording and by the model."""
+        """Return the present values, from the recording and the model."""
         return self._step(now_ns)
 
     def power_on(self, now_ns: int) -> None:
-        """Reset node: what was stored or left the factory is in the objects again."""
+        """Start the model after reset node: the objects have their stored or factory values again."""
         self._model.power_on(msgspec.structs.replace(self._situation(now_ns, (), self._played(now_ns)), errors=()))
 
     def written(self, keys: Collection[Key], now_ns: int) -> None:
-        """An RPDO wrote these objects."""
+        """Process a write of these objects by an RPDO."""
         self._step(now_ns, keys)
 
     def owns(self, index: int) -> bool:
@@ -156,7 +168,9 @@ class Behaviour(Service):
 
     @property
     def due_ns(self) -> int:
-        """As `asks_at_ns`; at once when errors came or went since the last step, though nobody wakes the node for that."""
+        """Equals `asks_at_ns`, but is immediate if errors have appeared or gone since the last step, which does not
+        wake the node.
+        """
         return self.asks_at_ns if self._emergency.active == self._seen else 0
 
     def tick(self, now_ns: int) -> None:

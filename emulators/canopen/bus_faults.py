@@ -1,7 +1,7 @@
-"""What a node notices of its own CAN controller: error-passive, bus-off, overrun, and another node on its identifiers.
+"""CAN controller events that a node notices: error-passive, bus-off, overrun, and a second node on its identifiers.
 
-EMCY codes after CiA 301 v4.2, table 26: 8110h overrun, 8120h error-passive, 8140h recovered from bus-off, 8150h collision of
-identifiers. In bus-off a node can say nothing, so that 8140h is told afterwards.
+EMCY codes follow CiA 301 v4.2, table 26: 8110h overrun, 8120h error-passive, 8140h recovered from bus-off, 8150h
+collision of identifiers. A node in bus-off cannot send, so 8140h is sent afterwards.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _MUTE = "bus-off"
 
 
 class BusFaults(Service):
-    """Turns what the controller tells into silence, emergencies and the reaction of 1029h."""
+    """Turns events of the controller into silence, emergencies and the reaction of 1029h."""
 
     def __init__(self, core: Core, emergency: emcy.Emergency, react: ErrorReaction) -> None:
         self._core = core
@@ -28,12 +28,12 @@ class BusFaults(Service):
         self.state = CanErrorState.ACTIVE
 
     def reset(self, now_ns: int) -> None:
-        """What the controller is stays what it is; an error that goes on is told anew."""
+        """Keep the controller's state, and report an error that continues again."""
         if self.state is CanErrorState.PASSIVE:
             self._raise(PASSIVE, now_ns)
 
     def changed(self, state: CanErrorState, now_ns: int) -> None:
-        """The controller's state, told when it changes; told twice it means nothing, and a warning is no state of its own."""
+        """Process a change of the controller's state. A repeated state has no effect; a warning counts as error-active."""
         state = CanErrorState.ACTIVE if state is CanErrorState.WARNING else state
         before, self.state = self.state, state
         if state is before:
@@ -51,11 +51,14 @@ class BusFaults(Service):
             self._raise(PASSIVE, now_ns)
 
     def overrun(self, now_ns: int) -> None:
-        """Frames came faster than they were taken, and were lost."""
+        """Report that frames were lost because they came faster than they were taken."""
         self._emergency.report(OVERRUN, now_ns, register=emcy.COMMUNICATION)
 
     def heard(self, frame: CanFrame, now_ns: int) -> bool:
-        """A data frame. Returns whether it is on an identifier that only this node may use: an error until a reset."""
+        """Check a data frame.
+
+        Returns whether its identifier is reserved for this node: an error that lasts until a reset.
+        """
         node_id, emcy_id = self._core.node_id, self._core.data.number(0x1014, 0, 1 << 31)
         own = {ERROR_CONTROL + node_id, RESPONSE + node_id} | ({emcy_id} if emcy_id <= 0x7FF else set())
         if frame.can_id not in own:
@@ -64,7 +67,7 @@ class BusFaults(Service):
         return True
 
     def on_error_frame(self, frame: CanFrame, now_ns: int) -> None:
-        """An error frame of the node's own controller: the kernel's, or the software bus's."""
+        """Process an error frame of the node's own controller, from the kernel or the software bus."""
         if tells_overrun(frame):
             self.overrun(now_ns)
         state = told_state(frame)

@@ -1,6 +1,6 @@
-"""The object dictionary as an SDO client sees it: generic rules first, then what the object's service says.
+"""The object dictionary as an SDO client sees it: generic rules first, then those of the object's service.
 
-It must never know SDO's frames.
+It must never know SDO frames.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from fieldtwin.emulators.canopen.tpdo import Tpdos
 
 
 class ClientView:
-    """An `ObjectAccess` over the live values. `refusals` are objects that the device refuses for reasons of its own."""
+    """An `ObjectAccess` to the live values. `refusals` are objects that the device refuses for device-specific reasons."""
 
     def __init__(
         self, core: Core, services: Iterable[Service], tpdos: Tpdos, refusals: Mapping[Key, Abort] | None = None
@@ -25,7 +25,7 @@ class ClientView:
         self._refusals = dict(refusals or {})
 
     def add(self, service: Service) -> None:
-        """One more service to ask: that of the SDO servers, which stand on this view."""
+        """Add a service: that of the SDO servers, which are themselves built on this view."""
         self._services += (service,)
 
     def read(self, index: int, subindex: int, now_ns: int) -> bytes:

@@ -1,6 +1,6 @@
 """CANopen's basic data types as bytes: the emulator's own codec (CiA 301 v4.2, 7.1.6 and table 44).
 
-It must never be shared with a driver: a mistake made on both sides of a wire would cancel itself out.
+It must never be shared with a driver: a mistake on both sides of a link would cancel itself out.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ _SIGNED = {0x02: 8, 0x03: 16, 0x04: 32, 0x10: 24, 0x12: 40, 0x13: 48, 0x14: 56, 
 _UNSIGNED = {0x05: 8, 0x06: 16, 0x07: 32, 0x16: 24, 0x18: 40, 0x19: 48, 0x1A: 56, 0x1B: 64}
 _REAL = {REAL32: struct.Struct("<f"), REAL64: struct.Struct("<d")}
 _LETTERS = {1: "b", 2: "h", 4: "i", 8: "q"}
-"""What `struct` calls signed integers of so many bytes; in capitals the others."""
+"""The `struct` letter of signed integers by size in bytes; the capital letter is the unsigned one."""
 _TIME_BYTES = {0x0C: 6, 0x0D: 6}
 """TIME_OF_DAY and TIME_DIFFERENCE: 48 bits on the wire, opaque here."""
 
-# By data type: these are asked for with every value.
+# By data type, because they are needed for every value.
 _INTEGER_BYTES = {BOOLEAN: 1} | {data_type: bits // 8 for data_type, bits in (_SIGNED | _UNSIGNED).items()}
 _BYTES = _INTEGER_BYTES | _TIME_BYTES | {data_type: real.size for data_type, real in _REAL.items()}
 _RANGES = (
@@ -37,27 +37,27 @@ _RANGES = (
 
 
 def size_bytes(data_type: int) -> int | None:
-    """Bytes that a value of `data_type` takes in an SDO; None where each value has its own length."""
+    """Return the bytes that a value of `data_type` takes in an SDO; None if the length varies from value to value."""
     return _BYTES.get(data_type)
 
 
 def is_number(data_type: int) -> bool:
-    """Whether values have an order, so that limits mean something."""
+    """Return whether values have an order, so that limits are meaningful."""
     return data_type in _INTEGER_BYTES or data_type in _REAL
 
 
 def is_integer(data_type: int) -> bool:
-    """Whether it is one of the integer types or BOOLEAN."""
+    """Return whether it is one of the integer types or BOOLEAN."""
     return data_type in _INTEGER_BYTES
 
 
 def integer_range(data_type: int) -> tuple[int, int] | None:
-    """The smallest and largest value of an integer type or BOOLEAN; None for others."""
+    """Return the smallest and largest value of an integer type or BOOLEAN; None for other types."""
     return _RANGES.get(data_type)
 
 
 def decode(data_type: int, raw: bytes) -> int | float:
-    """The number in `raw`, which must have the type's size. Little endian, two's complement."""
+    """Return the number in `raw`, which must have the type's size. Little endian, two's complement."""
     if data_type in _REAL:
         value: float = _REAL[data_type].unpack(raw)[0]
         return value
@@ -65,9 +65,10 @@ def decode(data_type: int, raw: bytes) -> int | float:
 
 
 def encode(data_type: int, value: int | float) -> bytes:
-    """The bytes of a number. Raises `ValueError` when it does not fit.
+    """Return the bytes of a number. Raises `ValueError` if it does not fit.
 
-    A signed type also takes the unsigned reading of its bits (0xFFFF for -1): data sheets write defaults so.
+    A signed type also accepts the unsigned form of its bits (0xFFFF for -1), because data sheets write defaults that
+    way.
     """
     try:
         if data_type in _REAL:
@@ -82,9 +83,9 @@ def encode(data_type: int, value: int | float) -> bytes:
 
 
 def held_encoder(data_type: int) -> Callable[[int | float], bytes]:
-    """A function that makes bytes of numbers as a device does, whose registers saturate: rounded, and held within the type.
+    """Return an encoder that rounds numbers and limits them to the type, like a device whose registers saturate.
 
-    What is no number is 0 in an integer. Real types take what `encode` takes.
+    NaN becomes 0 in an integer. Real types accept what `encode` accepts.
     """
     bounds = integer_range(data_type)
     if bounds is None:
@@ -98,7 +99,7 @@ def held_encoder(data_type: int) -> Callable[[int | float], bytes]:
     def encode_held(number: int | float) -> bytes:
         try:
             whole = round(number)
-        except (OverflowError, ValueError):  # without bounds, or no number
+        except (OverflowError, ValueError):  # infinite, or not a number
             whole = 0 if math.isnan(number) else bounds[number > 0]
         return pack(low if whole < low else high if whole > high else whole)
 
@@ -106,7 +107,10 @@ def held_encoder(data_type: int) -> Callable[[int | float], bytes]:
 
 
 def parse_number(text: str) -> int:
-    """An integer as CiA 306 writes it: decimal, 0x hexadecimal, or octal with a leading zero. Raises `ValueError`."""
+    """Return an integer in the notation of CiA 306: decimal, 0x hexadecimal, or octal with a leading zero.
+
+    Raises `ValueError`.
+    """
     text = text.strip()
     if text.lower().startswith(("0x", "-0x", "+0x")):
         return int(text, 16)
@@ -117,9 +121,10 @@ def parse_number(text: str) -> int:
 
 
 def encode_text(data_type: int, text: str) -> bytes:
-    """The bytes of a value as an electronic data sheet writes it (without $NODEID). Raises `ValueError`.
+    """Return the bytes of a value as written in an electronic data sheet (without $NODEID). Raises `ValueError`.
 
-    An empty text is a type's zero, or the empty string. A time is a number of 48 bits, or its six octets as twelve digits.
+    An empty text is the type's zero, or the empty string. A time is a number of 48 bits, or its six octets as twelve
+    digits.
     """
     if data_type == VISIBLE_STRING:
         return text.encode("latin-1", "replace")
@@ -149,6 +154,8 @@ def _fit(value: int, size: int) -> bytes:
 
 def _hex_bytes(text: str) -> bytes:
     compact = text.replace(" ", "")
-    if compact.lower().startswith("0x"):  # written as a number: an odd digit is a nibble with its zero left out
+    if compact.lower().startswith(
+        "0x"
+    ):  # written as a number: with an odd number of digits the leading zero was omitted
         compact = compact[2:].zfill(len(compact[2:]) + len(compact) % 2)
     return bytes.fromhex(compact)

@@ -1,8 +1,8 @@
-"""PDOs that a data sheet has without describing them: ``CompactPDO`` of CiA 306-1 v1.4, 4.5.2.
+"""PDOs that a data sheet declares without describing them: ``CompactPDO`` of CiA 306-1 v1.4, 4.5.2.
 
-The mask says which subindices of the communication parameters the device has: bit 0 for subindex 1, and so on. As many PDOs
-as ``NrOfRXPDO`` and ``NrOfTXPDO`` say exist; those without sections of their own are made here, on the identifiers of the
-predefined connection set as far as it goes, with nothing mapped.
+The mask lists the subindices of the communication parameters that the device has: bit 0 for subindex 1, and so on.
+``NrOfRXPDO`` and ``NrOfTXPDO`` give the number of PDOs. Those without sections are created here without mapped objects,
+with the identifiers of the predefined connection set as far as it defines them.
 """
 
 from __future__ import annotations
@@ -17,14 +17,17 @@ _PARAMETERS = {1: ("COB-ID", _U32), 2: ("Transmission type", _U8), 3: ("Inhibit 
     6: ("SYNC start value", _U8),
 }
 _ROOM = 8
-"""Mapped objects at most: a PDO's 64 bits hold no more whole bytes."""
+"""Highest number of mapped objects: a PDO's 64 bits hold no more whole bytes."""
 _INVALID = 1 << 31
 _PREDEFINED = 4
 _MAX_PDOS = 512
 
 
 def implied_pdos(info: Section, objects: dict[int, DictionaryObject]) -> dict[int, DictionaryObject]:
-    """Communication and mapping parameters of the PDOs that have no section. Raises `FileInvalid` for impossible counts."""
+    """Return communication and mapping parameters of the PDOs that have no section.
+
+    Raises `FileInvalid` for impossible counts.
+    """
     mask = info.number("CompactPDO", 0)
     made: dict[int, DictionaryObject] = {}
     if not mask:

@@ -1,7 +1,7 @@
 """An electronic data sheet (EDS or DCF, CiA 306-1) as the emulated node's object dictionary: a frozen description.
 
-Read by code of our own: the gateway reads data sheets with the `canopen` package, and two readings of one file are
-worth more than one. It must never know live values (`fieldtwin.emulators.canopen.node_data`) nor the bus.
+It has its own parser: the gateway reads data sheets with the `canopen` package, and two independent readers reveal each
+other's mistakes. It must never know live values (`fieldtwin.emulators.canopen.node_data`) or the bus.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.core.input_file import read_input
 
 MAX_EDS_BYTES = 8 * 1024 * 1024
-"""An EDS or DCF file that is larger is a mistake; the largest one known has 2 MB."""
+"""A larger EDS or DCF file is a mistake; the largest known one has 2 MB."""
 MAX_DOMAIN_BYTES = 16 * 1024 * 1024
-"""Of a file that a DOMAIN object names as its content."""
+"""Maximum size of a file that a DOMAIN object names as its content."""
 _ACCESS = ("ro", "wo", "rw", "rwr", "rww", "const")
 _OBJECT = re.compile(r"[0-9a-f]{1,4}")
 _VALUES = re.compile(r"[0-9a-f]{4}value")
@@ -39,22 +39,23 @@ _RESERVED_TYPES = (0x00, 0x0E, 0x17)
 _BIT_RATES = (10, 20, 50, 125, 250, 500, 800, 1000)
 _LISTS = ("mandatoryobjects", "optionalobjects", "manufacturerobjects")
 _NAMED = 4
-"""Objects of a kind that a note names."""
+"""Most objects of one kind that a note names."""
 _NODE_ID = re.compile(r"\$nodeid", re.IGNORECASE)
 _RELATIVE = re.compile(r"\$nodeid(?:\+([0-9a-fx]+))?|([0-9a-fx]+)\+\$nodeid", re.IGNORECASE)
 """``$NODEID``, ``$NODEID+0x180`` and ``0x180+$NODEID`` (CiA 306-1, 4.6.3.2), without spaces."""
 _HIGHEST_NODE_ID = 127
 _FIRST_OBJECT = 0x1000
-"""Lower indices define data types (CiA 301, 7.4.1): no client reads them."""
+"""Lower indices define data types (CiA 301, 7.4.1), which clients do not read."""
 _LAST_TYPE = 0x1B
 
 
 @dataclass(frozen=True, slots=True)
 class Dictionary:
-    """What a device is by its data sheet. Never changed after reading, so that many nodes share one.
+    """A device as its data sheet describes it. It never changes after reading, so that many nodes can share it.
 
-    `node_id` and `bit_rate` (bit/s) are what a DCF commissions, 0 for an EDS. `dummies` are the data types that an RPDO may map
-    to nothing; `bit_rates` what the device can do, in bit/s, empty where the file does not say. `notes` is what was mended.
+    `node_id` and `bit_rate` (bit/s) are the values that a DCF commissions, 0 for an EDS. `dummies` are the data types
+    that an RPDO may map without an object; `bit_rates` are those that the device supports, in bit/s, empty if the file
+    does not list them. `notes` lists the corrections made while reading.
     """
 
     path: str
@@ -73,19 +74,21 @@ class Dictionary:
         return index in self.objects
 
     def entry(self, index: int, subindex: int) -> Entry | None:
-        """The entry, or None when there is none."""
+        """Return the entry, or None if it does not exist."""
         found = self.objects.get(index)
         return found.entries.get(subindex) if found else None
 
     def entries(self) -> Iterator[Entry]:
-        """All entries by index and subindex."""
+        """Return all entries, sorted by index and subindex."""
         for index in sorted(self.objects):
             yield from (self.objects[index].entries[sub] for sub in sorted(self.objects[index].entries))
 
 
 def load_eds(path: str | Path, *, parameter_values: bool = True) -> Dictionary:
-    """The dictionary in a file. Without `parameter_values` the node starts with the DefaultValues, as one that no DCF has
-    configured. Raises `FileInvalid` with path and line."""
+    """Return the dictionary in a file. Raises `FileInvalid` with path and line.
+
+    Without `parameter_values` the node starts with the DefaultValues, like a node that no DCF has configured.
+    """
     try:
         raw = read_input(Path(path), MAX_EDS_BYTES)
     except OSError as e:
@@ -102,15 +105,18 @@ def parse_eds(
     *,
     parameter_values: bool = True,
 ) -> Dictionary:
-    """The dictionary in the text of an EDS or DCF. `path` is for messages, `notes` are known already; what a DOMAIN's
-    DownloadFile names is looked for in `folder`. `parameter_values` as in `load_eds`. Raises `FileInvalid`."""
+    """Return the dictionary in the text of an EDS or DCF. Raises `FileInvalid`.
+
+    `path` is used in messages, `notes` are earlier notes; the file in a DOMAIN's DownloadFile is searched in `folder`.
+    `parameter_values` as in `load_eds`.
+    """
     notes = [] if notes is None else notes
     sections = parse_sections(text, path, notes)
     if not parameter_values:
         _forget_parameter_values(sections)
     objects: dict[int, DictionaryObject] = {}
     for name, section in sections.items():
-        # Short names such as [A0] describe data types, not objects that a client can reach.
+        # Short names such as [A0] describe data types, not objects that a client can access.
         if _OBJECT.fullmatch(name) and len(name) == 4 and int(name, 16) >= _FIRST_OBJECT:
             found = _read_object(int(name, 16), section, sections)
             if found is not None:
@@ -139,7 +145,7 @@ def parse_eds(
 
 
 def _forget_parameter_values(sections: dict[str, Section]) -> None:
-    """Leave out what a DCF adds to an EDS: ParameterValues, DownloadFiles and the values of compact arrays."""
+    """Remove what a DCF adds to an EDS: ParameterValues, DownloadFiles and the values of compact arrays."""
     for name in [name for name in sections if _VALUES.fullmatch(name)]:
         del sections[name]
     for section in sections.values():
@@ -148,7 +154,7 @@ def _forget_parameter_values(sections: dict[str, Section]) -> None:
 
 
 def _commissioning(sections: dict[str, Section]) -> Section | None:
-    """A DCF's section, which the standard spells with one m; tools write it both ways."""
+    """Return a DCF's commissioning section. The standard spells it with one m; tools use both spellings."""
     correct = sections.get("devicecommissioning")
     if correct is not None and "devicecomissioning" not in sections:
         correct.note("[DeviceCommissioning] taken as [DeviceComissioning], as CiA 306 spells it")
@@ -164,7 +170,7 @@ def _in_range(section: Section, key: str, most: int) -> int:
 
 
 def _check_lists(sections: dict[str, Section], objects: dict[int, DictionaryObject]) -> None:
-    """What the lists of objects and the counts of subindices say otherwise than the sections is noted; sections count."""
+    """Note where the lists of objects and the counts of subindices differ from the sections; the sections are used."""
     listed: set[int] = set()
     for name in _LISTS:
         section = sections.get(name)
@@ -188,7 +194,10 @@ def _check_lists(sections: dict[str, Section], objects: dict[int, DictionaryObje
 
 
 def _fill_domains(sections: dict[str, Section], objects: dict[int, DictionaryObject], folder: Path | None) -> None:
-    """A DOMAIN holds what a DCF would download to it (CiA 306, 4.7.3). A file that is not there is no reason to refuse: noted."""
+    """Fill each DOMAIN with the data that a DCF would download to it (CiA 306, 4.7.3).
+
+    A missing file is noted, not refused.
+    """
     for found in objects.values():
         for sub, entry in found.entries.items():
             section = sections.get(f"{found.index:04x}sub{sub:x}") or sections.get(f"{found.index:04x}")
@@ -226,7 +235,7 @@ def _read_object(index: int, section: Section, sections: dict[str, Section]) -> 
         return None
     entries: dict[int, Entry] = {}
     count = section.number("CompactSubObj", 0)
-    if count == 255:  # the subindices go up to 254 (CiA 306, 4.7.2); several public files count one more
+    if count == 255:  # the highest subindex is 254 (CiA 306, 4.7.2); several public files count one more
         section.note(f"CompactSubObj 255 of [{section.name}] is taken as 254, the highest subindex", "CompactSubObj")
         count = 254
     if not 0 <= count <= 254:
@@ -295,10 +304,10 @@ def _read_entry(
 
 
 def _read_default(section: Section, data_type: int, value_text: str) -> tuple[bytes, bool, bool]:
-    """The bytes that the object starts with, whether the node id is added to them, and whether a DCF sets them.
+    """Return the initial bytes of the object, whether the node ID is added to them, and whether a DCF sets them.
 
-    A value that its data type cannot hold (a text in a DOMAIN, 300 in an UNSIGNED8) is noted, and the next one counts: the
-    DefaultValue after a ParameterValue, after that the type's zero or the empty string.
+    A value that does not fit its data type (a text in a DOMAIN, 300 in an UNSIGNED8) is noted, and the next one is
+    used: the DefaultValue after a ParameterValue, then the type's zero or the empty string.
     """
     texts = [("value", value_text), *((key, section.text(key)) for key in ("ParameterValue", "DefaultValue"))]
     for key, text in texts:
@@ -312,19 +321,21 @@ def _read_default(section: Section, data_type: int, value_text: str) -> tuple[by
 
 
 def _value(data_type: int, text: str) -> tuple[bytes, bool]:
-    """The bytes that a text means, and whether the node id is added to them. Raises `ValueError`."""
+    """Return the bytes for a text, and whether the node ID is added to them. Raises `ValueError`."""
     if not codec.is_integer(data_type) or not _NODE_ID.search(text):
         return codec.encode_text(data_type, text), False
     match = _RELATIVE.fullmatch(text.replace(" ", ""))
     if match is None:
         raise ValueError("neither a number, nor a number and the node id")
     raw = codec.encode_text(data_type, match[1] or match[2] or "0")
-    codec.encode(data_type, int(codec.decode(data_type, raw)) + _HIGHEST_NODE_ID)  # has to hold it for every node
+    codec.encode(
+        data_type, int(codec.decode(data_type, raw)) + _HIGHEST_NODE_ID
+    )  # the type must hold it for every node ID
     return raw, True
 
 
 def _basic_type(section: Section, sections: dict[str, Section]) -> int:
-    """The entry's basic data type; a type that the file defines itself is followed once, an unknown one is opaque."""
+    """Return the entry's basic data type. A type that the file defines is resolved once; an unknown type is opaque."""
     if section.number("ObjectType", VAR) == DOMAIN_OBJECT:
         return codec.DOMAIN
     data_type = section.number("DataType")

@@ -1,9 +1,9 @@
 """The INI layer of an electronic data sheet (CiA 306-1, 4.2): sections of ``key=value`` lines, each with its line number.
 
-Tolerant where real files are sloppy (indentation, empty values, case, line ends, encodings, free text in sections that
-describe no object), strict where a guess would be wrong: an object that is described twice, a key with two values, a line of
-an object that is no ``key=value``. The gateway's reader is as tolerant as this one (decision 0001); it shares no code. It
-knows no objects.
+It tolerates common defects of real files (indentation, empty values, case, line ends, encodings, free text in sections
+that describe no object). It is strict where a guess could be wrong: an object that is described twice, a key with two
+values, a line of an object that is not ``key=value``. The gateway's reader tolerates the same defects (decision 0001)
+but shares no code with this one. This module knows no objects.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ _OBJECT = re.compile(r"[0-9a-f]{4}(sub[0-9a-f]{1,2}|name|value)?", re.IGNORECASE
 """Names of the sections that describe objects."""
 
 MAX_LINES = 500_000
-"""More than any device has (65,536 objects), and a bound on what a wrong file can cost."""
+"""More than any device needs (65,536 objects); it limits the cost of a wrong file."""
 
 
 @dataclass(frozen=True, slots=True)
 class Note:
-    """Something that was mended in a file, and where."""
+    """A correction made while reading a file, and its line."""
 
     line: int
     text: str
@@ -34,21 +34,21 @@ class Note:
 
 @dataclass(slots=True)
 class Section:
-    """One section. Keys are lower case; a value that is empty counts as absent."""
+    """One section. Keys are lower case; an empty value counts as absent."""
 
     name: str
     line: int
     path: str
     values: dict[str, tuple[str, int]] = field(default_factory=dict)
     notes: list[Note] = field(default_factory=list)
-    """Shared by the sections of one file: what was mended in it."""
+    """The corrections, shared by all sections of one file."""
 
     def text(self, key: str, default: str = "") -> str:
-        """The value of `key`, or `default` when it is absent or empty."""
+        """Return the value of `key`, or `default` if it is absent or empty."""
         return self.values.get(key.lower(), ("", 0))[0] or default
 
     def number(self, key: str, default: int | None = None) -> int:
-        """The integer of `key`. Raises `FileInvalid` when it is no number, or absent without a default."""
+        """Return the integer value of `key`. Raises `FileInvalid` if it is not a number, or absent without a default."""
         text, line = self.values.get(key.lower(), ("", self.line))
         if not text:
             if default is None:
@@ -64,7 +64,7 @@ class Section:
             ) from None
 
     def count(self, key: str) -> int:
-        """The integer of `key`, which nothing depends on: one that cannot be read is noted and counts as 0."""
+        """Return the integer value of an informative `key`; a value that cannot be read is noted and counts as 0."""
         try:
             return self.number(key, 0)
         except FileInvalid:
@@ -72,19 +72,19 @@ class Section:
             return 0
 
     def note(self, text: str, key: str = "") -> None:
-        """Something that was mended, at `key` or in the section as a whole; said once."""
+        """Note a correction at `key` or in the whole section; a repeated note is dropped."""
         note = Note(self.values.get(key.lower(), ("", self.line))[1], text)
         if note not in self.notes:
             self.notes.append(note)
 
     def error(self, message: str, key: str = "", *, expected: str = "", got: str = "") -> FileInvalid:
-        """An error that points at `key`, or at the section where the key is absent."""
+        """Return an error that points at `key`, or at the section if the key is absent."""
         line = self.values.get(key.lower(), ("", self.line))[1]
         return FileInvalid(message, path=self.path, line=line, expected=expected, got=got)
 
 
 def decode_file(raw: bytes, notes: list[Note] | None = None) -> str:
-    """Text of a data sheet: UTF-8 or UTF-16 if it is that, else Windows-1252, which most tools write."""
+    """Return the text of a data sheet: decoded as UTF-8 or UTF-16 if valid, else as Windows-1252, which most tools write."""
     notes = [] if notes is None else notes
     if raw.startswith((b"\xff\xfe", b"\xfe\xff")):
         notes.append(Note(0, "the file is in UTF-16"))
@@ -97,7 +97,7 @@ def decode_file(raw: bytes, notes: list[Note] | None = None) -> str:
 
 
 def parse_sections(text: str, path: str = "", notes: list[Note] | None = None) -> dict[str, Section]:
-    """Sections by lower-case name, in the file's order. Raises `FileInvalid` with the line; adds to `notes`."""
+    """Return sections by lower-case name, in the file's order. Raises `FileInvalid` with the line; adds to `notes`."""
     notes = [] if notes is None else notes
     sections: dict[str, Section] = {}
     current: Section | None = None
@@ -120,7 +120,7 @@ def parse_sections(text: str, path: str = "", notes: list[Note] | None = None) -
             continue
         key, equals, value = line.partition("=")
         if not equals and current is not None and not _OBJECT.fullmatch(current.name):
-            continue  # free text, as in a section of comments
+            continue  # free text, for example in a section of comments
         if not equals or current is None:
             expected = "[section]" if current is None else "key=value"
             where = f" in [{current.name}]" if current else ""
@@ -140,7 +140,7 @@ def parse_sections(text: str, path: str = "", notes: list[Note] | None = None) -
 
 
 def _without_comment(value: str) -> str:
-    """Real files carry comments behind values; the standard wants them on lines of their own."""
+    """Remove a comment after a value. Real files have them, although the standard wants comments on separate lines."""
     for mark in (" ;", "\t;"):
         value = value.partition(mark)[0]
     return value

@@ -1,6 +1,6 @@
 """The emergency producer: EMCY messages, error register 1001h, history 1003h, inhibit time 1015h (CiA 301, 7.2.7).
 
-It decides when a message may be sent; *that* an error arose is told by others.
+It decides when a message may be sent; other services report the errors.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ MAX_WAITING = 32
 
 _INVALID = 1 << 31
 _UNIT_NS = 100_000
-"""1015h and the inhibit times of PDOs count in 100 microseconds."""
+"""1015h and the inhibit times of PDOs count in units of 100 microseconds."""
 
 
 class Emergency(Service):
@@ -43,9 +43,9 @@ class Emergency(Service):
     def raise_error(
         self, code: int, now_ns: int, *, register: int = GENERIC, info: bytes = b"", source: str = ""
     ) -> None:
-        """An error arose: register, history and message. `info` is the manufacturer's field, at most 5 bytes.
+        """Report a new error in register, history and message. `info` is the manufacturer's field, at most 5 bytes.
 
-        An error that is already active, from the same source, is no new one and sends nothing.
+        An error that is already active from the same source is not new and sends nothing.
         """
         if (code, source) not in self._active:
             self._active[code, source] = register | GENERIC
@@ -53,14 +53,17 @@ class Emergency(Service):
             self.report(code, now_ns, register=register, info=info)
 
     def report(self, code: int, now_ns: int, *, register: int = GENERIC, info: bytes = b"") -> None:
-        """An error that is over as soon as it is told (a PDO too short): history and message, nothing stays active."""
+        """Report an error that does not stay active (a PDO that is too short), in history and message only."""
         info = info[:5].ljust(5, b"\0")
         bits = self._update_register() | register | GENERIC
         self._remember(code | int.from_bytes(info[:2], "little") << 16)
         self._emit(code.to_bytes(2, "little") + bytes([bits]) + info, now_ns)
 
     def clear_error(self, code: int, now_ns: int, *, source: str = "") -> None:
-        """The error is repaired: 0000h with what remains in the register. Does nothing when it was not active."""
+        """Report that an error is repaired: 0000h with the remaining bits of the register.
+
+        No effect if it was not active.
+        """
         if self._active.pop((code, source), None) is not None:
             self._tell_active()
             self._emit(bytes([0, 0, self._update_register(), 0, 0, 0, 0, 0]), now_ns)
@@ -147,7 +150,7 @@ class Emergency(Service):
         return sorted(sub for sub in found.entries if sub) if found else []
 
     def _remember(self, field: int) -> None:
-        """Newest at subindex 1; the oldest falls off the end."""
+        """Add to the history: the newest is at subindex 1; the oldest is dropped."""
         data, subs = self._core.data, self._history()
         for sub in reversed(subs[1:]):
             data.put_number(0x1003, sub, data.number(0x1003, sub - 1))

@@ -14,10 +14,10 @@ VAR, ARRAY, RECORD, DOMAIN_OBJECT = 0x07, 0x08, 0x09, 0x02
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One subindex. `default` is on-wire bytes; with `node_relative` the node id is added to it.
+    """One subindex. `default` is in on-wire bytes; with `node_relative` the node ID is added to it.
 
-    `size` is the value's length in bytes, None where every value has its own. `low` and `high` are inclusive. `configured`:
-    `default` is what a DCF sets (its ParameterValue), not what the device leaves the factory with.
+    `size` is the value's length in bytes, None if the length varies. `low` and `high` are inclusive. `configured`: a
+    DCF sets `default` (its ParameterValue), so it is not the factory value.
     """
 
     index: int
@@ -49,7 +49,7 @@ class Entry:
         return self.access in ("rw", "rwr", "rww", "wo")
 
     def initial(self, node_id: int) -> bytes:
-        """The default value of a node with this id."""
+        """Return the default value of a node with this node ID."""
         if not self.node_relative:
             return self.default
         return codec.encode(self.data_type, int(codec.decode(self.data_type, self.default)) + node_id)
@@ -57,7 +57,7 @@ class Entry:
 
 @dataclass(frozen=True, slots=True)
 class DictionaryObject:
-    """One index: a VAR has subindex 0 only; an ARRAY or RECORD has the subindices that the data sheet lists."""
+    """One index: a VAR has only subindex 0; an ARRAY or RECORD has the subindices that the data sheet lists."""
 
     index: int
     name: str

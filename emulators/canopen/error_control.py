@@ -1,6 +1,6 @@
 """Error control: heartbeat producer (1017h), heartbeat consumer (1016h) and the reaction to communication errors (1029h).
 
-CiA 301 v4.2, 7.2.8 and 7.5.2.19 to 20. A node that has no 1017h produces no heartbeat.
+CiA 301 v4.2, 7.2.8 and 7.5.2.19 to 20. A node without 1017h produces no heartbeat.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ ERROR_CONTROL = 0x700
 
 
 class ErrorReaction:
-    """What 1029h:01 wants after a communication error; called with the time."""
+    """The reaction to a communication error that 1029h:01 selects; called with the time."""
 
     def __init__(self, core: Core, change_state: Callable[[NmtState, int], None]) -> None:
         self._core = core
         self._change_state = change_state
 
     def __call__(self, now_ns: int) -> None:
-        """0 leaves OPERATIONAL for PRE-OPERATIONAL, 1 changes nothing, 2 stops (CiA 301, 7.5.2.32)."""
+        """React: 0 leaves OPERATIONAL for PRE-OPERATIONAL, 1 changes nothing, 2 stops (CiA 301, 7.5.2.32)."""
         reaction = self._core.data.number(0x1029, 1)
         if reaction == 0 and self._core.operational:
             self._change_state(NmtState.PRE_OPERATIONAL, now_ns)
@@ -34,10 +34,10 @@ class ErrorReaction:
 
 
 class HeartbeatProducer(Service):
-    """Sends the state every 1017h milliseconds; a written period counts from that moment, its first beat at once."""
+    """Sends the state every 1017h milliseconds. A newly written period starts immediately, with a heartbeat."""
 
     due_ns: int = NEVER
-    """When the next heartbeat is to be sent."""
+    """When the next heartbeat must be sent."""
 
     def __init__(self, core: Core) -> None:
         self._core = core
@@ -53,7 +53,7 @@ class HeartbeatProducer(Service):
         self.due_ns = now_ns if self._period_ns() else NEVER
 
     def reset(self, now_ns: int) -> None:
-        """The boot-up message counts as the first heartbeat."""
+        """Schedule the heartbeat; the boot-up message counts as the first one."""
         period_ns = self._period_ns()
         self.due_ns = now_ns + period_ns if period_ns else NEVER
 
@@ -79,10 +79,10 @@ class _Watched:
 
 
 class HeartbeatConsumer(Service):
-    """Watches the nodes of 1016h, each from its first heartbeat on; a loss is EMCY 8130h and the reaction of 1029h."""
+    """Monitors the nodes of 1016h, each from its first heartbeat on; a loss causes EMCY 8130h and the reaction of 1029h."""
 
     due_ns: int = NEVER
-    """When the first of them is missing."""
+    """When the first missing heartbeat is detected."""
 
     def __init__(self, core: Core, emergency: emcy.Emergency, react: ErrorReaction) -> None:
         self._core = core
@@ -92,7 +92,7 @@ class HeartbeatConsumer(Service):
 
     @property
     def lost(self) -> tuple[int, ...]:
-        """Node ids whose heartbeat is missing."""
+        """Node IDs whose heartbeat is missing."""
         return tuple(sorted(node for node, watched in self._watched.items() if watched.lost))
 
     @property
@@ -110,14 +110,14 @@ class HeartbeatConsumer(Service):
 
     def wrote(self, index: int, subindex: int, now_ns: int) -> None:
         self._configure()
-        self._clear_if_all_heard(now_ns)  # the missing one may be watched no more
+        self._clear_if_all_heard(now_ns)  # the missing node may not be monitored any more
 
     def reset(self, now_ns: int) -> None:
         self._watched.clear()
         self._configure()
 
     def heard(self, frame: CanFrame, now_ns: int) -> None:
-        """An error control frame of another node."""
+        """Process an error control frame of a different node."""
         watched = self._watched.get(frame.can_id - ERROR_CONTROL)
         if watched is None:
             return
@@ -152,7 +152,7 @@ class HeartbeatConsumer(Service):
         return [sub for sub in found.entries if sub] if found else []
 
     def _configure(self) -> None:
-        """Entries that stayed as they were keep their watch."""
+        """Apply 1016h; unchanged entries keep their monitoring state."""
         wanted = dict(_split(self._core.data.number(0x1016, sub)) for sub in self._subs())
         before, self._watched = self._watched, {}
         for node, period_ms in wanted.items():
@@ -164,5 +164,5 @@ class HeartbeatConsumer(Service):
 
 
 def _split(value: int) -> tuple[int, int]:
-    """Node id and milliseconds of a consumer heartbeat time."""
+    """Return the node ID and milliseconds of a consumer heartbeat time."""
     return value >> 16 & 0xFF, value & 0xFFFF

@@ -1,7 +1,7 @@
-"""Node guarding and life guarding, the slave's side (CiA 301 v4.2, 7.2.8.2.1; 100Ch, 100Dh).
+"""Node guarding and life guarding, on the side of the guarded node (CiA 301 v4.2, 7.2.8.2.1; 100Ch, 100Dh).
 
-The answer to a guarding request carries the state and a bit that alternates. Whoever was guarded once expects to be guarded
-within the life time; silence is EMCY 8130h and the reaction of 1029h. A running heartbeat producer rules guarding out.
+The answer to a guarding request carries the state and a toggle bit. After its first request a node expects the next
+within the life time; otherwise it sends EMCY 8130h and reacts by 1029h. An active heartbeat producer disables guarding.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ _SOURCE = "life guarding"
 
 
 class NodeGuarding(Service):
-    """Answers guarding requests and watches that they come."""
+    """Answers guarding requests and monitors that they arrive."""
 
     due_ns: int = NEVER
     """When the life time ends."""
@@ -43,7 +43,7 @@ class NodeGuarding(Service):
         self.due_ns = NEVER
 
     def requested(self, now_ns: int) -> None:
-        """A remote frame asked for the state."""
+        """Answer a remote frame that requests the state."""
         if self._core.data.number(0x1017) or not self._core.data.has(0x100C):
             self._core.counters.ignored += 1
             return
@@ -56,7 +56,7 @@ class NodeGuarding(Service):
     def tick(self, now_ns: int) -> None:
         if now_ns >= self.due_ns:
             self.due_ns = NEVER
-            self._guarded = False  # watching starts anew with the next request
+            self._guarded = False  # monitoring starts again with the next request
             self._emergency.raise_error(emcy.HEARTBEAT_LOST, now_ns, register=emcy.COMMUNICATION, source=_SOURCE)
             self._react(now_ns)
 

@@ -1,7 +1,7 @@
-"""Layer setting services, the slave's side: node id and bit rate by identity (CiA 305 v3.0, clause 6).
+"""Layer setting services on the LSS slave: node ID and bit rate by identity (CiA 305 v3.0, clause 6).
 
-Pure: the master's 8 bytes in, the slave's 8 bytes or None out. It must never know the bus nor NMT: what is to become of a new
-node id or bit rate is the node's, which reads `pending_id`, `stored_id` and `pending_rate`.
+Pure: it takes the LSS master's 8 bytes and returns the slave's 8 bytes or None. It must never know the bus or NMT: the
+node applies a new node ID or bit rate, which it reads from `pending_id`, `stored_id` and `pending_rate`.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from enum import Enum
 
 FROM_MASTER, FROM_SLAVE = 0x7E5, 0x7E4
 UNCONFIGURED = 255
-"""The node id of a node that has none."""
+"""The node ID of an unconfigured node."""
 
 BIT_RATES = {0: 1_000_000, 1: 800_000, 2: 500_000, 3: 250_000, 4: 125_000, 6: 50_000, 7: 20_000, 8: 10_000}
 """Standard table 0 (CiA 305, table 1): index and bit/s."""
@@ -25,11 +25,11 @@ _FASTSCAN, _CONFIRM_ALL = 0x51, 0x80
 _INQUIRE, _INQUIRE_NODE_ID = range(0x5A, 0x5E), 0x5E
 
 Identity = tuple[int, int, int, int]
-"""Vendor id, product code, revision, serial number: 1018h:01 to 04."""
+"""Vendor ID, product code, revision, serial number: 1018h:01 to 04."""
 
 
 class LssStore(Enum):
-    """What becomes of the store command; values are its error codes."""
+    """The result of the store command; the values are its error codes."""
 
     WORKS = 0
     UNSUPPORTED = 1
@@ -38,7 +38,7 @@ class LssStore(Enum):
 
 @dataclass(slots=True)
 class LssSlave:
-    """One slave. `rates` are the bit rates that it can take, in bit/s."""
+    """One LSS slave. `rates` are the bit rates that it supports, in bit/s."""
 
     identity: Callable[[], Identity]
     node_id: int
@@ -50,7 +50,7 @@ class LssSlave:
     pending_rate: int | None = None
     stored_rate: int | None = None
     activate_ms: int | None = None
-    """Set by an activation of the bit timing, for the node to take and clear: the switch delay."""
+    """Switch delay of an activated bit timing, for the node to read and clear."""
     _selected: int = 0
     _identified: int = 0
     _scanned: int = 0
@@ -59,13 +59,13 @@ class LssSlave:
         self.pending_id = self.stored_id = self.node_id
 
     def adopt(self, node_id: int) -> None:
-        """The node has this id now; the slave waits again."""
+        """Set the node ID that the node now has, and return to the waiting state."""
         self.node_id = self.pending_id = node_id
         self.configuring = False
         self._selected = self._identified = self._scanned = 0
 
     def request(self, data: bytes) -> bytes | None:
-        """One frame of the master's; anything but 8 bytes is none."""
+        """Process one frame of the LSS master; a frame without exactly 8 bytes is ignored."""
         if len(data) != 8:
             return None
         command = data[0]
@@ -103,7 +103,7 @@ class LssSlave:
         return _reply(command, self.node_id) if command == _INQUIRE_NODE_ID else None
 
     def _select(self, part: int, number: int) -> bytes | None:
-        """Four frames in their order; the fourth that matches switches."""
+        """Process four frames in order; if all match, the fourth one switches to configuration."""
         if self.configuring:
             return None
         in_turn = part in (0, self._selected) and self.identity()[part] == number
@@ -114,7 +114,7 @@ class LssSlave:
         return _reply(_SELECTED)
 
     def _identify(self, part: int, number: int) -> bytes | None:
-        """Vendor, product, lowest and highest revision, lowest and highest serial number."""
+        """Process vendor, product, lowest and highest revision, lowest and highest serial number."""
         vendor, product, revision, serial = self.identity()
         matches = (
             number == vendor,
@@ -131,7 +131,7 @@ class LssSlave:
         return _reply(_IDENTIFIED)
 
     def _scan(self, number: int, bits: int, part: int, following: int) -> bytes | None:
-        """Only those without a node id answer, and only for the part of their identity that is being looked for."""
+        """Answer fastscan: only unconfigured nodes answer, and only for the part of the identity that is being scanned."""
         if self.node_id != UNCONFIGURED or self.configuring:
             return None
         if bits == _CONFIRM_ALL:

@@ -1,7 +1,7 @@
-"""LSS inside a node: when it is answered, and what becomes of a new node id or bit rate (CiA 305 v3.0, 4.3 and 6.3).
+"""LSS inside a node: when it answers, and the effect of a new node ID or bit rate (CiA 305 v3.0, 4.3 and 6.3).
 
-A configured node takes a new id at the next reset; one without an id boots with it as soon as LSS leaves configuration. The
-bit rate changes after the switch delay; the node is silent for a delay before and one after.
+A configured node takes a new node ID at the next reset; an unconfigured node boots with it as soon as LSS leaves
+configuration. The bit rate changes after the switch delay; the node is silent for one delay before and one after.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ _MUTE = "bit timing"
 
 
 class LssService(Service):
-    """One node's LSS slave. `boot` is called with the time when a node that had no id has one pending."""
+    """The LSS slave of one node. `boot` is called with the time when an unconfigured node has a pending node ID."""
 
     due_ns: int = NEVER
-    """When it talks again, at the new bit rate."""
+    """When the node may send again, at the new bit rate."""
 
     def __init__(self, core: Core, store: LssStore, boot: Callable[[int], None]) -> None:
         self._core = core
@@ -29,14 +29,14 @@ class LssService(Service):
         self.bit_rate: int | None = None
 
     def power_on(self) -> None:
-        """What was stored is what the node has."""
+        """Restore the stored settings at power-on."""
         self._slave.pending_id = self._slave.stored_id
         self.bit_rate = self._slave.stored_rate
         self.due_ns = NEVER
         self._core.mutes.discard(_MUTE)
 
     def adopt(self, now_ns: int) -> None:
-        """A reset: the pending node id becomes the node's. Live values are the caller's to reset."""
+        """Apply the pending node ID at a reset. The caller resets the live values."""
         if self._slave.pending_id != self._core.node_id:
             self._core.node_id = self._slave.pending_id
             self._core.note(now_ns, "lss", 0, 0, bytes([self._core.node_id]))
@@ -44,7 +44,7 @@ class LssService(Service):
         self._slave.adopt(self._core.node_id)
 
     def receive(self, data: bytes, now_ns: int) -> None:
-        """A frame of the LSS master's; not for a node in OPERATIONAL."""
+        """Process a frame of the LSS master; a node in OPERATIONAL ignores it."""
         if self._core.operational:
             self._core.counters.ignored += 1
             return

@@ -70,17 +70,17 @@ _TARGET = {
 
 @dataclass(frozen=True, slots=True)
 class NodeContext:
-    """What the node is given besides its data sheet.
+    """The parts and settings of a node besides its data sheet.
 
-    `source` plays values, by time and where it `AnswersReads` by upload; `model` makes of them, and of what clients write, what
-    the device does; `distort` changes what the model says, for faults; `held` is told of every value that the objects then have.
-    `factory` replaces defaults (a serial number).
-    `refusals` are objects that SDO clients get an abort for, whatever the data sheet says.
+    `source` plays values, by time and, if it is an `AnswersReads`, by upload. `model` computes the device's behaviour
+    from them and from the values that clients write; `distort` changes the model's output, for faults. `held` is called
+    with every value that the objects then have. `factory` replaces defaults (a serial number). `refusals` are objects
+    that SDO clients get an abort for, regardless of the data sheet.
 
-    `tolerate_short_sdo` takes SDO requests of fewer than 8 bytes as padded with zeros, as for old PLCs; by default they are
-    ignored. `sdo_block` is how many segments a client may send at once, 1 to 127. A TIME producer (1012h) tells its time every
-    `time_period_ms`, 0 for never. `lss` decides about LSS, None lets the data sheet; `lss_store` is what becomes of LSS's store
-    command. `journal_size` bounds both journals: older lines fall off.
+    `tolerate_short_sdo` accepts SDO requests of fewer than 8 bytes as if padded with zeros, as for old PLCs; by default
+    they are ignored. `sdo_block` is how many segments a client may send in one sub-block, 1 to 127. A TIME producer
+    (1012h) sends its time every `time_period_ms`, 0 for never. `lss` enables or disables LSS, None uses the data sheet;
+    `lss_store` is the result of LSS's store command. `journal_size` limits both journals: older entries are dropped.
     """
 
     source: Source | None = None
@@ -101,8 +101,8 @@ class NodeContext:
 class CanopenNode:
     """One node. Call `start`, then `feed` for each frame and `tick` when `wake_at_ns` has come; send what they return.
 
-    A node of id 255 has none yet and waits silently for LSS to give it one. Raises `UsageError` for any other id outside 1 to
-    127, for 255 without LSS, and from any call when `source` gives what does not fit.
+    A node with ID 255 is unconfigured and waits silently until LSS assigns a node ID. Raises `UsageError` for any other
+    ID outside 1 to 127, for 255 without LSS, and from any call when `source` gives values that do not fit.
     """
 
     def __init__(self, dictionary: Dictionary, node_id: int, context: NodeContext | None = None) -> None:
@@ -117,7 +117,7 @@ class CanopenNode:
         core.held = context.held
         core.answers = source if isinstance(source, AnswersReads) else None
         self.accepts = Acceptance(core)
-        """The acceptance filter: whether a frame can mean anything to this node. Feeding others does no harm."""
+        """The acceptance filter: whether a frame can concern this node. Feeding other frames is harmless."""
         self._powered = False
         self._emergency = Emergency(core)
         react = ErrorReaction(core, self._enter)
@@ -139,17 +139,17 @@ class CanopenNode:
         self._sdo = SdoChannels(core, view, timeout_ns, context.sdo_block, tolerate_short=context.tolerate_short_sdo)
         view.add(self._sdo)
         self._services = (self._sdo, *services)
-        # Most services never wait for a time; those that do are asked with every frame and every tick.
+        # Most services never wait for a time; the others are checked with every frame and every tick.
         self._timed = tuple(s for s in self._services if type(s).tick is not Service.tick and s.waits)
         self._wakers = tuple(s for s in self._timed if s is not self._behaviour)
         if self._behaviour is not None:
             self._behaviour.connect(core, self._emergency, self._tpdos.changed)
 
-    # -- what can be asked ----------------------------------------------------------------------------------------
+    # -- queries --------------------------------------------------------------------------------------------------
 
     @property
     def node_id(self) -> int:
-        """255 while it has none."""
+        """The node ID; 255 while the node is unconfigured."""
         return self._core.node_id
 
     @property
@@ -162,7 +162,7 @@ class CanopenNode:
 
     @property
     def data(self) -> NodeData:
-        """The live values. Change them by `set_value` only, so that TPDOs learn of it."""
+        """The live values. Change them only with `set_value`, so that TPDOs are triggered."""
         return self._core.data
 
     @property
@@ -182,15 +182,15 @@ class CanopenNode:
 
     @property
     def bit_rate(self) -> int | None:
-        """The bit rate that LSS activated, in bit/s; None while it is the one that the node came with."""
+        """The bit rate that LSS activated, in bit/s; None if LSS has not changed it."""
         return self._lss.bit_rate if self._lss else None
 
     def time_of_day(self, now_ns: int) -> TimeOfDay | None:
-        """The network's time as the node knows it; None until it was told."""
+        """Return the network's time as known to the node; None until it is set or received."""
         return self._time.now(now_ns)
 
     def wake_at_ns(self) -> int | None:
-        """When `tick` is due next; None when only a frame can make the node do something."""
+        """Return when `tick` is due next; None if only a frame can cause an action."""
         if self._core.state is _INITIALISING:
             wake_ns = self._lss.due_ns if self._lss else NEVER
         else:
@@ -199,7 +199,7 @@ class CanopenNode:
                 wake_ns = self._behaviour.asks_at_ns
         return None if wake_ns == NEVER else wake_ns
 
-    # -- what can happen to it ------------------------------------------------------------------------------------
+    # -- events ---------------------------------------------------------------------------------------------------
 
     def start(self, now_ns: int) -> list[CanFrame]:
         """Power on (again): power-on values, boot-up message, PRE-OPERATIONAL."""
@@ -210,7 +210,7 @@ class CanopenNode:
         return self._core.take_output()
 
     def feed(self, frame: CanFrame, now_ns: int) -> list[CanFrame]:
-        """A frame came off the bus."""
+        """Process a frame from the bus."""
         if not self._powered:
             return []
         self._core.counters.frames_in += 1
@@ -227,51 +227,54 @@ class CanopenNode:
         return self._core.take_output()
 
     def tick(self, now_ns: int) -> list[CanFrame]:
-        """Time passed. Early calls do nothing."""
+        """Process the passage of time. Early calls do nothing."""
         if self._powered:
             self._run_due(now_ns)
         return self._core.take_output()
 
     def bus_state(self, state: CanErrorState, now_ns: int) -> list[CanFrame]:
-        """The CAN controller's state changed: error-passive is EMCY 8120h, bus-off is silence and 8140h after it."""
+        """Process a state change of the CAN controller: error-passive is EMCY 8120h, bus-off is silence and then 8140h."""
         if self._powered:
             self._faults.changed(state, now_ns)
         return self.tick(now_ns)
 
     def overrun(self, now_ns: int) -> list[CanFrame]:
-        """The CAN controller lost received frames: EMCY 8110h."""
+        """Report that the CAN controller lost received frames: EMCY 8110h."""
         if self._powered:
             self._faults.overrun(now_ns)
         return self.tick(now_ns)
 
     def take_overdue(self) -> frozenset[int]:
-        """Identifiers of synchronous TPDOs whose window (1007h) ended. What still waits for the bus under them is to be taken
-        back, as a controller aborts its mailboxes, and told with `dropped`. Each SYNC's are given once."""
+        """Return the identifiers of synchronous TPDOs whose window (1007h) has ended.
+
+        The caller withdraws frames with these identifiers that still wait for the bus, as a controller aborts its
+        mailboxes, and reports them with `dropped`. The identifiers of each SYNC are returned once.
+        """
         return self._tpdos.take_overdue()
 
     def dropped(self, frames: Collection[CanFrame], now_ns: int) -> list[CanFrame]:
-        """Frames of this node that were taken back: counted, and EMCY 8100h once a SYNC."""
+        """Process frames of this node that were withdrawn: count them, and send EMCY 8100h once per SYNC."""
         if frames:
             self._tpdos.dropped(frames)
             self._sync.late(now_ns)
         return self.tick(now_ns)
 
     def set_time(self, time: TimeOfDay, now_ns: int) -> list[CanFrame]:
-        """The device's own clock is set; what a TIME producer tells."""
+        """Set the device's own clock, which a TIME producer sends."""
         self._time.tell(time, now_ns)
         return self.tick(now_ns)
 
     def set_value(self, index: int, subindex: int, raw: bytes, now_ns: int) -> list[CanFrame]:
-        """The device itself changes a value (on-wire bytes); a change is an event for TPDOs that map it."""
+        """Change a value from the device's side (on-wire bytes); a change is an event for TPDOs that map it."""
         if self._core.data.put(index, subindex, raw):
             self._core.note(now_ns, "set", index, subindex, raw)
             self._tpdos.changed([(index, subindex)], now_ns)
         return self.tick(now_ns)
 
     def raise_error(self, code: int, now_ns: int, *, register: int = GENERIC, info: bytes = b"") -> list[CanFrame]:
-        """An error arises in the device: EMCY `code` with `info` (up to 5 bytes), active until `clear_error`.
+        """Raise an error of the device: EMCY `code` with `info` (up to 5 bytes), active until `clear_error`.
 
-        Raises `UsageError` for what no EMCY message can carry.
+        Raises `UsageError` for values that no EMCY message can carry.
         """
         if not 0 < code <= 0xFFFF or not 0 <= register <= 0xFF or len(info) > 5:
             raise UsageError(
@@ -283,7 +286,7 @@ class CanopenNode:
         return self.tick(now_ns)
 
     def clear_error(self, code: int, now_ns: int) -> list[CanFrame]:
-        """The error is gone: EMCY 0000h with what remains in the error register."""
+        """Clear an error: EMCY 0000h with the remaining bits of the error register."""
         self._emergency.clear_error(code, now_ns)
         return self.tick(now_ns)
 
@@ -291,7 +294,7 @@ class CanopenNode:
 
     def _run_due(self, now_ns: int) -> None:
         if self._core.state is not _INITIALISING:
-            for service in self._timed:  # what one does may make the next ones due
+            for service in self._timed:  # one service can make the next ones due
                 if service.due_ns <= now_ns:
                     service.tick(now_ns)
         elif self._lss is not None:
@@ -309,7 +312,7 @@ class CanopenNode:
             self._consumer.heard(frame, now_ns)
 
     def _taken(self, frame: CanFrame, now_ns: int) -> bool:
-        """Whether a service of ours stands on the frame's identifier."""
+        """Return whether one of the node's services handled the frame."""
         can_id, data = frame.can_id, frame.data
         return (
             self._sdo.receive(can_id, data, now_ns)
@@ -326,7 +329,7 @@ class CanopenNode:
             self._tpdos.on_remote(frame.can_id, now_ns)
 
     def _on_nmt(self, data: bytes, now_ns: int) -> None:
-        """Ignored unless it is exactly a command and a node id that mean us (CiA 301, 7.2.8.3.1)."""
+        """Process an NMT command; ignored unless it is exactly a command and a node ID for this node (CiA 301, 7.2.8.3.1)."""
         if len(data) != 2 or data[1] > 127 or data[0] not in (*_TARGET, _RESET_NODE, _RESET_COMMUNICATION):
             self._core.counters.ignored += 1
             return
@@ -340,7 +343,7 @@ class CanopenNode:
             self._reset(now_ns, communication_only=command == _RESET_COMMUNICATION)
 
     def _on_sync(self, counter: int | None, now_ns: int) -> None:
-        """Inputs are sampled at the SYNC, before what came for it is applied."""
+        """Process SYNC: sample inputs before the waiting RPDOs are applied."""
         self._tpdos.on_sync(counter, now_ns)
         self._rpdos.on_sync(now_ns)
 
@@ -357,11 +360,11 @@ class CanopenNode:
             service.state_changed(now_ns)
 
     def _boot(self, now_ns: int) -> None:
-        """LSS gave a node id to one that had none."""
+        """Boot an unconfigured node to which LSS has assigned a node ID."""
         self._reset(now_ns, communication_only=False)
 
     def _reset(self, now_ns: int, *, communication_only: bool) -> None:
-        """A node id that LSS gave takes effect here; without one the node stays where it is, silent."""
+        """Reset the node. A node ID that LSS assigned takes effect here; without one the node stays silent."""
         self._core.state = NmtState.INITIALISING
         self._core.note(now_ns, "nmt", 0, 0, bytes([NmtState.INITIALISING]))
         if self._lss is not None:

@@ -1,7 +1,7 @@
 """The live values of one emulated node: bytes by (index, subindex), with what reset restores and 1010h stores.
 
-Generic rules only (existence, access, length, limits). What a certain object *means* belongs to the services; this
-module must never know the bus nor the time.
+Generic rules only (existence, access, length, limits). The services know what a certain object *means*; this module
+must never know the bus or the time.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Group(IntEnum):
 
 
 class NodeData:
-    """Values of one node. `factory` replaces defaults of the data sheet (a serial number); keys must exist."""
+    """Values of one node. `factory` replaces defaults of the data sheet (a serial number); its keys must exist."""
 
     def __init__(self, dictionary: Dictionary, node_id: int, factory: Mapping[Key, bytes] | None = None) -> None:
         self.dictionary = dictionary
@@ -48,15 +48,15 @@ class NodeData:
         self._live: dict[Key, bytes] = dict(self._factory)
         self._decoded: dict[Key, int | float] = {}
         self.version = 0
-        """Counts what happened to communication objects, so that others can keep what they made of them."""
+        """Counts changes of communication objects, so that services can cache what they derive from them."""
 
     def rebase(self, node_id: int) -> None:
-        """Factory values of a node with this id; live values stay until a reset."""
+        """Set the factory values of a node with this node ID; live values stay until a reset."""
         self.node_id = node_id
         self._factory = {entry.key: entry.initial(node_id) for entry in self.dictionary.entries()} | self._given
 
     def find(self, index: int, subindex: int) -> Entry:
-        """The entry; raises `SdoAborted` with 06020000 or 06090011 when there is none."""
+        """Return the entry. Raises `SdoAborted` with 06020000 or 06090011 if it does not exist."""
         entry = self.dictionary.entry(index, subindex)
         if entry is None:
             missing_object = index not in self.dictionary
@@ -67,30 +67,31 @@ class NodeData:
         return (index, subindex) in self._live
 
     def get(self, index: int, subindex: int = 0) -> bytes:
-        """The live value. The entry must exist."""
+        """Return the live value. The entry must exist."""
         return self._live[index, subindex]
 
     def factory(self, index: int, subindex: int = 0) -> bytes:
-        """The value that the device left the factory with. The entry must exist."""
+        """Return the factory value. The entry must exist."""
         return self._factory[index, subindex]
 
     def size(self, key: Key) -> int | None:
-        """Bytes that the entry's values have; None where that varies, or there is no such entry."""
+        """Return the number of bytes of the entry's values; None if it varies or the entry does not exist."""
         return self._sizes.get(key)
 
     def joined(self, keys: Iterable[Key]) -> bytes:
-        """The live values of these entries in a row. They must exist."""
+        """Return the concatenated live values of these entries. They must exist."""
         return b"".join(map(self._live.__getitem__, keys))
 
     def number(self, index: int, subindex: int = 0, default: int = 0) -> int:
-        """The live value as an unsigned integer, or `default` when the node has no such entry."""
+        """Return the live value as an unsigned integer, or `default` if the node has no such entry."""
         raw = self._live.get((index, subindex))
         return default if raw is None else int.from_bytes(raw, "little")
 
     def decoded(self, key: Key) -> int | float | None:
-        """The live value as its type's number; None when the node has no such entry. Kept until the value changes.
+        """Return the live value as a number of its type; None if the node has no such entry. Cached until the value
+        changes.
 
-        Raises as `codec.decode` for a value that is none.
+        Raises the errors of `codec.decode` for a value that it cannot decode.
         """
         number = self._decoded.get(key)
         if number is None and key in self.types:
@@ -98,9 +99,9 @@ class NodeData:
         return number
 
     def put(self, index: int, subindex: int, raw: bytes) -> bool:
-        """Set a value from inside the device, whatever its access. Returns whether it changed.
+        """Set a value from the device's side, whatever its access. Return whether it changed.
 
-        Raises `UsageError` when there is no such entry or the length is not its type's.
+        Raises `UsageError` if the entry does not exist or the length is not that of its type.
         """
         key = (index, subindex)
         if self._live.get(key) == raw:
@@ -114,19 +115,19 @@ class NodeData:
         return True
 
     def put_number(self, index: int, subindex: int, value: int) -> None:
-        """`put` for an unsigned value; does nothing when the node has no such entry."""
+        """Call `put` with an unsigned value; does nothing if the node has no such entry."""
         entry = self.dictionary.entry(index, subindex)
         if entry is not None and entry.size is not None:
             self.put(index, subindex, value.to_bytes(entry.size, "little"))
 
     def check_value(self, entry: Entry, raw: bytes) -> None:
-        """Length and limits of a value from the bus. Raises `SdoAborted` (06070012/13, 06090031/32)."""
+        """Check length and limits of a value from the bus. Raises `SdoAborted` (06070012/13, 06090031/32)."""
         self.check_size(entry, len(raw))
         if not codec.is_number(entry.data_type):
             return
         value = codec.decode(entry.data_type, raw)
         high = 1 if entry.data_type == codec.BOOLEAN and entry.high is None else entry.high
-        # Written so that a NaN is inside no limits.
+        # Written so that a NaN violates every limit.
         if high is not None and not value <= high:
             raise abort(entry.index, entry.subindex, Abort.VALUE_HIGH)
         if entry.low is not None and not value >= entry.low:
@@ -134,12 +135,12 @@ class NodeData:
 
     @staticmethod
     def check_size(entry: Entry, size: int) -> None:
-        """The length of a value from the bus. Raises `SdoAborted` (06070012/13)."""
+        """Check the length of a value from the bus. Raises `SdoAborted` (06070012/13)."""
         if entry.size is not None and size != entry.size:
             raise abort(entry.index, entry.subindex, Abort.TOO_LONG if size > entry.size else Abort.TOO_SHORT)
 
     def reset(self, *, communication_only: bool) -> None:
-        """Power-on values: what was stored, else the factory's (CiA 301, 7.3.2.2.1)."""
+        """Restore power-on values: the stored ones, else the factory values (CiA 301, 7.3.2.2.1)."""
         self.version += 1
         self._decoded.clear()
         for key, raw in self._factory.items():
@@ -153,7 +154,7 @@ class NodeData:
                 self._stored[entry.key] = self._live[entry.key]
 
     def forget(self, group: Group) -> None:
-        """Make the factory's values the power-on values again (1011h). Live values stay until a reset."""
+        """Make the factory values the power-on values again (1011h). Live values stay until a reset."""
         self._stored = {key: raw for key, raw in self._stored.items() if not group.holds(key[0])}
 
     def _sized(self, key: Key, raw: bytes) -> None:

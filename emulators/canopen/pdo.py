@@ -1,7 +1,7 @@
-"""What TPDOs and RPDOs have in common: communication and mapping parameters, and the rules for changing them.
+"""Common parts of TPDOs and RPDOs: communication and mapping parameters, and the rules for changing them.
 
 CiA 301 v4.2, 7.5.2.35 to 7.5.2.38. A PDO is changed in five steps: invalidate it (bit 31 of its COB-ID), set the
-mapping's subindex 0 to zero, write the entries, set subindex 0, make it valid again. Anything else is refused.
+mapping's subindex 0 to zero, write the entries, set subindex 0, make it valid again. Any other order is refused.
 """
 
 from __future__ import annotations
@@ -54,10 +54,10 @@ class Mapped:
 
 
 class PdoSettings(msgspec.Struct, frozen=True):
-    """One PDO's parameters, read. `valid`: it exists, on an 11-bit identifier (29-bit ones are not supported).
+    """The parameters of one PDO. `valid`: it exists, on an 11-bit identifier (29-bit ones are not supported).
 
-    `mapping` are the entries in use, `length` the bytes that they fill. `whole`: each is a whole object, so that a PDO is nothing
-    but their bytes in a row.
+    `mapping` holds the entries in use, `length` the number of bytes that they fill. `whole`: each entry is a whole
+    object, so that a PDO is the concatenation of their bytes.
     """
 
     can_id: int
@@ -87,7 +87,7 @@ class PdoParameters:
 
     @property
     def settings(self) -> PdoSettings:
-        """The parameters as they are now; read again only when a communication object changed since."""
+        """The present parameters; they are read again only after a communication object has changed."""
         if self._settings is None or self._settings_of != self._data.version:
             self._settings, self._settings_of = self._read(), self._data.version
         return self._settings
@@ -120,13 +120,13 @@ class PdoParameters:
         )
 
     def _read_mapping(self) -> tuple[Mapped, ...]:
-        """A count beyond what fits is not followed (a data sheet can default to nonsense)."""
+        """Return the mapping; empty if it exceeds a PDO's length (a data sheet can have invalid defaults)."""
         count = self._data.number(self.map_index)
         entries = tuple(Mapped.from_value(self._data.number(self.map_index, sub)) for sub in range(1, count + 1))
         return entries if sum(entry.bits for entry in entries) <= MAX_BITS else ()
 
     def check_communication(self, subindex: int, raw: bytes) -> None:
-        """Whether a communication parameter may take this value. Raises `SdoAborted`."""
+        """Check whether a communication parameter may take this value. Raises `SdoAborted`."""
         value = int.from_bytes(raw, "little")
         if subindex == COB_ID:
             self._check_cob(value)
@@ -138,7 +138,7 @@ class PdoParameters:
             raise abort(self.index, subindex, Abort.VALUE)
 
     def check_mapping(self, subindex: int, raw: bytes) -> None:
-        """Whether a mapping parameter may take this value. Raises `SdoAborted`."""
+        """Check whether a mapping parameter may take this value. Raises `SdoAborted`."""
         value = int.from_bytes(raw, "little")
         if self.valid or (subindex != 0 and self._data.number(self.map_index) != 0):
             raise abort(self.map_index, subindex, Abort.DEVICE_STATE)
@@ -177,5 +177,5 @@ class PdoParameters:
 
 
 def pdo_indices(data: NodeData, first: int) -> list[int]:
-    """The communication parameter records that the node has among the 512 from `first` on."""
+    """Return the communication parameter records that the node has among the 512 from `first` on."""
     return [index for index in sorted(data.dictionary.objects) if first <= index < first + 0x200]

@@ -1,7 +1,9 @@
-"""What a user should know about a data sheet before its node is started: settings that do not fit this node, and a missing model.
+"""Remarks about a data sheet for the user, before its node is started: settings that do not fit the node, and a missing
+model.
 
-A file is often taken from another node of the plant: its ParameterValues are that node's COB-IDs. They are applied as they stand,
-because a data sheet is data; `remarks` says so. Pure; the texts name no command, the caller says how to override.
+A file is often copied from a different node of the plant, so its ParameterValues are that node's COB-IDs. They are
+applied unchanged, because a data sheet is data; `remarks` reports them. Pure; the texts name no command, because the
+caller knows how to override the settings.
 """
 
 from __future__ import annotations
@@ -16,12 +18,12 @@ _SHORTEST_CYCLE_US = 50
 """A SYNC without data takes 47 bits: 47 us at 1 Mbit/s, the highest bit rate (CiA 301, 5.3)."""
 _INVALID = 1 << 31
 _NAMED = 6
-"""Objects that one remark names."""
+"""Most objects that one remark names."""
 
 
 @dataclass(frozen=True, slots=True)
 class Remark:
-    """One remark. `by_parameter_value`: the DefaultValues alone give no cause for it; `model`: it is about the missing model."""
+    """One remark. `by_parameter_value`: the DefaultValues alone do not cause it; `model`: it is about the missing model."""
 
     text: str
     by_parameter_value: bool = False
@@ -29,7 +31,7 @@ class Remark:
 
 
 def remarks(dictionary: Dictionary, node_id: int, *, has_model: bool) -> list[Remark]:
-    """Return what does not fit a node with this id. `has_model`: a model of a device profile is behind its objects."""
+    """Return the settings that do not fit a node with this ID. `has_model`: the node has a model of a device profile."""
     found = [*_of_another_node(dictionary, node_id), *_of_the_cycle(dictionary)]
     if not has_model:
         found.append(_without_model(dictionary))
@@ -37,7 +39,7 @@ def remarks(dictionary: Dictionary, node_id: int, *, has_model: bool) -> list[Re
 
 
 def _of_another_node(dictionary: Dictionary, node_id: int) -> list[Remark]:
-    """COB-IDs that the predefined connection set (CiA 301, 7.3.3) gives to another node, where they stand as numbers."""
+    """Return remarks for literal COB-IDs that the predefined connection set (CiA 301, 7.3.3) assigns to a different node."""
     if not 1 <= node_id <= 127:
         return []
     by_node: dict[tuple[int, bool], list[Entry]] = {}
@@ -62,7 +64,10 @@ def _of_another_node(dictionary: Dictionary, node_id: int) -> list[Remark]:
 
 
 def _owner(entry: Entry) -> int:
-    """The node that a COB-ID belongs to by the predefined connection set; 0 for one that follows the node id or no object's."""
+    """Return the node that owns a COB-ID in the predefined connection set.
+
+    Returns 0 for a COB-ID that follows the node ID, and for other objects.
+    """
     base = _base(entry)
     if base == 0 or entry.node_relative or entry.size != 4:
         return 0
@@ -73,7 +78,7 @@ def _owner(entry: Entry) -> int:
 
 
 def _base(entry: Entry) -> int:
-    """The function code that the predefined connection set has for this COB-ID; 0 for objects that are none."""
+    """Return the function code that the predefined connection set has for this COB-ID; 0 for all other objects."""
     index, sub = entry.key
     if (index, sub) == (0x1014, 0):
         return 0x080

@@ -1,8 +1,8 @@
-"""Receive PDOs: taking values off the bus (CiA 301 v4.2, 7.2.2 and 7.5.2.35 to 36).
+"""Receive PDOs: taking values from the bus (CiA 301 v4.2, 7.2.2 and 7.5.2.35 to 36).
 
-Applied at once with transmission types 254 and 255, at the next SYNC with 0 to 240. Too short a PDO is EMCY 8210h and not
-applied; of too long a one the first bytes count. One that was received and does not come again within its event timer is
-EMCY 8250h until it does.
+A PDO is applied immediately with transmission types 254 and 255, at the next SYNC with 0 to 240. A PDO that is too
+short causes EMCY 8210h and is not applied; of one that is too long, the first bytes are used. If a PDO does not arrive
+again within its event timer, EMCY 8250h is active until it does.
 """
 
 from __future__ import annotations
@@ -23,21 +23,24 @@ _FIRST = 0x1400
 class _Rpdo:
     parameters: PdoParameters
     waiting: bytes | None = None
-    """Received, to be applied at the next SYNC; a newer one replaces it."""
+    """Received data, to be applied at the next SYNC; a newer PDO replaces it."""
     deadline_ns: int = NEVER
-    """When the next one must be here; never before the first."""
+    """When the next one must have arrived; `NEVER` before the first one."""
 
     @property
     def source(self) -> str:
-        """Whose error a timeout is."""
+        """The error source of a timeout."""
         return f"{self.parameters.index:04X}h"
 
 
 class Rpdos(Service):
-    """All RPDOs of a node. `changed` is told which values a PDO changed, `wrote` after it which ones it brought."""
+    """All RPDOs of a node.
+
+    `changed` is called with the values that a PDO changed, then `wrote` with all that it contained.
+    """
 
     due_ns: int = NEVER
-    """When the first of them is missing."""
+    """When the first timeout is due."""
 
     def __init__(
         self,
@@ -93,7 +96,7 @@ class Rpdos(Service):
         self.due_ns = min((rpdo.deadline_ns for rpdo in self._rpdos), default=NEVER)
 
     def receive(self, can_id: int, payload: bytes, now_ns: int) -> bool:
-        """A data frame. Returns whether it is an RPDO of ours, applied or not."""
+        """Process a data frame. Returns whether it is an RPDO of this node, applied or not."""
         mine = [r for r in self._rpdos if (s := r.parameters.settings).valid and s.can_id == can_id]
         for rpdo in mine:
             if not self._core.operational:
@@ -116,7 +119,7 @@ class Rpdos(Service):
         return bool(mine)
 
     def on_sync(self, now_ns: int) -> None:
-        """A SYNC in OPERATIONAL: what waited is applied."""
+        """Apply the waiting PDOs at a SYNC in OPERATIONAL."""
         for rpdo in self._rpdos:
             if rpdo.waiting is not None:
                 payload, rpdo.waiting = rpdo.waiting, None
@@ -133,7 +136,7 @@ class Rpdos(Service):
         self._emergency.clear_error(emcy.RPDO_TIMEOUT, now_ns, source=rpdo.source)
 
     def _apply(self, rpdo: _Rpdo, payload: bytes, now_ns: int) -> None:
-        """All values or none: one outside its limits refuses the whole PDO, counted."""
+        """Apply all values or none: a value outside its limits refuses the whole PDO, which is counted."""
         data = self._core.data
         packed, position = int.from_bytes(payload, "little"), 0
         values: list[tuple[Key, bytes]] = []
@@ -142,7 +145,7 @@ class Rpdos(Service):
             position += mapped.bits
             entry = data.dictionary.entry(*mapped.key)
             if entry is None or entry.size is None:
-                continue  # a dummy: room that nobody reads
+                continue  # a dummy: padding without an object
             raw = value.to_bytes(max(entry.size, (mapped.bits + 7) // 8), "little")[: entry.size]
             try:
                 data.check_value(entry, raw)

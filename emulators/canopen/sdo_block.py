@@ -1,9 +1,9 @@
-"""Block transfers of the SDO server, one object for each transfer (CiA 301 v4.2, 7.2.4.3.9 to 7.2.4.3.16).
+"""Block transfers of the SDO server, one object per transfer (CiA 301 v4.2, 7.2.4.3.9 to 7.2.4.3.16).
 
-Pure: 8 bytes in, 8 bytes out. It must never know objects, timers or the bus; `sdo_server` has those.
+Pure: it takes and returns frames of 8 bytes. It must never know objects, timers or the bus, which `sdo_server` handles.
 
-A sub-block is up to 127 segments, numbered from 1, acknowledged together. Of a sub-block with a hole only what came before
-the hole counts; the client sends the rest again, numbered from 1.
+A sub-block has up to 127 segments, numbered from 1, which are acknowledged together. If a segment is missing, only the
+segments before it count; the client sends the rest again, numbered from 1.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _LAST = 0x80
 
 @dataclass(slots=True)
 class BlockDownload:
-    """Towards the server. `announced` is the size that the client said, `limit` what may come at most, in bytes."""
+    """A transfer to the server. `announced` is the size that the client stated, `limit` the largest permitted, in bytes."""
 
     index: int
     subindex: int
@@ -29,17 +29,17 @@ class BlockDownload:
     limit: int
     crc: bool
     overflow: Abort = Abort.TOO_LONG
-    """What more than `limit` is refused with."""
+    """The abort code for more than `limit` bytes."""
     block: int = MAX_BLOCK
     """Segments of a sub-block."""
     receiving: bool = True
-    """False once the last segment is here and only the end is awaited."""
+    """False after the last segment, while only the end request is missing."""
     data: bytearray = field(default_factory=bytearray)
     good: int = 0
-    """Number of the last segment of this sub-block that came in its turn."""
+    """Number of the last segment of this sub-block that arrived in sequence."""
 
     def segment(self, data: bytes) -> bytes | None:
-        """One segment; returns the acknowledgement where it ends a sub-block. Raises `SdoAborted`."""
+        """Process one segment; return the acknowledgement if it ends a sub-block. Raises `SdoAborted`."""
         number = data[0] & 0x7F
         if not 1 <= number <= self.block:
             raise abort(self.index, self.subindex, Abort.SEQUENCE)
@@ -48,19 +48,19 @@ class BlockDownload:
             self.good = number
             self.data += data[1:8]
             self.receiving = not last
-            room = max(-(-self.limit // SEGMENT_BYTES), 1) * SEGMENT_BYTES  # nothing at all takes a segment too
+            room = max(-(-self.limit // SEGMENT_BYTES), 1) * SEGMENT_BYTES  # an empty value takes one segment too
             if len(self.data) > room:
                 raise abort(self.index, self.subindex, self.overflow)
         return self.acknowledge() if last or number == self.block else None
 
     def acknowledge(self) -> bytes:
-        """Says up to where the sub-block is good, and begins the next one."""
+        """Return the acknowledgement of the segments received in sequence, and begin the next sub-block."""
         reply = bytes([0xA2, self.good, self.block]) + bytes(5)
         self.good = 0
         return reply
 
     def end(self, data: bytes) -> bytes:
-        """The client's end request: the value. Raises `SdoAborted` where size or CRC do not match."""
+        """Process the client's end request and return the value. Raises `SdoAborted` if size or CRC do not match."""
         unused = data[0] >> 2 & 0x07
         value = bytes(self.data[: len(self.data) - unused])
         if len(value) > self.limit:
@@ -74,7 +74,7 @@ class BlockDownload:
 
 @dataclass(slots=True)
 class BlockUpload:
-    """Towards the client. `block` is how many segments the client takes at once."""
+    """A transfer to the client. `block` is how many segments the client accepts in one sub-block."""
 
     index: int
     subindex: int
@@ -88,7 +88,7 @@ class BlockUpload:
     ending: bool = False
 
     def segments(self) -> list[bytes]:
-        """The sub-block from `offset` on."""
+        """Return the sub-block from `offset` on."""
         frames: list[bytes] = []
         position = self.offset
         while len(frames) < self.block:
@@ -102,13 +102,13 @@ class BlockUpload:
         return frames
 
     def start(self) -> list[bytes]:
-        """The client is ready. Raises `SdoAborted` when it was already."""
+        """Process the client's start. Raises `SdoAborted` if the transfer has already started."""
         if self.sent or self.ending:
             raise self._abort(Abort.COMMAND)
         return self.segments()
 
     def acknowledged(self, data: bytes) -> list[bytes]:
-        """What is sent after the client's acknowledgement, an early one included. Raises `SdoAborted`."""
+        """Return the frames to send after the client's acknowledgement, also after an early one. Raises `SdoAborted`."""
         if not self.sent:
             raise self._abort(Abort.COMMAND)
         number, block = data[1], data[2]

@@ -15,14 +15,14 @@ _ADDITIONAL = range(0x1201, 0x1280)
 _TO_SERVER, _TO_CLIENT = 1, 2
 _INVALID = 1 << 31
 _RESERVED = 0x3FFFF800
-"""The frame bit too: 29-bit identifiers are not supported."""
+"""Includes the frame bit: 29-bit identifiers are not supported."""
 
 
 class SdoChannels(Service):
-    """All SDO servers of a node, each with its own transfer. `tolerate_short` takes requests of fewer than 8 bytes."""
+    """All SDO servers of a node, each with its own transfer. `tolerate_short` accepts requests of fewer than 8 bytes."""
 
     due_ns: int = NEVER
-    """When the first of the transfers wants something."""
+    """When the first transfer needs a call."""
 
     def __init__(self, core: Core, access: ObjectAccess, timeout_ns: int, block: int, *, tolerate_short: bool) -> None:
         self._core = core
@@ -34,7 +34,7 @@ class SdoChannels(Service):
         return index == DEFAULT or index in self._servers
 
     def check_write(self, index: int, subindex: int, raw: bytes) -> None:
-        """The default server's identifiers never change; those of another only while it is invalid."""
+        """Check that only identifiers of an invalid additional server change; those of the default server never do."""
         if subindex not in (_TO_SERVER, _TO_CLIENT):
             return
         if index == DEFAULT:
@@ -59,7 +59,7 @@ class SdoChannels(Service):
             self.reset(now_ns)
 
     def receive(self, can_id: int, data: bytes, now_ns: int) -> bool:
-        """A data frame. Returns whether it is a request to one of the servers, answered or not."""
+        """Process a data frame. Returns whether it is a request to one of the servers, answered or not."""
         for index, server in self._servers.items():
             ids = self._ids(index)
             if ids is not None and ids[0] == can_id:
@@ -84,7 +84,7 @@ class SdoChannels(Service):
         self.due_ns = due_ns
 
     def _ids(self, index: int) -> tuple[int, int] | None:
-        """Identifiers of requests and responses; None where the server is not valid."""
+        """Return the identifiers of requests and responses; None if the server is not valid."""
         if index == DEFAULT:
             return REQUEST + self._core.node_id, RESPONSE + self._core.node_id
         data = self._core.data

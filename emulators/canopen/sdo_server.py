@@ -1,8 +1,8 @@
 """The server side of SDO: expedited, segmented and block transfers (CiA 301 v4.2, 7.2.4.3).
 
-A pure object: one request's 8 bytes and `now` in, the replies' bytes out (a list, since a sub-block of a block transfer
-answers one request with many frames). It must never know objects, NMT states or the bus: what may be read and written is
-asked of an `ObjectAccess`.
+A pure object: it takes one request's 8 bytes and `now`, and returns the replies' bytes (a list, because one request can
+be answered with the many frames of a sub-block). It must never know objects, NMT states or the bus: an `ObjectAccess`
+decides what may be read and written.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from fieldtwin.emulators.canopen.sdo_block import MAX_BLOCK, BlockDownload, Bloc
 from fieldtwin.gateway.core.errors import SdoAborted
 
 MAX_TRANSFER_BYTES = 1 << 20
-"""The longest value a client may write; more is refused with 05040005."""
+"""The longest value that a client may write; a longer one is refused with 05040005."""
 
 _MUX = struct.Struct("<HB")
 _ABORT = 0x80
@@ -27,15 +27,18 @@ class ObjectAccess(Protocol):
     """The object dictionary as an SDO client sees it. Every method raises `SdoAborted` to refuse."""
 
     def read(self, index: int, subindex: int, now_ns: int) -> bytes:
-        """The value."""
+        """Return the value."""
         ...
 
     def begin_write(self, index: int, subindex: int, size: int | None) -> int | None:
-        """Check existence, access and `size` (None if unknown) before data come; the entry's own size, None if any."""
+        """Check existence, access and `size` (None if unknown) before the data arrive.
+
+        Returns the size of the entry, None if every size is valid.
+        """
         ...
 
     def write(self, index: int, subindex: int, raw: bytes, now_ns: int) -> None:
-        """Check and take the value."""
+        """Check and store the value."""
         ...
 
 
@@ -63,10 +66,11 @@ _Transfer = _Download | _Upload | BlockDownload | BlockUpload
 
 
 class SdoServer:
-    """One SDO channel. One transfer at a time; a new initiate replaces a running one.
+    """One SDO channel with one transfer at a time; a new initiate replaces a running transfer.
 
-    While a sub-block of a block download comes in, every frame but an abort is one of its segments: the standard leaves
-    no other way to tell them apart. `block` is how many segments a client may send at once.
+    While a sub-block of a block download is being received, every frame except an abort is taken as one of its
+    segments: the standard offers no other way to distinguish them. `block` is how many segments a client may send in
+    one sub-block.
     """
 
     def __init__(self, access: ObjectAccess, timeout_ns: int, block: int = MAX_BLOCK) -> None:
@@ -97,17 +101,17 @@ class SdoServer:
 
     @property
     def deadline_ns(self) -> int | None:
-        """When `tick` has something to do for the running transfer, None when there is none."""
+        """When `tick` must be called for the running transfer, None if there is none."""
         return self._deadline_ns if self._prompt_ns is None else self._prompt_ns
 
     def reset(self) -> None:
-        """Forget a running transfer silently (NMT reset, STOPPED)."""
+        """Drop a running transfer silently (NMT reset, STOPPED)."""
         self._transfer = None
         self._deadline_ns = None
         self._prompt_ns = None
 
     def request(self, data: bytes, now_ns: int) -> list[bytes]:
-        """Answer one request of exactly 8 bytes; no reply to a client's abort nor inside a sub-block."""
+        """Answer one request of exactly 8 bytes; there is no reply to a client's abort or inside a sub-block."""
         try:
             replies = self._dispatch(data, now_ns)
         except SdoAborted as e:
@@ -118,10 +122,10 @@ class SdoServer:
         return replies
 
     def tick(self, now_ns: int) -> list[bytes]:
-        """Time passed. A transfer whose client fell silent is given up: one abort, 05040000.
+        """Process the passage of time. A transfer whose client is silent for too long is aborted with 05040000.
 
-        Inside a sub-block half that silence means that its end got lost: what is good is acknowledged, and the client sends
-        the rest again.
+        Inside a sub-block, half of that time without a segment means that its end was lost: the segments received in
+        sequence are acknowledged, and the client sends the rest again.
         """
         transfer = self._transfer
         if transfer is None or self._deadline_ns is None:
@@ -164,7 +168,7 @@ class SdoServer:
         return [b"\x60" + data[1:4] + bytes(4)]
 
     def _room(self, index: int, subindex: int, size: bytes) -> tuple[int | None, int, Abort]:
-        """What the client announces, what may come at most, and how more is refused. Raises `SdoAborted` before any data come."""
+        """Return the announced size, the limit, and the abort code for more. Raises `SdoAborted` before any data come."""
         announced = int.from_bytes(size, "little") if size else None
         own = self._access.begin_write(index, subindex, announced)
         if announced is not None and announced > MAX_TRANSFER_BYTES:
@@ -250,7 +254,7 @@ class SdoServer:
         return []
 
     def _initiate_block_upload(self, data: bytes, now_ns: int) -> list[bytes]:
-        """A value that is no longer than the client's threshold (pst) is given by an ordinary upload."""
+        """Start a block upload; a value not longer than the client's threshold (pst) is sent by an ordinary upload."""
         self.reset()
         index, subindex = _MUX.unpack_from(data, 1)
         raw = self._access.read(index, subindex, now_ns)
@@ -267,7 +271,7 @@ class SdoServer:
             raise abort(transfer.index, transfer.subindex, Abort.TOGGLE)
 
     def _out_of_turn(self) -> SdoAborted:
-        """A command that is unknown, or of a transfer that is not under way: named after the transfer that there is."""
+        """Return the abort for an unknown or unexpected command, with the object of the running transfer."""
         transfer = self._transfer
         index, subindex = (transfer.index, transfer.subindex) if transfer else (0, 0)
         return abort(index, subindex, Abort.COMMAND)

@@ -1,4 +1,4 @@
-"""Runs an emulated node on a CAN connection: the thin asynchronous shell around `CanopenNode`.
+"""Runs an emulated node on a CAN connection: the asynchronous shell around `CanopenNode`.
 
 It must never know the protocol: it moves frames and waits.
 """
@@ -17,34 +17,37 @@ from fieldtwin.gateway.core.connection import CanConnection
 from fieldtwin.gateway.core.nursery import Nursery
 
 Poke = Callable[[int], list[CanFrame]]
-"""Something that happens in the device: called with the time, returns what the node then sends."""
+"""An event inside the device: called with the time, it returns the frames that the node then sends."""
 
 
 @runtime_checkable
 class TakesBack(Protocol):
-    """A connection that can still take back what waits for the bus. A kernel's interface cannot."""
+    """A connection that can withdraw frames that still wait for the bus. A kernel interface cannot."""
 
     def withdraw(self, can_ids: Collection[int], /) -> list[CanFrame]:
-        """The frames that were taken back, in order."""
+        """Return the frames that were withdrawn, in order."""
         ...
 
 
 @runtime_checkable
 class SendsAtOnce(Protocol):
-    """A connection of this process, whose queue as a rule has room. A socket's is the kernel's."""
+    """A connection of this process, whose queue usually has room. A socket's queue belongs to the kernel."""
 
     def send_at_once(self, frame: CanFrame, /) -> bool:
-        """Queue `frame` now. False where that would take longer: nothing happened, and `send` waits. Raises `ConnectionLost`."""
+        """Queue `frame` now.
+
+        Return False, without an effect, if that would block; then use `send`. Raises `ConnectionLost`.
+        """
         ...
 
 
 async def serve_node(
     connection: CanConnection, node: CanopenNode, clock: Clock, pokes: asyncio.Queue[Poke] | None = None
 ) -> None:
-    """Power the node on and serve it until cancelled. What is put into `pokes` is done in between (`node.set_value`...).
+    """Power the node on and serve it until cancelled. Callables put into `pokes` run in between (`node.set_value`...).
 
-    Raises `ConnectionLost` when the bus goes away, and what the node raises. The connection stays open: it is the
-    caller's. Synchronous TPDOs that are late are taken back where the connection can (`TakesBack`).
+    Raises `ConnectionLost` if the bus is lost, and the errors of the node. The caller owns the connection, which stays
+    open. Late synchronous TPDOs are withdrawn if the connection supports it (`TakesBack`).
     """
     connection.accept = node.accepts
     shell = _Shell(connection, node, clock)
@@ -57,10 +60,10 @@ async def serve_node(
 
 
 class _Shell:
-    """A node between frames and time. One thing at a time: what follows from it is sent before the next is looked at.
+    """Serialises frames and time for a node: the output of one event is sent before the next event is processed.
 
-    Where the connection can send at once and nobody is in the midst of something, all is done on the spot, by the timer's
-    callback itself; else by a task that holds the turn.
+    If the connection can send immediately and no other event is in progress, the event is processed in the callback
+    itself, otherwise by a task that holds the lock.
     """
 
     def __init__(self, connection: CanConnection, node: CanopenNode, clock: Clock) -> None:
@@ -70,7 +73,7 @@ class _Shell:
         self._clock = clock
         self._turn = asyncio.Lock()
         self._left: list[CanFrame] = []
-        """What was begun on the spot and found no room: whoever has the turn next sends it before anything else."""
+        """Frames of an event for which there was no room; the next holder of the lock sends them first."""
         self._overdue: Collection[int] = ()
         self._failed: Exception | None = None
         self._woken = asyncio.Event()
@@ -116,14 +119,14 @@ class _Shell:
             self._failed = e
             self._woken.set()
 
-    # -- on the spot ----------------------------------------------------------------------------------------------------
+    # -- in the callback ------------------------------------------------------------------------------------------------
 
     def _may_do_at_once(self) -> bool:
-        """Whether nobody has the turn, and nothing is left over."""
+        """Return whether the lock is free and no frames are left over."""
         return self._send_at_once is not None and not (self._left or self._overdue or self._turn.locked())
 
     def _do_at_once(self, frames: list[CanFrame]) -> None:
-        """Send what came of something. What cannot go out now is left to `tick`, and the timer with it."""
+        """Send the frames of an event. Frames that cannot be sent now, and the timer, are left to `tick`."""
         send_at_once = self._send_at_once
         assert send_at_once is not None
         for sent, frame in enumerate(frames):
@@ -137,7 +140,7 @@ class _Shell:
         else:
             self._set_timer()
 
-    # -- in turn --------------------------------------------------------------------------------------------------------
+    # -- under the lock -------------------------------------------------------------------------------------------------
 
     async def _do(self, what: Poke) -> None:
         async with self._turn:
@@ -147,7 +150,7 @@ class _Shell:
             self._set_timer()
 
     async def _follow_up(self) -> None:
-        """Send what is left, and take back what is late; somebody who came first may have left it."""
+        """Send left-over frames and withdraw late ones, which an earlier event may have left."""
         await self._send_left()
         overdue = self._overdue or self._node.take_overdue()
         self._overdue = ()

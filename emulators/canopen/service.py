@@ -1,7 +1,7 @@
-"""What the node's communication objects have in common: the core that they share and the hooks that they fill.
+"""Common parts of the node's communication objects: the core that they share and the hooks that they implement.
 
-A service is the behaviour behind some indices (heartbeat behind 1016h and 1017h, the TPDOs behind 1800h...). Services
-know the core, never the SDO server nor each other, save where one is given to another's constructor.
+A service is the behaviour of some indices (heartbeat of 1016h and 1017h, the TPDOs of 1800h...). Services know the
+core, but not the SDO server or each other, unless one is passed to a different one's constructor.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ _OPERATIONAL = NmtState.OPERATIONAL
 
 @dataclass(slots=True)
 class NodeCounters:
-    """What a node did since it was made; never reset by NMT.
+    """Counters of a node since its creation; NMT never resets them.
 
-    `sdo_requests` are request frames that were taken (a client's abort is none), `sdo_replies` the frames that answered
-    them, aborts among them: without block transfers the two are equal. `sdo_aborts` are all aborts sent, those after a
-    timeout included, which answer nothing. `ignored` are frames for this node that the standard tells it to ignore,
-    `frames_muted` those that it could not send in bus-off or while its bit rate changes. `tpdos_late` were taken back: they had
-    not got onto the bus when the synchronous window was over.
+    `sdo_requests` counts accepted request frames (not a client's aborts), `sdo_replies` the frames that answered them,
+    aborts included: without block transfers the two are equal. `sdo_aborts` counts all aborts sent, including those
+    after a timeout, which answer nothing. `ignored` counts frames for this node that the standard requires it to
+    ignore, `frames_muted` those that it could not send in bus-off or while its bit rate changes. `tpdos_late` were
+    withdrawn because they were not on the bus when the synchronous window ended.
     """
 
     frames_in: int = 0
@@ -59,12 +59,12 @@ class NodeCounters:
     ignored: int = 0
 
     def as_dict(self) -> dict[str, int]:
-        """By name, for a summary."""
+        """Return the counters by name, for a summary."""
         return {f.name: getattr(self, f.name) for f in fields(self)}
 
 
 class SentPdo(msgspec.Struct, frozen=True, gc=False):
-    """One TPDO that left the node."""
+    """One TPDO that the node sent."""
 
     t_ns: int
     cob_id: int
@@ -73,9 +73,11 @@ class SentPdo(msgspec.Struct, frozen=True, gc=False):
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """Something about the node changed: `what` is ``nmt``, ``write`` (SDO), ``rpdo``, ``set`` (the device itself),
-    ``emcy``, ``time`` or ``lss``. `index`, `subindex` and `data` are the object and its new bytes; for ``nmt`` the state, for
-    ``emcy`` the 8 bytes of the message, for ``time`` the TIME_OF_DAY, for ``lss`` the new node id; without an object, index 0.
+    """A change of the node.
+
+    `what` is ``nmt``, ``write`` (SDO), ``rpdo``, ``set`` (the device itself), ``emcy``, ``time`` or ``lss``. `index`,
+    `subindex` and `data` are the object and its new bytes; for ``nmt`` the state, for ``emcy`` the 8 bytes of the
+    message, for ``time`` the TIME_OF_DAY, for ``lss`` the new node ID. Without an object, index is 0.
     """
 
     t_ns: int
@@ -89,27 +91,27 @@ _VALUES = frozenset({"write", "rpdo", "set"})
 """Changes whose data are an object's value."""
 
 Held = Callable[[Mapping[tuple[int, int], bytes], int], None]
-"""Told (values by object, now_ns) of what the node's objects hold from now on: the oracle of a prototype run."""
+"""Called with (values by object, now_ns) when the node's objects change: the reference values of a prototype run."""
 
 
 class Source(Protocol):
     """Values that change by themselves: a recorded or computed signal."""
 
     def __call__(self, now_ns: int, /) -> dict[tuple[int, int], bytes]:
-        """On-wire bytes by (index, subindex) at `now_ns`. Must be cheap: asked for every TPDO and SDO read.
+        """Return on-wire bytes by (index, subindex) at `now_ns`. Must be cheap: called for every TPDO and SDO read.
 
-        Being asked is no event: what the source plays is sent by event timer, SYNC or remote frame. A change that is
-        to be sent by itself is told with `CanopenNode.set_value`.
+        A call is not an event: the source's values are sent by event timer, SYNC or remote frame. Use
+        `CanopenNode.set_value` for a change that must trigger a TPDO.
         """
         ...
 
 
 @runtime_checkable
 class AnswersReads(Protocol):
-    """A source that besides gives an object's value for each upload of it: what was recorded, read by read."""
+    """A source that can also give an object's value for each upload of it, as recorded read by read."""
 
     def answer(self, key: tuple[int, int], now_ns: int, /) -> bytes | None:
-        """On-wire bytes for the upload that begins, or None to leave the object as it is."""
+        """Return on-wire bytes for the upload that begins, or None to leave the object unchanged."""
         ...
 
 
@@ -140,7 +142,7 @@ class Core:
         return self.state is _OPERATIONAL
 
     def send(self, can_id: int, data: bytes, now_ns: int) -> None:
-        """Queue a frame for this turn's output; while the node is mute it is lost, and counted."""
+        """Queue a frame for output; while the node is mute the frame is dropped and counted."""
         if self.mutes:
             self.counters.frames_muted += 1
             return
@@ -148,12 +150,12 @@ class Core:
         self.counters.frames_out += 1
 
     def take_output(self) -> list[CanFrame]:
-        """The frames of this turn, in the order of sending."""
+        """Return the queued frames in the order of sending, and clear the queue."""
         out, self._out = self._out, []
         return out
 
     def refresh(self, now_ns: int) -> None:
-        """Take the source's values of `now_ns`. Raises `UsageError` when they do not fit the dictionary."""
+        """Take the source's values of `now_ns`. Raises `UsageError` if they do not fit the dictionary."""
         if self._source is not None:
             values, put = self._source(now_ns), self.data.put
             for (index, subindex), raw in values.items():
@@ -162,7 +164,7 @@ class Core:
                 self.held(values, now_ns)
 
     def answer(self, key: tuple[int, int], now_ns: int) -> None:
-        """A client's upload begins: take the source's values, and the one that is for this read. Raises as `refresh`."""
+        """Prepare a client's upload: take the source's values, and the one for this read. Raises what `refresh` raises."""
         self.refresh(now_ns)
         raw = None if self.answers is None else self.answers.answer(key, now_ns)
         if raw is not None:
@@ -171,14 +173,14 @@ class Core:
                 self.held({key: raw}, now_ns)
 
     def note(self, now_ns: int, what: str, index: int, subindex: int, data: bytes) -> None:
-        """One line in the journal of changes."""
+        """Add an entry to the journal of changes."""
         self.changes.append(Change(now_ns, what, index, subindex, data))
         if self.held is not None and what in _VALUES:
             self.held({(index, subindex): data}, now_ns)
 
 
 NEVER = 1 << 63
-"""A time that does not come."""
+"""A time that is never reached."""
 
 
 class Service:
@@ -186,33 +188,35 @@ class Service:
 
     @property
     def waits(self) -> bool:
-        """Whether it can ever be due: a data sheet without its objects makes that impossible, for good."""
+        """Whether the service can ever be due: without its objects in the data sheet, it never can."""
         return True
 
     @property
     def due_ns(self) -> int:
-        """When `tick` has something to do next. Asked for after all that happens: a service that waits for one time keeps it
-        as an attribute of this name."""
+        """When `tick` has something to do next.
+
+        It is read after every event, so a service that waits for one time keeps it as an attribute of this name.
+        """
         return NEVER
 
     def owns(self, index: int) -> bool:
-        """Whether `check_*` and `wrote` are to be called for `index`."""
+        """Return whether `check_*` and `wrote` must be called for `index`."""
         return False
 
     def check_read(self, index: int, subindex: int) -> None:
-        """Before a client's read."""
+        """Called before a client's read."""
 
     def check_write(self, index: int, subindex: int, raw: bytes) -> None:
-        """Before a client's write, after length and limits were found good. Live values are still the old ones."""
+        """Called before a client's write, after length and limits were checked. Live values are still the old ones."""
 
     def wrote(self, index: int, subindex: int, now_ns: int) -> None:
-        """After a client's write."""
+        """Called after a client's write."""
 
     def reset(self, now_ns: int) -> None:
-        """After reset node or reset communication: values are back at power-on."""
+        """Called after reset node or reset communication: values are back at power-on."""
 
     def state_changed(self, now_ns: int) -> None:
-        """After a change of NMT state, except the one to INITIALISING."""
+        """Called after a change of NMT state, except the one to INITIALISING."""
 
     def tick(self, now_ns: int) -> None:
         """Do what is due. Called once `due_ns` has come."""

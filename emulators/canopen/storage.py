@@ -1,6 +1,6 @@
 """Store parameters (1010h) and restore default parameters (1011h): CiA 301 v4.2, 7.5.2.13 and 14.
 
-What is stored lives as long as the emulated node does. Restored defaults take effect at the next reset.
+Stored values last as long as the emulated node. Restored defaults take effect at the next reset.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from fieldtwin.emulators.canopen.service import Core, Service
 STORE, RESTORE = 0x1010, 0x1011
 _SIGNATURES = {STORE: b"save", RESTORE: b"load"}
 _ON_COMMAND = 1
-"""Reads as: stores on command, not by itself."""
+"""Read value: the device stores on command, not autonomously."""
 
 
 class Storage(Service):
-    """Acts only on the signatures ``save`` and ``load``; reads tell what is supported."""
+    """Acts only on the signatures ``save`` and ``load``; reads return the supported functions."""
 
     def __init__(self, core: Core) -> None:
         self._core = core
@@ -29,7 +29,7 @@ class Storage(Service):
             raise abort(index, subindex, Abort.NOT_STORED)
 
     def wrote(self, index: int, subindex: int, now_ns: int) -> None:
-        self._announce()  # the signature itself is no value to be read back
+        self._announce()  # the signature itself cannot be read back
         if index == STORE:
             self._core.data.store(Group(subindex))
         else:

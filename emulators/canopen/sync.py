@@ -1,8 +1,8 @@
 """SYNC: consumer, producer, counter and window (CiA 301 v4.2, 7.2.5; 1005h, 1006h, 1007h, 1019h).
 
-A node that is told a cycle (1006h) and hears no SYNC for one and a half of it reports 8100h until SYNC is back; the
-standard has no code of its own for that. Synchronous PDOs have the window (1007h) to go by: an RPDO that comes after it
-waits for nothing, a TPDO that has not got onto the bus by then is dropped.
+A node with a cycle period (1006h) that hears no SYNC for one and a half periods reports 8100h until SYNC returns; the
+standard defines no specific code for that. The window (1007h) limits synchronous PDOs: an RPDO that arrives after it is
+refused, a TPDO that is not on the bus by then is dropped.
 """
 
 from __future__ import annotations
@@ -22,7 +22,9 @@ _SOURCE = "sync"
 
 
 class Sync(Service):
-    """Calls `on_sync(counter, now_ns)` for each good SYNC in OPERATIONAL, its own included; `counter` is None without 1019h."""
+    """Calls `on_sync(counter, now_ns)` for each valid SYNC in OPERATIONAL, its own included; `counter` is None without
+    1019h.
+    """
 
     def __init__(self, core: Core, emergency: emcy.Emergency, on_sync: Callable[[int | None, int], None]) -> None:
         self._core = core
@@ -68,7 +70,9 @@ class Sync(Service):
         self._counter = 1
 
     def state_changed(self, now_ns: int) -> None:
-        """The producer counts from 1 again after STOPPED; nobody misses a SYNC that STOPPED does not hear."""
+        """Restart the producer's counter at 1 after STOPPED; a SYNC is not missed in STOPPED, where the node does not
+        hear it.
+        """
         if not self._core.communicating:
             self._send_at_ns = self._missing_at_ns = NEVER
         elif self._send_at_ns == NEVER:
@@ -78,7 +82,7 @@ class Sync(Service):
         self._was_stopped = self._core.state is NmtState.STOPPED
 
     def receive(self, frame: CanFrame, now_ns: int) -> bool:
-        """A data frame. Returns whether it is the SYNC, good or not."""
+        """Process a data frame. Returns whether it is the SYNC, valid or not."""
         if frame.can_id != self._can_id:
             return False
         if not self._core.communicating:
@@ -93,7 +97,7 @@ class Sync(Service):
         return True
 
     def in_window(self, now_ns: int) -> bool:
-        """Whether a synchronous PDO still counts for this cycle; the first that does not is reported."""
+        """Return whether a synchronous PDO is in time for this cycle; report the first one that is not."""
         end_ns = self.window_end_ns
         if end_ns is None or now_ns <= end_ns:
             return True
@@ -101,7 +105,7 @@ class Sync(Service):
         return False
 
     def late(self, now_ns: int) -> None:
-        """A synchronous PDO missed the window; said once a cycle."""
+        """Report that a synchronous PDO missed the window, once per cycle."""
         if not self._late_told:
             self._late_told = True
             self._emergency.report(emcy.COMMUNICATION_ERROR, now_ns, register=emcy.COMMUNICATION)
@@ -121,7 +125,7 @@ class Sync(Service):
 
     @property
     def due_ns(self) -> int:
-        """When a SYNC is missing, or to be sent."""
+        """When a SYNC is detected as missing, or must be sent."""
         return self._missing_at_ns if self._missing_at_ns < self._send_at_ns else self._send_at_ns
 
     @property

@@ -1,7 +1,8 @@
 """TIME: consumer and producer of the network's time of day (CiA 301 v4.2, 7.2.6; 1012h).
 
-Six bytes: milliseconds after midnight in 28 bits, days since 1 January 1984 in 16. The node's own clock is what was told
-last, and the time since. When to produce is the application's: every `period_ns`, 0 for never.
+Six bytes: milliseconds after midnight in 28 bits, days since 1 January 1984 in 16. The node's own clock is the last
+time received or set, plus the time elapsed since. The application decides when to produce: every `period_ns`, 0 for
+never.
 """
 
 from __future__ import annotations
@@ -26,22 +27,22 @@ class TimeOfDay:
     ms: int
 
     def to_bytes(self) -> bytes:
-        """TIME_OF_DAY on the wire."""
+        """Return TIME_OF_DAY as on the wire."""
         return self.ms.to_bytes(4, "little") + self.days.to_bytes(2, "little")
 
     @classmethod
     def from_bytes(cls, raw: bytes) -> TimeOfDay:
-        """The upper 4 of the 32 bits are reserved and ignored."""
+        """Return the time in `raw`. The upper 4 of the 32 bits are reserved and ignored."""
         return cls(int.from_bytes(raw[4:6], "little"), int.from_bytes(raw[:4], "little") & 0x0FFFFFFF)
 
     def later(self, ms: int) -> TimeOfDay:
-        """So many milliseconds after."""
+        """Return the time of day `ms` milliseconds later."""
         total = self.days * _MS_PER_DAY + self.ms + ms
         return TimeOfDay(total // _MS_PER_DAY & 0xFFFF, total % _MS_PER_DAY)
 
 
 class TimeService(Service):
-    """The node's time of day; None until it is told."""
+    """The node's time of day; None until it has been set or received."""
 
     due_ns: int = NEVER
     """When to produce it next."""
@@ -52,7 +53,7 @@ class TimeService(Service):
         self._told: tuple[TimeOfDay, int] | None = None
 
     def now(self, now_ns: int) -> TimeOfDay | None:
-        """The time of day at `now_ns`."""
+        """Return the time of day at `now_ns`."""
         if self._told is None:
             return None
         told, at_ns = self._told
@@ -84,7 +85,7 @@ class TimeService(Service):
         self._schedule(now_ns)
 
     def receive(self, can_id: int, data: bytes, now_ns: int) -> bool:
-        """A data frame. Returns whether it is the TIME that the node listens to, good or not."""
+        """Process a data frame. Returns whether it is the TIME that the node consumes, valid or not."""
         cob_id = self._core.data.number(COB_ID)
         if not cob_id & _CONSUMES or can_id != cob_id & 0x7FF:
             return False

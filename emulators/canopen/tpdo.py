@@ -1,11 +1,11 @@
-"""Transmit PDOs: when each is sent and with what (CiA 301 v4.2, 7.2.2 and 7.5.2.37).
+"""Transmit PDOs: when each is sent and with what data (CiA 301 v4.2, 7.2.2 and 7.5.2.37).
 
-Transmission types: 0 at the SYNC after an event, 1 to 240 every n-th SYNC, 252 sampled at SYNC and 253 fresh on a remote
-frame, 254 and 255 on an event. Events are: the event timer, a mapped value changed, the PDO became active. Inhibit time
-and event timer bind event-driven PDOs only, and both are kept.
+Transmission types: 0 at the SYNC after an event, 1 to 240 every n-th SYNC, 252 sampled at SYNC and 253 fresh on a
+remote frame, 254 and 255 on an event. Events are: the event timer, a change of a mapped value, the activation of the
+PDO. Inhibit time and event timer apply only to event-driven PDOs, and both are observed.
 
-What SYNC made the node send is late when it still waits for the bus at the end of the synchronous window (1007h):
-`take_overdue` names it, and whoever holds the transmit queue takes it back.
+A PDO that SYNC triggered is late if it still waits for the bus at the end of the synchronous window (1007h):
+`take_overdue` returns its identifier, and the owner of the transmit queue withdraws it.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ class _Tpdo:
     """End of the inhibit time."""
     syncs: int = 0
     started: bool = False
-    """The SYNC whose counter equals the start value came by."""
+    """The SYNC whose counter equals the start value has occurred."""
     sample: bytes | None = None
 
     def due_ns(self) -> int:
-        """When an event-driven PDO is to be sent next."""
+        """Return when an event-driven PDO must be sent next."""
         settings = self.parameters.settings
         if settings.type < 254 or not settings.valid:
             return NEVER
@@ -51,11 +51,11 @@ class Tpdos(Service):
     def __init__(self, core: Core, window_end_ns: Callable[[], int | None]) -> None:
         self._core = core
         self._window_end_ns = window_end_ns
-        self._of_sync: set[int] = set()  # identifiers that the last SYNC had sent, until its window ends
+        self._of_sync: set[int] = set()  # identifiers sent because of the last SYNC, until its window ends
         self._overdue: frozenset[int] = frozenset()
         self._event_ns = NEVER
         self._event_of = -1
-        """The version of the values that `_event_ns` follows from; -1 once something here changed."""
+        """The version of the values that `_event_ns` follows from; -1 after a change in this object."""
         self._tpdos = [_Tpdo(PdoParameters(core.data, index)) for index in pdo_indices(core.data, _FIRST)]
 
     @property
@@ -95,7 +95,7 @@ class Tpdos(Service):
             self._activate(tpdo, now_ns)
 
     def changed(self, keys: Iterable[Key], now_ns: int) -> None:
-        """Values changed inside the device: the event of those PDOs that map them."""
+        """Process values that changed inside the device: an event for the PDOs that map them."""
         if self._core.operational:
             keys = set(keys)
             for tpdo in self._tpdos:
@@ -116,7 +116,7 @@ class Tpdos(Service):
 
     @property
     def due_ns(self) -> int:
-        """When an event is to be told, or the synchronous window is over."""
+        """When an event must be sent, or the synchronous window ends."""
         core, due_ns = self._core, NEVER
         if core.operational and not core.mutes:
             if self._event_of != core.data.version:
@@ -128,12 +128,12 @@ class Tpdos(Service):
         return due_ns
 
     def take_overdue(self) -> frozenset[int]:
-        """Identifiers of what the last SYNC had sent, once its window is over; each SYNC's once."""
+        """Return the identifiers sent because of the last SYNC, after the end of its window; once per SYNC."""
         overdue, self._overdue = self._overdue, frozenset()
         return overdue
 
     def dropped(self, frames: Iterable[CanFrame]) -> None:
-        """These, as `CanopenNode` gave them, never got onto the bus."""
+        """Uncount frames, as returned by `CanopenNode`, that never got onto the bus."""
         for frame in frames:
             self._core.counters.tpdos_late += 1
             self._core.counters.tpdos -= 1
@@ -142,7 +142,7 @@ class Tpdos(Service):
                 self._core.journal.remove(SentPdo(frame.t_ns, frame.can_id, frame.data))
 
     def on_sync(self, counter: int | None, now_ns: int) -> None:
-        """A SYNC in OPERATIONAL; `counter` is its own where it carries one."""
+        """Process a SYNC in OPERATIONAL; `counter` is its counter if it carries one."""
         self._of_sync.clear()
         self._overdue = frozenset()
         for tpdo in self._tpdos:
@@ -150,7 +150,7 @@ class Tpdos(Service):
                 self._on_sync(tpdo, counter, now_ns)
 
     def on_remote(self, can_id: int, now_ns: int) -> bool:
-        """A remote frame. Returns whether it asked for a TPDO of ours; an answer is queued where one is allowed."""
+        """Process a remote frame. Returns whether it requests a TPDO of this node; queues an answer if one is allowed."""
         for tpdo in self._tpdos:
             settings = tpdo.parameters.settings
             if settings.valid and settings.can_id == can_id:
@@ -160,7 +160,7 @@ class Tpdos(Service):
         return False
 
     def _activate(self, tpdo: _Tpdo, now_ns: int) -> None:
-        """Counters start anew; becoming active is an event. The inhibit time of what was sent goes on."""
+        """Restart the counters; becoming active is an event. The inhibit time of PDOs already sent continues."""
         active = self._core.operational and tpdo.parameters.settings.valid
         self._event_of = -1
         tpdo.pending = active
@@ -199,7 +199,7 @@ class Tpdos(Service):
         settings = tpdo.parameters.settings
         event_ns = settings.event_ns
         on_time = not tpdo.pending and tpdo.event_at_ns is not None
-        # The timer's grid is kept, so that lateness does not add up; after any other event it starts anew.
+        # The timer keeps its grid, so that delays do not add up; after any other event it restarts.
         next_ns = (tpdo.event_at_ns or 0) + event_ns if on_time else now_ns + event_ns
         tpdo.event_at_ns = (next_ns if next_ns > now_ns else now_ns + event_ns) if event_ns else None
         tpdo.pending = False
@@ -210,7 +210,7 @@ class Tpdos(Service):
     def _transmit(self, tpdo: _Tpdo, data: bytes | None, now_ns: int) -> None:
         data = self._build(tpdo, now_ns) if data is None else data
         if not data or self._core.mutes:
-            return  # nothing mapped: the PDO carries nothing and is not sent
+            return  # nothing is mapped: the PDO is empty and is not sent
         can_id = tpdo.parameters.settings.can_id
         self._core.counters.tpdos += 1
         self._core.journal.append(SentPdo(now_ns, can_id, data))

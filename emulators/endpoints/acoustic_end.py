@@ -1,7 +1,9 @@
-"""The water between processes: one serves the medium on a Unix socket, and the modems of the others have their ends of it here.
+"""The acoustic channel between processes: one process serves the medium on a Unix socket, the modems of others connect
+to it.
 
-A frame is a kind, a length in two bytes (big endian) and so many bytes: `M` the modem's name, first of all; `S` say this; `A` it
-was taken, there is room again; `H` this was heard. Without the server a modem takes nothing and hears nothing, and goes on.
+A frame is a kind, a length in two bytes (big endian) and that number of bytes: `M` the modem's name, sent first; `S`
+send this packet; `A` the packet was accepted, there is room again; `H` this packet was received. Without the server a
+modem accepts and receives nothing, and keeps running.
 """
 
 from __future__ import annotations
@@ -17,13 +19,13 @@ from fieldtwin.gateway.core.errors import Desync, EndpointBusy, FieldtwinError, 
 from fieldtwin.gateway.core.nursery import Nursery
 
 ROOM = 2
-"""Packets that a modem hands over before the first is taken."""
+"""Packets that a modem hands over before the first is accepted."""
 HEARD = 64
 _LONGEST = 1024
 
 
 async def _read(reader: asyncio.StreamReader) -> tuple[bytes, bytes]:
-    """A frame's kind and content. Raises `asyncio.IncompleteReadError` at the end, `Desync` for what is none."""
+    """Return a frame's kind and content. Raises `asyncio.IncompleteReadError` at the end, `Desync` for an invalid frame."""
     head = await reader.readexactly(3)
     length = int.from_bytes(head[1:])
     if length > _LONGEST:
@@ -42,7 +44,7 @@ async def _close(writer: asyncio.StreamWriter) -> None:
 
 
 class AcousticServer:
-    """``await server.open(path)``, then ``await server.run()`` beside it. One connection a modem."""
+    """Serves the medium: ``await server.open(path)``, then ``await server.run()`` in parallel. One connection per modem."""
 
     def __init__(self, medium: AcousticMedium, clock: Clock) -> None:
         self._medium = medium
@@ -55,7 +57,7 @@ class AcousticServer:
         self._serving: list[asyncio.Task[None]] = []
 
     async def open(self, path: Path) -> None:
-        """Raises `EndpointBusy`."""
+        """Listen on the Unix socket. Raises `EndpointBusy`."""
         path.unlink(missing_ok=True)
         try:
             self._server = await asyncio.start_unix_server(self._serve, path)
@@ -63,7 +65,7 @@ class AcousticServer:
             raise EndpointBusy(f"cannot serve the water: {e.strerror}", where=str(path)) from e
 
     async def run(self) -> None:
-        """Hand on what is heard, until cancelled."""
+        """Forward received packets to the modems, until cancelled."""
         while True:
             now_ns = self._clock.monotonic_ns()
             self._medium.advance(now_ns)
@@ -81,7 +83,7 @@ class AcousticServer:
             writer.write(_frame(b"H", heard))
 
     async def _until(self, t_ns: int | None) -> None:
-        """Until something happens in the water, or somebody wants to speak."""
+        """Wait until an event occurs in the channel, or a modem wants to send."""
         left_s = None if t_ns is None else max(0.0, (t_ns - self._clock.monotonic_ns()) / 1e9)
         with suppress(TimeoutError):
             async with asyncio.timeout(left_s):
@@ -97,7 +99,7 @@ class AcousticServer:
             if kind != b"M" or name not in self._medium.counters or name in self._writers:
                 return
             self._writers[name], self._wanted[name] = writer, deque()
-            writer.write(_frame(b"A"))  # it is in the water
+            writer.write(_frame(b"A"))  # the modem has joined the channel
             while True:
                 kind, content = await _read(reader)
                 if kind == b"S" and len(self._wanted[name]) < ROOM:
@@ -123,7 +125,7 @@ class AcousticServer:
 
 
 class AcousticEnd:
-    """A modem's end of water that another process serves (`fieldtwin.emulators.models.packet_link.ModemEnd`)."""
+    """A modem's end of a channel that another process serves (`fieldtwin.emulators.models.packet_link.ModemEnd`)."""
 
     def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self.sent = self.resent = self.delivered = 0
@@ -136,7 +138,7 @@ class AcousticEnd:
 
     @classmethod
     async def open(cls, path: Path, name: str) -> AcousticEnd:
-        """The end of the modem `name`. Raises `Unreachable`."""
+        """Return the end of the modem `name`. Raises `Unreachable`."""
         try:
             reader, writer = await asyncio.open_unix_connection(path)
         except OSError as e:

@@ -1,8 +1,8 @@
-"""Two CAN buses joined: what is on one is sent on the other, both ways. For the software bus and a kernel's interface.
+"""Joins two CAN buses: each frame on one is sent on the other. For the software bus and kernel interfaces.
 
-Nothing comes back: neither end receives what it sent itself, so a frame crosses once. Error frames stay where they are: they tell
-of one controller, not of a bus. A bus that is full holds the other direction's frames back, in a bounded queue; what comes beyond
-it is lost and counted. What the frames mean is not known here.
+Frames are not sent back, because an end does not receive what it sent itself. Error frames are not forwarded: they
+concern one controller, not a bus. While one bus is full, the frames of the other direction wait in a bounded queue;
+further frames are lost and counted. The bridge does not interpret frames.
 """
 
 from __future__ import annotations
@@ -14,18 +14,18 @@ from fieldtwin.gateway.core.errors import FieldtwinError, WireError
 
 
 class CanBridge:
-    """Runs from `start` to `aclose`, or until one of the two buses is gone: `ended` then gives why."""
+    """Runs from `start` to `aclose`, or until one of the two buses is lost: `ended` then holds the reason."""
 
     def __init__(self, one: CanConnection, other: CanConnection) -> None:
         self.forwarded = {str(one.endpoint): 0, str(other.endpoint): 0}
-        """Frames by the endpoint that they came from."""
+        """Number of frames by the endpoint that they came from."""
         self._ends = (one, other)
         self._refused = 0
         self._tasks: list[asyncio.Task[None]] = []
         self.ended: asyncio.Future[FieldtwinError] = asyncio.get_running_loop().create_future()
 
     def start(self) -> None:
-        """Forward from now on."""
+        """Start forwarding."""
         one, other = self._ends
         for source, sink in ((one, other), (other, one)):
             task = asyncio.create_task(self._pump(source, sink), name=f"bridge {source.endpoint}")
@@ -33,7 +33,7 @@ class CanBridge:
 
     @property
     def lost(self) -> int:
-        """Frames that came faster than the other bus took them."""
+        """Frames that came faster than the other bus accepted them."""
         return self._refused + sum(end.overruns for end in self._ends)
 
     async def aclose(self) -> None:
@@ -56,7 +56,7 @@ class CanBridge:
                 try:
                     await sink.send(frame)
                 except WireError:
-                    self._refused += 1  # a transmit queue that stays full; the next one may fit
+                    self._refused += 1  # the transmit queue stays full; the next frame may fit
                 else:
                     self.forwarded[where] += 1
         except FieldtwinError as e:

@@ -37,7 +37,7 @@ assert _HELLO.size == RECORD_SIZE
 
 
 class Status(IntEnum):
-    """The bus's verdict on a hello."""
+    """The bus's answer to a hello."""
 
     WELCOME = 0
     WRONG_BITRATE = 1
@@ -58,7 +58,7 @@ class Hello:
     data_kbitrate: int = 0
 
     def pack(self) -> bytes:
-        """The 24 bytes."""
+        """Return the 24 bytes."""
         return _HELLO.pack(
             _MARK,
             self.version,
@@ -73,7 +73,7 @@ class Hello:
 
 
 def unpack_hello(record: bytes) -> Hello | None:
-    """The hello in a record of 24 bytes, or None when it is none."""
+    """Return the hello in a record of 24 bytes, or None if the record is not a hello."""
     mark, version, status, options, bitrate, t_ns, magic, window, data_kbitrate = _HELLO.unpack(record)
     if mark != _MARK or magic != _MAGIC:
         return None

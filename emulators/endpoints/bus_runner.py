@@ -1,7 +1,7 @@
-"""The CAN bus model on an event loop: time passes, frames are handed to ports, senders are held back.
+"""The CAN bus model on an event loop: it advances time, delivers frames to ports and holds senders back.
 
-Knows the loop's clock (wall or virtual) and nothing of sockets: the TCP server is one kind of port, an attached
-connection of the same process another.
+It knows the loop's clock (wall or virtual) and no sockets: the TCP server is one kind of port, an attached connection
+of the same process a different one.
 """
 
 from __future__ import annotations
@@ -24,32 +24,37 @@ from fieldtwin.gateway.core.errors import ConnectionLost, FieldtwinError
 
 
 class BusPort(Protocol):
-    """Whoever hangs on the bus. Called from the loop; may not wait."""
+    """A participant of the bus. Called from the loop; may not wait."""
 
     def on_frame(self, frame: CanFrame) -> bool:
-        """A frame of another node ended at `frame.t_ns`. False: no room for it, it is lost here (and counted)."""
+        """Receive a frame of a different node that ended at `frame.t_ns`.
+
+        Return False if there is no room: it is lost and counted.
+        """
         ...
 
     def on_confirmed(self, frame: CanFrame) -> None:
-        """A frame of this node was on the wire; its place in the transmit queue is free."""
+        """Note that a frame of this node was on the wire; its place in the transmit queue is free."""
         ...
 
     def on_error(self, frame: CanFrame, *, violation: bool) -> None:
-        """An error frame of this node's controller (gateway/core/can_error.py): its state changed, or (`violation`) it took part
-        in an attempt that came to an error."""
+        """Receive an error frame of this node's controller (gateway/core/can_error.py).
+
+        The controller's state has changed, or (`violation`) it took part in an attempt that ended in an error.
+        """
         ...
 
     def on_settled(self) -> None:
-        """No more frames for this instant."""
+        """Note that there are no more frames for this instant."""
         ...
 
     def on_bus_closed(self, error: FieldtwinError) -> None:
-        """The bus is gone."""
+        """Note that the bus has closed."""
         ...
 
 
 class _Told(NamedTuple):
-    """What a controller tells its node."""
+    """An error frame from a controller to its node."""
 
     t_ns: int
     order: int
@@ -59,7 +64,7 @@ class _Told(NamedTuple):
 
 
 class BusRunner:
-    """Runs a `CanBus` on the running loop. `paced`: frames take the time they take; otherwise none.
+    """Runs a `CanBus` on the running loop. `paced`: frames take their time on the bus; otherwise none.
 
     A late wake-up delays deliveries and never shifts the bus: frames keep their exact times (`frame.t_ns`).
     """
@@ -96,7 +101,7 @@ class BusRunner:
 
     @property
     def data_bitrate(self) -> int:
-        """That of CAN FD frames with the bit-rate switch, in bit/s."""
+        """Bit rate of CAN FD frames with the bit-rate switch, in bit/s."""
         return self._bus.data_bitrate
 
     @property
@@ -104,11 +109,14 @@ class BusRunner:
         return self._bus.queue_frames
 
     def now_ns(self) -> int:
-        """The loop's clock in ns."""
+        """Return the loop's clock in ns."""
         return int(self._time() * NS_PER_S)
 
     def join(self, port: BusPort, name: str = "", *, listen_only: bool = False) -> int:
-        """The port's node number. Raises `EndpointBusy` when the bus is full, or why the bus closed."""
+        """Add a port and return its node number.
+
+        Raises `EndpointBusy` if the bus is full, or the reason why the bus closed.
+        """
         if self._closed is not None:
             raise self._closed
         node = self._bus.join(self.now_ns(), name, listen_only=listen_only)
@@ -117,15 +125,15 @@ class BusRunner:
         return node
 
     def leave(self, node: int) -> None:
-        """The port hears nothing more; its queued frames still go out."""
+        """Remove a port, which receives nothing more; its queued frames are still sent."""
         if self._ports.pop(node, None) is not None:
             self._bus.leave(node, self.now_ns())
             self._schedule()
 
     def submit(self, node: int, frame: CanFrame, *, more: bool = False, counted: bool = True) -> bool:
-        """Queue a frame; False while the node's transmit queue is full: try again after `on_confirmed`. `counted` as in `CanBus`.
+        """Queue a frame. Return False if the node's transmit queue is full: try again after `on_confirmed`.
 
-        With `more` the caller has further ones, and calls `settle` after the last.
+        `counted` as in `CanBus`. With `more` the caller has further frames, and calls `settle` after the last.
         """
         now_ns = self.now_ns()
         taken = self._bus.submit(node, frame, now_ns, counted=counted)
@@ -134,13 +142,13 @@ class BusRunner:
         return taken
 
     def withdraw(self, node: int, can_ids: Collection[int]) -> list[CanFrame]:
-        """Take back what the node has queued under `can_ids` and is not on the wire yet."""
+        """Withdraw frames of the node with `can_ids` that are queued and not on the wire yet, and return them."""
         taken = self._bus.withdraw(node, can_ids, self.now_ns())
         self._schedule()
         return taken
 
     def settle(self) -> None:
-        """All that a port had at this moment is submitted. Where frames take no time they go out now."""
+        """End a series of submissions with `more`. If frames take no time, they are sent now."""
         if self._bus.instant and not self._pumping and self._timer is None and self._closed is None:
             self._due_ns = self.now_ns()
             self._pump()
@@ -148,23 +156,23 @@ class BusRunner:
             self._schedule()
 
     def disturb(self, rule: Rule) -> None:
-        """Spoil attempts to send as `rule` says (`can_faults.spoil` makes one)."""
+        """Destroy attempts to send as `rule` says (`can_faults.spoil` creates one)."""
         self._bus.disturb(rule)
 
     def undisturb(self, rule: Rule) -> None:
-        """Take a rule away."""
+        """Remove a rule."""
         self._bus.undisturb(rule)
 
     def attach(self, endpoint: Endpoint, name: str = "", max_pending: int = 4096) -> AttachedConnection:
-        """A connection for a node of this process, on the very same bus."""
+        """Return a connection for a node of this process, on the same bus."""
         return AttachedConnection(self, endpoint, name, max_pending)
 
     def stats(self) -> dict[str, Any]:
-        """`CanBus.stats` now."""
+        """Return the present `CanBus.stats`."""
         return self._bus.stats(self.now_ns())
 
     def close(self, error: FieldtwinError) -> None:
-        """Stop the bus and tell every port; what was queued is lost."""
+        """Stop the bus and notify every port; queued frames are lost."""
         self._closed = error
         if self._timer is not None:
             self._timer.cancel()
@@ -184,11 +192,11 @@ class BusRunner:
             due_ns = now_ns
         if self._timer is not None:
             if self._due_ns <= due_ns:
-                return  # it will look again then
+                return  # the pending timer fires early enough
             self._timer.cancel()
         self._due_ns = due_ns
         if due_ns <= now_ns:
-            # Not at once: whoever submits in this turn of the loop takes part in the arbitration.
+            # Not immediately: all nodes that submit in this iteration of the loop take part in the arbitration.
             self._timer = self._loop.call_soon(self._pump)
         else:
             self._timer = self._loop.call_at(due_ns / NS_PER_S, self._pump)
@@ -203,7 +211,7 @@ class BusRunner:
         self._schedule()
 
     def _hand_out(self) -> None:
-        # The loop may fire a timer one clock resolution early; the frame's end is reached then all the same.
+        # The loop may fire a timer one clock resolution early; the end of the frame counts as reached all the same.
         deliveries = self._bus.advance(max(self.now_ns(), self._due_ns))
         told = self._told() if self._bus.has_news else None
         touched: dict[int, BusPort] = {}
@@ -225,7 +233,7 @@ class BusRunner:
             port.on_settled()
 
     def _told(self) -> deque[_Told]:
-        """What controllers have to tell since the last time, in its order."""
+        """Return the new error frames of all controllers, in order of time."""
         states = (
             _Told(
                 n.t_ns, 1, n.node, state_frame(n.state, n.tec, n.rec, restarted=restarted, t_ns=n.t_ns), violation=False
@@ -248,9 +256,9 @@ class BusRunner:
 
 
 class AttachedConnection(TellsOverrun):
-    """A node of the same process. `recv` gets what the other nodes sent, stamped with its exact end of frame.
+    """A node of the same process. `recv` returns the frames of the other nodes, stamped with their exact end of frame.
 
-    Error frames tell of its controller: changes of state, and overruns.
+    Error frames report changes of its controller's state, and overruns.
     """
 
     def __init__(self, runner: BusRunner, endpoint: Endpoint, name: str, max_pending: int) -> None:
@@ -262,7 +270,10 @@ class AttachedConnection(TellsOverrun):
         self._node = runner.join(self, name)
 
     def send_at_once(self, frame: CanFrame) -> bool:
-        """Queue `frame` where nobody waits for room and there is some. Else False, and nothing is done nor counted."""
+        """Queue `frame` if there is room and no sender waits for room.
+
+        Otherwise return False without an effect or a count.
+        """
         if self._lost is not None:
             raise self._loss()
         return not self._held_back and self._runner.submit(self._node, frame, counted=False)
@@ -271,7 +282,7 @@ class AttachedConnection(TellsOverrun):
         if self._lost is not None:
             raise self._loss()
         full = False
-        if not self._held_back:  # as a rule nobody waits
+        if not self._held_back:  # usually no sender waits
             if self._runner.submit(self._node, frame):
                 return
             full = True
@@ -291,7 +302,7 @@ class AttachedConnection(TellsOverrun):
             self._held_back -= 1
 
     def withdraw(self, can_ids: Collection[int]) -> list[CanFrame]:
-        """Take back what was sent under `can_ids` and is not on the wire yet, as a controller aborts its mailboxes."""
+        """Withdraw frames sent with `can_ids` that are not on the wire yet, as a controller aborts its mailboxes."""
         if self.lost is not None:
             return []
         taken = self._runner.withdraw(self._node, can_ids)
@@ -307,7 +318,7 @@ class AttachedConnection(TellsOverrun):
 
     def on_frame(self, frame: CanFrame) -> bool:
         if frame.fd:
-            return True  # a classic node of this process: as a kernel's socket without the option for CAN FD
+            return True  # a classic node of this process: like a kernel socket without the option for CAN FD
         before = self.overruns
         self.feed(frame)
         return self.overruns == before
@@ -321,7 +332,7 @@ class AttachedConnection(TellsOverrun):
             self.feed(frame)
 
     def on_settled(self) -> None:
-        """Nothing is gathered here."""
+        """Do nothing: this port does not collect frames."""
 
     def on_bus_closed(self, error: FieldtwinError) -> None:
         self.feed_lost(ConnectionLost(error.message, where=str(self.endpoint)))

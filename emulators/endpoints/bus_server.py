@@ -1,12 +1,12 @@
 """The software CAN bus as a TCP server: each client is a node, each frame a record of 24 bytes.
 
-A client says hello (emulators/endpoints/bus_hello.py), then both sides send records (gateway/core/canframe.py). A full
-transmit queue stops reading from that client only, so TCP holds it back; a client that does not read its records loses
-frames alone, counted, and never stalls the bus. Confirmations are never dropped: a client that asked for them and does
-not read is not read from either.
+A client sends a hello (emulators/endpoints/bus_hello.py), then both sides send records (gateway/core/canframe.py). If a
+client's transmit queue is full, the server stops reading from that client only, so TCP holds it back. A client that
+does not read its records loses frames, which are counted, and never stalls the bus. Confirmations are never dropped:
+the server stops reading from a client that asked for them and does not read them.
 
-What runs on the bus is not known here, and of frames only which are SDO requests and replies: those are counted by client, so
-that a prototype run can tell its own from those of a third party.
+The server does not interpret frames, except SDO requests and replies, which it counts by client, so that a prototype
+run can separate its own from those of third-party programs.
 """
 
 from __future__ import annotations
@@ -49,13 +49,13 @@ SDO_REPLY, SDO_REQUEST = 0x580, 0x600
 SDO_ABORT = b"\x80"
 CLOSE_TIMEOUT_S = 1.0
 SEND_BUFFER_BYTES = 64 * 1024
-"""The kernel's buffer per client. Left alone it grows to megabytes: minutes of frames that a slow client reads late."""
+"""The kernel's buffer per client. By default it grows to megabytes: minutes of frames that a slow client reads late."""
 RECEIVE_BUFFER_BYTES = 16 * 1024
-"""Likewise the other way: a sender that waits for no confirmations is held back after some hundred frames."""
+"""The receive buffer: a sender that waits for no confirmations is held back after some hundred frames."""
 
 
 class SoftBusServer:
-    """A CAN bus that any process can join. Make it with `open`."""
+    """A CAN bus that any process can join. Create it with `open`."""
 
     def __init__(self, runner: BusRunner, endpoint: Endpoint, max_outbound_frames: int) -> None:
         self._runner = runner
@@ -64,10 +64,10 @@ class SoftBusServer:
         self._clients: set[_Client] = set()
         self._server: asyncio.Server | None = None
         self.sdo_clients = ClientCounts()
-        """SDO requests by the client that sent them, and the frames that answered the client that asked last."""
+        """SDO requests by the client that sent them, and the replies, assigned to the client that sent the last request."""
         self._asked_by: dict[int, _Client] = {}
         self.turned_away = 0
-        """Clients that were refused or broke the protocol."""
+        """Clients that were refused or violated the protocol."""
 
     @classmethod
     async def open(
@@ -84,11 +84,12 @@ class SoftBusServer:
     ) -> SoftBusServer:
         """Listen on a ``can:fieldtwin/HOST:PORT`` endpoint; port 0 takes a free one (see `bound`).
 
-        `paced`: frames take their exact time at `bitrate` bit/s; otherwise they are delivered at once. `queue_frames`
-        bounds each node's transmit queue, `max_outbound_frames` what waits for a client that reads slowly. `monitored`: the
-        bus itself acknowledges every frame; otherwise a node that is alone on it tries for ever, as on a real one.
-        `data_bitrate` in bit/s is that of CAN FD frames with the bit-rate switch, 0 for `bitrate`.
-        Raises `EndpointBusy` when the port is in use, `Unreachable` when it cannot be opened, `UsageError` for another
+        `paced`: frames take their exact time at `bitrate` bit/s; otherwise they are delivered immediately.
+        `queue_frames` limits each node's transmit queue, `max_outbound_frames` the frames that wait for a slow client.
+        `monitored`: the bus itself acknowledges every frame; otherwise a node that is alone on it retries without end,
+        as on a real bus. `data_bitrate` in bit/s is that of CAN FD frames with the bit-rate switch, 0 for `bitrate`.
+
+        Raises `EndpointBusy` if the port is in use, `Unreachable` if it cannot be opened, `UsageError` for a different
         kind of endpoint or an impossible bit rate.
         """
         if endpoint.interface != "fieldtwin":
@@ -110,7 +111,7 @@ class SoftBusServer:
             if e.errno == errno.EADDRINUSE:
                 raise EndpointBusy("the port of the software CAN bus is in use", where=str(endpoint)) from e
             raise Unreachable(f"cannot listen: {os_reason(e)}", where=str(endpoint)) from e
-        for listening in server.sockets:  # whatever it accepts inherits this
+        for listening in server.sockets:  # accepted sockets inherit this
             listening.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
         bus._server = server
         bus._endpoint = endpoint.with_address(host, int(server.sockets[0].getsockname()[1]))
@@ -118,7 +119,7 @@ class SoftBusServer:
 
     @property
     def bound(self) -> Endpoint:
-        """The endpoint with the port that it really has."""
+        """The endpoint with the port that is really open."""
         return self._endpoint
 
     @property
@@ -127,27 +128,27 @@ class SoftBusServer:
 
     @property
     def runner(self) -> BusRunner:
-        """What other kinds of ports hang on, an slcan port for one."""
+        """The bus model, to which other kinds of ports connect, for example an slcan port."""
         return self._runner
 
     def disturb(self, rule: Rule) -> None:
-        """Spoil attempts to send as `rule` says (`fieldtwin.emulators.wires.can_faults.spoil` makes one)."""
+        """Destroy attempts to send as `rule` says (`fieldtwin.emulators.wires.can_faults.spoil` creates one)."""
         self._runner.disturb(rule)
 
     def undisturb(self, rule: Rule) -> None:
-        """Take a rule away."""
+        """Remove a rule."""
         self._runner.undisturb(rule)
 
     def attach(self, name: str = "", max_pending: int = 4096) -> CanConnection:
-        """A connection for a node in this process, on the same bus without TCP. `max_pending` bounds its receive queue."""
+        """Return a connection for a node in this process, without TCP. `max_pending` limits its receive queue."""
         return self._runner.attach(self._endpoint, name, max_pending)
 
     def bus_stats(self) -> dict[str, Any]:
-        """JSON-able: see `CanBus.stats` (frames, bits, load, overruns, nodes...), and ``turned_away``."""
+        """Return JSON-able statistics: see `CanBus.stats` (frames, bits, load, overruns, nodes...), and ``turned_away``."""
         return {**self._runner.stats(), "turned_away": self.turned_away, "sdo_clients": self.sdo_clients.describe()}
 
     async def aclose(self) -> None:
-        """Stop listening, end the bus for everybody. Closing twice does nothing."""
+        """Stop listening and close the bus for all clients. Closing twice does nothing."""
         if self._server is None:
             return
         server, self._server = self._server, None
@@ -159,13 +160,13 @@ class SoftBusServer:
         if gone:
             await asyncio.wait(gone, timeout=CLOSE_TIMEOUT_S)
             for client in list(self._clients):
-                client.abort()  # it does not take what was still to be sent
+                client.abort()  # the client does not read the remaining records
             await asyncio.wait(gone)
         await server.wait_closed()
 
 
 class _Client(asyncio.Protocol):
-    """One TCP client: a `BusPort` once it has said hello."""
+    """One TCP client: a `BusPort` after its hello."""
 
     def __init__(self, bus: SoftBusServer, runner: BusRunner) -> None:
         self._bus = bus
@@ -174,20 +175,20 @@ class _Client(asyncio.Protocol):
         self.gone: asyncio.Future[None] = self._loop.create_future()
         self._inbound = bytearray()
         self._outbound = bytearray()
-        self._node = 0  # 0 until welcome
+        self._node = 0  # 0 until the hello is accepted
         self._counts = Counts()
         self._options = 0
         self._fd = False
         self._record_size = RECORD_SIZE
         self._max_outbound_bytes = bus._max_outbound_bytes
-        self._lost_since_ns = 0  # when frames began to be lost that this client has not been told of
+        self._lost_since_ns = 0  # start of a loss of frames that has not been reported to this client
         self._reading = True
         self._flooded = False  # it asked for confirmations and does not read them
 
-    # -- the transport's side -------------------------------------------------------------------------------------
+    # -- transport ------------------------------------------------------------------------------------------------
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        transport = cast(asyncio.Transport, transport)  # uvloop's is one in all but its class
+        transport = cast(asyncio.Transport, transport)  # uvloop's class is not a subclass of it
         self._transport = transport
         connection: socket.socket = transport.get_extra_info("socket")
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
@@ -230,11 +231,11 @@ class _Client(asyncio.Protocol):
     def abort(self) -> None:
         self._transport.abort()
 
-    # -- the bus's side -------------------------------------------------------------------------------------------
+    # -- bus ------------------------------------------------------------------------------------------------------
 
     def on_frame(self, frame: CanFrame) -> bool:
         if frame.fd and not self._fd:
-            return True  # a classic node, as a kernel's socket without the option for CAN FD
+            return True  # a classic node, like a kernel socket without the option for CAN FD
         if frame.can_id & 0x780 == SDO_REPLY and self._bus._asked_by.get(frame.can_id & 0x7F) is self:
             self._counts.replies += 1
         waiting = self._transport.get_write_buffer_size() + len(self._outbound)
@@ -271,7 +272,7 @@ class _Client(asyncio.Protocol):
     # -- records --------------------------------------------------------------------------------------------------
 
     def _take(self) -> None:
-        """Take whole records while the bus has room; stop reading when it has none."""
+        """Process whole records while the bus has room; stop reading when it has none."""
         taken = 0
         blocked = False
         while len(self._inbound) - taken >= (size := self._record_size) and not self._transport.is_closing():
@@ -304,7 +305,7 @@ class _Client(asyncio.Protocol):
                 self._counts.requests += 1
                 self._bus._asked_by[frame.can_id & 0x7F] = self
             return taken
-        except (Desync, UsageError):  # not our protocol, or an error frame: nothing after it can be trusted
+        except (Desync, UsageError):  # not this protocol, or an error frame: the rest cannot be trusted
             self._turn_away()
             return True
 
@@ -347,7 +348,7 @@ class _Client(asyncio.Protocol):
             self._transport.close()
 
     def _carry_fd(self) -> None:
-        """From now on all records of this client can carry CAN FD; as many frames may wait for it as before."""
+        """Use CAN FD records for this client from now on; the number of frames that may wait for it stays the same."""
         self._fd, self._record_size = True, FD_RECORD_SIZE
         self._max_outbound_bytes = self._max_outbound_bytes * FD_RECORD_SIZE // RECORD_SIZE
         self._transport.set_write_buffer_limits(high=2 * self._max_outbound_bytes, low=self._max_outbound_bytes)

@@ -1,7 +1,7 @@
 """An emulated node's own end of a CAN bus: the software bus over TCP, or a kernel interface through python-can.
 
-Written apart from the plant's side (fieldtwin.gateway.connections), so that a mistake in one is seen by the other. What the node
-is and says is not known here.
+It shares no code with the gateway's side (fieldtwin.gateway.connections), so that each side reveals mistakes of the
+other. It does not interpret frames.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ ARPHRD_CAN = "280"  # include/uapi/linux/if_arp.h
 async def open_can_end(endpoint: Endpoint, bitrate: int) -> CanConnection:
     """Join the bus at `endpoint`: ``can:fieldtwin/HOST:PORT`` or ``can:socketcan/IFACE``.
 
-    A software bus must run at `bitrate` bit/s (0: any), else `UsageError`; a kernel interface's bit rate is the
-    kernel's. Raises `Unreachable` when there is no such bus, `EndpointBusy` when it is full, `UsageError` for another
+    A software bus must run at `bitrate` bit/s (0: any), else `UsageError`; the bit rate of a kernel interface is set in
+    the kernel. Raises `Unreachable` if there is no such bus, `EndpointBusy` if it is full, `UsageError` for a different
     kind of endpoint.
     """
     if endpoint.interface == "fieldtwin":
@@ -60,7 +60,7 @@ async def _join_soft_bus(endpoint: Endpoint, bitrate: int) -> SoftBusEnd:
     try:
         async with asyncio.timeout(OPEN_TIMEOUT_S):
             reader, writer = await asyncio.open_connection(host, port)
-    except OSError as e:  # a time-out is one
+    except OSError as e:  # includes TimeoutError
         raise Unreachable(f"no software CAN bus: {os_reason(e)}", where=str(endpoint)) from e
     try:
         loop = asyncio.get_running_loop()
@@ -77,14 +77,14 @@ async def _join_soft_bus(endpoint: Endpoint, bitrate: int) -> SoftBusEnd:
     except BaseException:
         await _hang_up(writer)
         raise
-    # One host has one monotonic clock; a bus elsewhere has its own, known to half a round trip.
+    # Processes on one host share a monotonic clock; the offset of a remote bus's clock is known to half a round trip.
     told_ns = int(loop.time() * NS_PER_S)
     offset_ns = 0 if asked_ns <= answer.t_ns <= told_ns else (asked_ns + told_ns) // 2 - answer.t_ns
     return SoftBusEnd(endpoint, reader, writer, answer.window, offset_ns)
 
 
 def _judge(answer: Hello, bitrate: int, endpoint: Endpoint) -> None:
-    """Raise what a bus's answer other than a welcome means."""
+    """Raise the error for an answer of the bus that is not a welcome."""
     if answer.status == Status.WRONG_BITRATE:
         raise UsageError(
             "the software CAN bus has another bit rate",
@@ -103,7 +103,7 @@ def _judge(answer: Hello, bitrate: int, endpoint: Endpoint) -> None:
 class SoftBusEnd(TellsOverrun):
     """A node on the software bus over TCP: a task reads records, `send` keeps within the bus's transmit window.
 
-    Error frames (gateway/core/can_error.py) tell of its controller: changes of state, and overruns.
+    Error frames (gateway/core/can_error.py) report changes of its controller's state, and overruns.
     """
 
     def __init__(
@@ -136,12 +136,12 @@ class SoftBusEnd(TellsOverrun):
         self._writer.write(pack_record(frame))
 
     async def aclose(self) -> None:
-        """Leave, once the bus has sent what was handed to it (or after a second)."""
+        """Leave, once the bus has sent all frames (or after a second)."""
         if self.lost is None:
             try:
                 await asyncio.wait_for(self._all_sent.wait(), CLOSE_TIMEOUT_S)
             except TimeoutError:
-                pass  # a slow bus: it sends the rest after we left
+                pass  # a slow bus: it sends the rest after this node has left
         self._end(closed_here(self.endpoint))
         self.inbound.data_stream.clear()
         self._task.cancel()
@@ -174,16 +174,16 @@ async def _hang_up(writer: asyncio.StreamWriter) -> None:
     writer.close()
     try:
         await asyncio.wait_for(writer.wait_closed(), CLOSE_TIMEOUT_S)
-    except OSError:  # reset, or a peer that takes nothing more
+    except OSError:  # reset, or a peer that does not read any more
         writer.transport.abort()
 
 
 def _no_interface(endpoint: Endpoint) -> Unreachable:
-    """Whether it is the interface that is missing, or CAN in the whole kernel."""
+    """Return the error for a missing interface, or for a kernel without CAN."""
     instead = "or use the software bus: can:fieldtwin/HOST:PORT"
     try:
         socket.socket(socket.PF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
-    except (AttributeError, OSError):  # AttributeError: a system, or a Python, that never heard of it
+    except (AttributeError, OSError):  # AttributeError: a system, or a Python build, without CAN sockets
         return Unreachable("this kernel has no SocketCAN", where=str(endpoint), hint=f"modprobe can_raw, {instead}")
     make = f"ip link add {endpoint.path} type vcan && ip link set {endpoint.path} up"
     return Unreachable(f"there is no interface {endpoint.path}", where=str(endpoint), hint=f"{make}, {instead}")
@@ -208,7 +208,7 @@ def _open_kernel_end(endpoint: Endpoint) -> KernelCanEnd:
 
 
 class KernelCanEnd(TellsOverrun):
-    """A node on a kernel interface (vcan, as a rule). Frames are stamped when they are read."""
+    """A node on a kernel interface (usually vcan). Frames are stamped when they are read."""
 
     def __init__(self, endpoint: Endpoint, bus: can.BusABC) -> None:
         super().__init__(CANConnection(), endpoint)
@@ -219,7 +219,7 @@ class KernelCanEnd(TellsOverrun):
         self._loop.add_reader(bus.fileno(), self._read_some)
 
     async def send(self, frame: CanFrame) -> None:
-        """Raises `WireError` when the kernel's transmit queue stays full for `TX_FULL_TIMEOUT_S`."""
+        """Send a frame. Raises `WireError` if the kernel's transmit queue stays full for `TX_FULL_TIMEOUT_S`."""
         message = can.Message(
             arbitration_id=frame.can_id,
             data=frame.data,
@@ -247,7 +247,7 @@ class KernelCanEnd(TellsOverrun):
 
     def _read_some(self) -> None:
         try:
-            for _ in range(FRAMES_PER_TURN):  # what is left keeps the descriptor readable
+            for _ in range(FRAMES_PER_TURN):  # further frames keep the descriptor readable
                 message = self._bus.recv(0)
                 if message is None:
                     return
@@ -275,6 +275,6 @@ class KernelCanEnd(TellsOverrun):
 
 
 def _enlarge(descriptor: int) -> None:
-    """A larger receive buffer, as far as the kernel allows: the usual one holds some hundred frames."""
+    """Enlarge the receive buffer as far as the kernel allows: the default one holds some hundred frames."""
     with socket.socket(fileno=os.dup(descriptor)) as can_socket:
         can_socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)

@@ -1,7 +1,8 @@
-"""Which client of an emulated bus sent how many requests, and how many of them were answered.
+"""Counts the requests of each client of an emulated bus, and their replies.
 
-A prototype run compares what its gateway sent with what its emulators took. A third party that reads an emulator is no fault of
-either, so that its traffic is counted apart, by the address that it connects from. It must never know protocols.
+A prototype run compares the requests that its gateway sent with those that its emulators received. A third-party
+program that reads an emulator must not disturb this comparison, so its traffic is counted separately, by the address
+that it connects from. It must never know protocols.
 """
 
 from __future__ import annotations
@@ -10,13 +11,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 MOST_CLIENTS = 1024
-"""Addresses that are remembered beside those of open connections; the counts of older ones are kept as a sum."""
+"""Addresses that are kept in addition to those of open connections; the counts of older ones are kept as a sum."""
 OLDER = "older clients"
 
 
 @dataclass(slots=True)
 class Counts:
-    """Requests that reached a device, and the replies to them. `open`: the client is connected, and is not forgotten."""
+    """Requests that reached a device, and the replies to them. `open`: the client is connected, so its counts are kept."""
 
     requests: int = 0
     replies: int = 0
@@ -30,7 +31,10 @@ class ClientCounts:
         self._by_client: dict[str, Counts] = {}
 
     def of(self, client: str) -> Counts:
-        """The counts of a client, to be added to. The same object as long as the client is remembered."""
+        """Return the counts of a client, for the caller to increase.
+
+        The object stays the same while the client is remembered.
+        """
         found = self._by_client.get(client)
         if found is None:
             self._forget_oldest()
@@ -38,13 +42,13 @@ class ClientCounts:
         return found
 
     def add(self, client: str, requests: int, replies: int) -> None:
-        """Count for a client."""
+        """Add to the counts of a client."""
         counts = self.of(client)
         counts.requests += requests
         counts.replies += replies
 
     def describe(self) -> dict[str, dict[str, int]]:
-        """JSON-able: by client, its requests and replies."""
+        """Return JSON-able counts: by client, its requests and replies."""
         return {name: {"requests": c.requests, "replies": c.replies} for name, c in self._by_client.items()}
 
     def _forget_oldest(self) -> None:
@@ -56,7 +60,7 @@ class ClientCounts:
 
 
 class Difference:
-    """Counts for a client what `totals` grew by since the last call: for a line whose one client changes.
+    """Assigns the growth of `totals` since the last call to a client: for a line with one client at a time.
 
     `totals` returns the requests and replies of all devices on the line so far.
     """
@@ -68,12 +72,12 @@ class Difference:
         self._client = ""
 
     def change(self, client: str) -> None:
-        """From now on the line's traffic is that of `client`; empty for no client."""
+        """Assign the traffic of the line to `client` from now on; empty for no client."""
         self.settle()
         self._client = client
 
     def settle(self) -> None:
-        """Count what came since the last call."""
+        """Count the traffic since the last call."""
         requests, replies = self._totals()
         if self._client and (requests, replies) != self._last:
             self._clients.add(self._client, requests - self._last[0], replies - self._last[1])

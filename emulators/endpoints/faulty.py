@@ -1,6 +1,6 @@
-"""An emulator's end of a wire with faults on it: what it hears and says passes through the bus's faults.
+"""An emulator's end of a link with fault injection: the bytes in both directions pass through the faults of the bus.
 
-Neither side knows. Time is the loop's. While no fault is in, bytes pass as they are.
+Neither side notices. Time is that of the loop. While no fault is active, bytes pass unchanged.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from fieldtwin.gateway.core.connection import PROTOCOL, ByteConnection
 from fieldtwin.gateway.core.errors import ConnectionLost, FieldtwinError
 
 MOST_WAITING = 10_000
-"""Pieces that wait for their time; what is more is lost and counted."""
+"""Pieces that wait for their time; further ones are lost and counted."""
 
 
 class FaultyEnd(ByteConnection):
@@ -41,7 +41,9 @@ class FaultyEnd(ByteConnection):
         self._requests = Assembler(Way.REQUEST, faults.framing)
         self._replies = Assembler(Way.REPLY, faults.framing)
         self._free_ns: dict[Way, int] = {}
-        """Until when what was put off keeps a way, so that nothing overtakes it; a way that is free is not in it."""
+        """The time until which delayed bytes block a direction, so that later bytes do not overtake them; absent if it
+        is free.
+        """
         self._gathered: dict[Way, bytearray] = {}
         self._asked: Frame | None = None
         self._dead = False
@@ -50,10 +52,10 @@ class FaultyEnd(ByteConnection):
         self._flush: asyncio.TimerHandle | None = None
         inner.intercept = self._heard
         faults.listeners.append(self._put_in)
-        for active in faults.active.values():  # what was put in before this connection came
+        for active in faults.active.values():  # faults that were put in before this connection was opened
             self._put_in(active)
 
-    # -- as a connection ------------------------------------------------------------------------------------------------
+    # -- connection interface -------------------------------------------------------------------------------------------
 
     @property
     def lost(self) -> FieldtwinError | None:
@@ -61,7 +63,7 @@ class FaultyEnd(ByteConnection):
 
     @property
     def paced(self) -> bool:
-        """Whether the end keeps a line's time by itself (`PtyEnd`)."""
+        """Whether the end paces bytes like a line (`PtyEnd`)."""
         return self._pty is not None and self._pty.paced
 
     def read(self) -> Coroutine[Any, Any, bytes]:
@@ -74,7 +76,7 @@ class FaultyEnd(ByteConnection):
         return self.inner.read_pending()
 
     async def write(self, data: bytes) -> None:
-        if self._passes(self._replies) and not self._dead:  # as a rule: no fault is in
+        if self._passes(self._replies) and not self._dead:  # the usual case: no fault is active
             await self.inner.write(data)
             if self._faults.watch is not None:
                 self._show(Way.REPLY, data)
@@ -84,7 +86,7 @@ class FaultyEnd(ByteConnection):
             self._show(Way.REPLY, piece)
 
     async def answer(self, data: bytes, after_s: float) -> None:
-        """As `PtyEnd.answer`."""
+        """Do the same as `PtyEnd.answer`."""
         assert self._pty is not None
         for n, piece in enumerate(self._said(data, after_s)):
             await (self._pty.answer(piece, after_s) if n == 0 else self._pty.write(piece))
@@ -95,7 +97,7 @@ class FaultyEnd(ByteConnection):
         await self.inner.aclose()
 
     def detach(self) -> None:
-        """Faults no longer strike here; `inner` stays as it is."""
+        """Disconnect from the faults; `inner` stays open."""
         self._close()
         self.inner.intercept = None
 
@@ -118,11 +120,11 @@ class FaultyEnd(ByteConnection):
             self._faults.watch(self, way, data)
 
     def _passes(self, assembler: Assembler) -> bool:
-        """Whether bytes pass as they are: no fault is in, and nothing that one kept is still on its way."""
+        """Return whether bytes pass unchanged: no fault is active, and no delayed bytes are waiting."""
         return not (self._faults.active or assembler.pending or (self._free_ns and assembler.way in self._free_ns))
 
     def _heard(self, data: bytes) -> bool:
-        """A chunk from the other side; True: it is dealt with."""
+        """Process a chunk from the peer; return True if it has been handled."""
         if self._faults.watch is not None:
             self._show(Way.REQUEST, data)
         if self._dead:
@@ -143,7 +145,7 @@ class FaultyEnd(ByteConnection):
             self._pass_in(piece)
 
     def _flush_later(self) -> None:
-        """What makes no frame goes on by and by."""
+        """Schedule the forwarding of bytes that form no frame."""
         if self._flush is not None:
             self._flush.cancel()
             self._flush = None
@@ -155,7 +157,7 @@ class FaultyEnd(ByteConnection):
             self._on_request(frame)
 
     def _said(self, data: bytes, after_s: float = 0.0) -> list[bytes]:
-        """What of an emulator's reply goes out at once; the rest is on its way."""
+        """Return the parts of an emulator's reply that are sent immediately; the rest is scheduled."""
         if self._dead:
             return []
         assembler = self._replies
@@ -175,7 +177,7 @@ class FaultyEnd(ByteConnection):
     # -- carrying out ---------------------------------------------------------------------------------------------------
 
     def _carry_out(self, way: Way, outcome: Outcome, after_s: float = 0.0) -> list[bytes]:
-        """The pieces that go on at once; those of another time or way are seen to here."""
+        """Return the pieces to send immediately; schedule those with a delay or the opposite direction."""
         now_ns = self._now_ns()
         at_once: list[bytes] = []
         for piece in outcome.pieces:
@@ -244,7 +246,7 @@ class FaultyEnd(ByteConnection):
     # -- the connection itself ------------------------------------------------------------------------------------------
 
     def _put_in(self, active: Active) -> None:
-        """A fault that ends connections does so when its time comes."""
+        """Schedule the effect of a fault on the connection for the fault's start time."""
         hang = active.fault.appears() if isinstance(active.fault, WireFault) else None
         if hang is None:
             return
@@ -259,7 +261,7 @@ class FaultyEnd(ByteConnection):
     def _hang(self, hang: Hang, last: list[bytes]) -> None:
         in_memory = isinstance(self.inner, MemoryEnd) and self.inner.wire.serial
         if self._dead or in_memory or self.inner.type is PROTOCOL.RS232:
-            return  # a serial line cannot be ended: what is said on it is lost by the fault itself
+            return  # a serial line cannot be closed: the fault itself drops the bytes
         if hang is Hang.HALF_OPEN:
             self._dead = True
             return

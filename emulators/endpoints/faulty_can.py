@@ -1,4 +1,6 @@
-"""An emulated node's end of a CAN bus with faults on it: frames that it sends and hears pass through the bus's faults."""
+"""An emulated node's end of a CAN bus with fault injection: the frames in both directions pass through the faults of
+the bus.
+"""
 
 from __future__ import annotations
 
@@ -46,7 +48,7 @@ class FaultyCan(CanConnection):
         return await self.inner.recv()
 
     def send_at_once(self, frame: CanFrame) -> bool:
-        """As `inner` can, while no fault is in: what one makes of a frame may take time."""
+        """Do the same as `inner` while no fault is active; otherwise return False, because a fault may delay frames."""
         return self._inner_at_once is not None and not self._faults.active and self._inner_at_once(frame)
 
     async def send(self, frame: CanFrame) -> None:
@@ -60,7 +62,7 @@ class FaultyCan(CanConnection):
         self._later(p for p in pieces if p.delay_s > 0)
 
     def withdraw(self, can_ids: Collection[int]) -> list[CanFrame]:
-        """As `inner` can: what is on its way to the bus is taken back; nothing where it cannot."""
+        """Withdraw frames that wait for the bus, as `inner` does; returns nothing if it cannot."""
         return self.inner.withdraw(can_ids) if isinstance(self.inner, AttachedConnection) else []
 
     async def aclose(self) -> None:
@@ -88,7 +90,7 @@ class FaultyCan(CanConnection):
         return True
 
     def _struck(self, way: Way, frame: CanFrame) -> list[CanPiece] | None:
-        """What becomes of the frame; None: nothing happens to it."""
+        """Return the frames that replace `frame`, or None if no fault strikes it."""
         if not self._faults.active or frame.error:
             return None
         return struck(self._faults, way, frame, self.node, self._now_ns())
@@ -102,7 +104,7 @@ class FaultyCan(CanConnection):
             self._loop.call_later(piece.delay_s + wait_s, self._add, active, piece.frame)
 
     def _add(self, active: Active, frame: CanFrame) -> None:
-        """A frame that only the fault sends, while it is in."""
+        """Send a frame that the fault adds, if the fault is still active."""
         if self._faults.active.get(active.id) is active and in_time(active, self._now_ns()):
             active.struck += 1
             self._start(frame)
@@ -126,7 +128,9 @@ class FaultyCan(CanConnection):
 
 
 def bus_rule(active: Active, now_ns: Callable[[], int], from_nodes: frozenset[int]) -> Any:
-    """A rule for the modelled bus (emulators/wires/can_faults.py): spoil what the nodes send while the fault lasts."""
+    """Return a rule for the modelled bus (emulators/wires/can_faults.py) that destroys the nodes' frames while the
+    fault lasts.
+    """
     from fieldtwin.emulators.wires.can_faults import Disturbance
 
     assert isinstance(active.fault, BusFault)
@@ -139,7 +143,7 @@ def bus_rule(active: Active, now_ns: Callable[[], int], from_nodes: frozenset[in
         if not ours or not in_time(active, now_ns()) or (attempts is not None and spoilt >= attempts):
             return None
         if attempts is None and again is not None and again.key() == frame.key():
-            again = None  # its controller sends it again, and that goes well
+            again = None  # its controller sends it again, successfully
             return None
         if not aimed(active, frame) or not active.strikes(seen(Way.REPLY, frame.can_id & 0x7F), now_ns()):
             return None

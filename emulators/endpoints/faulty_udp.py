@@ -1,4 +1,7 @@
-"""An emulator's UDP socket with faults on it: each datagram is a frame. There is no connection that a fault could end."""
+"""An emulator's UDP socket with fault injection: each datagram is a frame.
+
+There is no connection that a fault could close.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,7 @@ from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import ConnectionLost
 
 MOST_WAITING = 1_000
-"""Datagrams that were heard and not yet taken; what is more is lost, as a socket loses it."""
+"""Datagrams received and not yet taken; further ones are lost, as with a socket."""
 
 Heard = tuple[bytes, tuple[str, int]]
 
@@ -82,7 +85,7 @@ class FaultyDatagrams(Datagrams):
             self._faults.watch(peer, way, data)
 
     def _later(self, piece: Piece, then: Callable[[bytes, tuple[str, int]], None], peer: tuple[str, int]) -> None:
-        """`then`, when the piece's time has come, unless it went by itself meanwhile."""
+        """Call `then` when the piece's time has come, unless the piece has been forwarded already."""
 
         def due() -> None:
             if not self._listening.done() and (piece.gone is None or not piece.gone()):

@@ -1,7 +1,7 @@
-"""The ends that an emulated connection forwards between: a TCP stream, dialled or accepted, and a serial device.
+"""The ends between which an emulated connection forwards bytes: a TCP stream, dialled or accepted, and a serial device.
 
-The emulators' own: they share no code with the gateway's ends (DESIGN.md), so that a fault in one cannot hide behind
-the same fault in the other. A virtual serial port is fieldtwin.emulators.endpoints.pty. Bytes pass here; no protocol is known.
+They share no code with the gateway's ends (DESIGN.md), so that a mistake in one cannot be hidden by the same mistake in
+the other. A virtual serial port is fieldtwin.emulators.endpoints.pty. These ends know no protocol.
 """
 
 from __future__ import annotations
@@ -33,29 +33,29 @@ else:
 
 CHUNK = 4096
 MAX_PENDING = 64
+"""Chunks that wait in an end: with `CHUNK` the limit for bytes in flight in each direction (256 KiB)."""
 PTY_MAJORS = range(136, 144)
 """Device numbers of the slave side of Linux pseudo-terminals (Linux, Documentation/admin-guide/devices.txt)."""
-"""Chunks that wait in an end: with `CHUNK` the bound of what is in flight each way (256 KiB)."""
 
 WRITE_HIGH_WATER = 64 * 1024
 CLOSE_LIMIT_S = 0.5
 
 
 class TcpEnd(ByteConnection):
-    """One end of the carrier.
+    """One end of a TCP connection that carries the bytes of a link.
 
-    A far side that has finished sending may still be listening (half-closed): then `read` raises and `write` works,
-    and `half_closed` is true. `finish` does the same the other way round.
+    A peer that has finished sending may still be receiving (half-closed): then `read` raises, `write` works, and
+    `half_closed` is true. `finish` does the same in the other direction.
     """
 
     def __init__(self, endpoint: Endpoint, door: TcpDoor | None = None) -> None:
-        """Not connected yet: `dial`, or a `TcpDoor` hands one out."""
+        """Create an unconnected end: use `dial`, or take one from a `TcpDoor`."""
         super().__init__(TCPConnection(), endpoint, MAX_PENDING)
         self.wire = _Wire(self, door)
 
     @classmethod
     async def dial(cls, endpoint: Endpoint, timeout_s: float) -> TcpEnd:
-        """Connect; raises `Unreachable` that says what failed."""
+        """Connect; raises `Unreachable` with the reason."""
         end = cls(endpoint)
         try:
             async with asyncio.timeout(timeout_s):
@@ -79,7 +79,7 @@ class TcpEnd(ByteConnection):
             raise self._loss()
 
     def finish(self) -> None:
-        """Say that nothing more will be sent, and keep receiving."""
+        """Send the end of the stream, and keep receiving."""
         if self.wire.open:
             self.wire.transport.write_eof()
 
@@ -90,7 +90,7 @@ class TcpEnd(ByteConnection):
         try:
             async with asyncio.timeout(CLOSE_LIMIT_S):
                 await self.wire.gone.wait()
-        except TimeoutError:  # the far side does not take what is left
+        except TimeoutError:  # the peer does not read the rest
             self.wire.transport.abort()
             await self.wire.gone.wait()
 
@@ -102,7 +102,7 @@ class TcpEnd(ByteConnection):
 
 
 class _Wire(asyncio.BufferedProtocol):
-    """What asyncio calls on behalf of a `TcpEnd`."""
+    """The asyncio protocol of a `TcpEnd`."""
 
     transport: asyncio.Transport
 
@@ -138,7 +138,7 @@ class _Wire(asyncio.BufferedProtocol):
     def eof_received(self) -> bool:
         self.eof = True
         self._end.feed_lost(ConnectionLost("the far side finished sending", where=str(self._end.endpoint)))
-        return True  # stay open for what is still to be sent
+        return True  # stay open to send the rest
 
     def connection_lost(self, exc: Exception | None) -> None:
         why = (getattr(exc, "strerror", None) or str(exc)) if exc else "closed"
@@ -154,10 +154,10 @@ class _Wire(asyncio.BufferedProtocol):
 
 
 class TcpDoor:
-    """Listens, and lets one far side in at a time, as a serial line has one master.
+    """Listens, and accepts one peer at a time, because a serial line has one client.
 
-    While one is inside, others are closed at once and counted in `refused`; one that has half-closed, or is gone, holds
-    nobody up.
+    While a peer is connected, further ones are closed immediately and counted in `refused`. A peer that has half-closed
+    or disconnected does not block the next one.
     """
 
     def __init__(self, endpoint: Endpoint) -> None:
@@ -183,7 +183,7 @@ class TcpDoor:
         return door
 
     async def next_peer(self) -> TcpEnd:
-        """Wait for a far side to come in."""
+        """Wait for the next peer."""
         while self._next is None or self._next.wire.gone.is_set():
             self._knock.clear()
             await self._knock.wait()
@@ -203,12 +203,12 @@ class TcpDoor:
         return TcpEnd(self.bound, self).wire
 
     def knocked(self, end: TcpEnd) -> None:
-        """A connection was accepted (called by its protocol)."""
+        """Handle an accepted connection (called by its protocol)."""
         if any(other is not None and other.wire.open and not other.wire.eof for other in (self._inside, self._next)):
             self.refused += 1
             end.wire.transport.abort()
             return
-        if self._next is not None:  # has finished sending before anybody attended to it
+        if self._next is not None:  # it finished sending before it was served
             self.refused += 1
             self._next.wire.transport.abort()
         self._next = end
@@ -216,7 +216,7 @@ class TcpDoor:
 
 
 def _tune(sock: socket.socket) -> None:
-    """No waiting for more bytes, and a far side that lost its power is found out within half a minute."""
+    """Disable Nagle's algorithm, and detect within half a minute that a peer has lost power."""
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     for option, value in (("TCP_KEEPIDLE", 10), ("TCP_KEEPINTVL", 5), ("TCP_KEEPCNT", 3), ("TCP_USER_TIMEOUT", 25_000)):
@@ -225,7 +225,7 @@ def _tune(sock: socket.socket) -> None:
 
 
 class TtyEnd(ByteConnection):
-    """A serial device of this computer, raw, at the endpoint's baud rate and frame, held exclusively."""
+    """A serial device of this computer, raw, at the endpoint's baud rate and frame, opened exclusively."""
 
     def __init__(self, fd: int, endpoint: Endpoint) -> None:
         super().__init__(RS232Connection(), endpoint, MAX_PENDING)
@@ -237,7 +237,7 @@ class TtyEnd(ByteConnection):
 
     @classmethod
     def open(cls, endpoint: Endpoint) -> TtyEnd:
-        """Open and configure; raises `Unreachable`, `EndpointBusy`, or `UsageError` for settings it cannot do."""
+        """Open and configure; raises `Unreachable`, `EndpointBusy`, or `UsageError` for unsupported settings."""
         where = str(endpoint)
         if not TTYS:
             raise Unreachable("this system has no serial devices as files", where=where, hint="a tcp end works")
@@ -325,12 +325,13 @@ def _make_raw(fd: int, endpoint: Endpoint) -> None:
         raise UsageError(f"{endpoint}: baud rate", expected="one of the standard rates", got=str(settings.baudrate))
     attributes: list[Any] = termios.tcgetattr(fd)
     cflag = termios.CREAD | termios.CLOCAL | (termios.CS8 if settings.data_bits == 8 else termios.CS7)
-    # A pty drops parity, and glibc's tcsetattr then fails with EINVAL when a port is opened a second time (docs/decisions/0013).
+    # A pty drops parity, and glibc's tcsetattr then fails with EINVAL when a port is opened a second time
+    # (docs/decisions/0013).
     parity = "N" if os.major(os.fstat(fd).st_rdev) in PTY_MAJORS else settings.parity
     cflag |= {"N": 0, "E": termios.PARENB, "O": termios.PARENB | termios.PARODD}[parity]
     cflag |= termios.CSTOPB if settings.stop_bits == 2 else 0
     attributes[0:4] = [0, 0, cflag, 0]  # no translation, no flow control, no echo, no signals
     attributes[4] = attributes[5] = speed
-    attributes[6][termios.VMIN] = 1  # with VMIN 0 an empty device and one that hung up would read the same
+    attributes[6][termios.VMIN] = 1  # with VMIN 0, a read could not distinguish an empty device from a disconnected one
     attributes[6][termios.VTIME] = 0
     termios.tcsetattr(fd, termios.TCSANOW, attributes)

@@ -1,6 +1,6 @@
-"""Emulated CAN ends that tell their node when frames came faster than it took them, as a CAN controller does.
+"""Emulated CAN ends that report to their node that frames came faster than it took them, as a CAN controller does.
 
-The frame that says so is an error frame; what a node makes of it is not known here.
+The report is an error frame; this module does not know how the node reacts.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from fieldtwin.gateway.core.connection import CanConnection
 
 
 class TellsOverrun(CanConnection):
-    """A CAN end whose receive queue lost frames says so as soon as it has room again: one error frame for all of them."""
+    """A CAN end that reports lost frames with one error frame, as soon as its receive queue has room again."""
 
     _untold = 0
 

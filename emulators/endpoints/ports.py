@@ -1,7 +1,7 @@
-"""Where emulators are reached: whoever runs a field side asks here for serial ports, listeners and buses.
+"""The places where emulators can be reached: a field simulator gets its serial ports, listeners and buses here.
 
-`OsPorts` gives the operating system's; `fieldtwin.emulators.virtual.ports` gives ones in memory. A device cannot tell which it
-has.
+`OsPorts` provides those of the operating system; `fieldtwin.emulators.virtual.ports` provides ones in memory. A device
+cannot tell the difference.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ OnClient = Callable[[ByteConnection], Awaitable[None]]
 
 
 class Listening(Protocol):
-    """Something that waits for clients. `bound` is the endpoint that it really has."""
+    """A listener. `bound` is the endpoint that is really open."""
 
     @property
     def bound(self) -> Endpoint: ...
@@ -45,17 +45,17 @@ class CanPort(Listening, Protocol):
     async def join(self, name: str) -> CanConnection: ...
 
     def stats(self) -> dict[str, Any]:
-        """What the bus counted; empty where it is not ours."""
+        """Return the counters of the bus; empty if it is not served by this process."""
         ...
 
     @property
     def runner(self) -> BusRunner | None:
-        """The model of the bus; None where it is not ours."""
+        """The model of the bus; None if it is not served by this process."""
         ...
 
 
 class Ports(Protocol):
-    """Raises `EndpointBusy` or `Unreachable` where there is none to be had."""
+    """A provider of ports. Raises `EndpointBusy` or `Unreachable` if a port cannot be provided."""
 
     async def serial(
         self, link: Path, plant: Endpoint, pace: SerialSettings | None
@@ -72,7 +72,7 @@ class OsPorts:
     """Virtual serial ports, sockets, the software CAN bus as a TCP server, kernel CAN interfaces."""
 
     async def serial(self, link: Path, plant: Endpoint, pace: SerialSettings | None) -> tuple[ByteConnection, Endpoint]:
-        """A pty with its link in the file system, and the endpoint to name it by."""
+        """Return a pty with its link in the file system, and the endpoint that names it."""
         end = await PtyEnd.open(link, plant, pace)
         return end, Endpoint("pty", path=str(end.link))
 
@@ -83,7 +83,7 @@ class OsPorts:
         return await UdpEnd.open(endpoint)
 
     async def can_bus(self, endpoint: Endpoint, bitrate: int, *, paced: bool) -> CanPort:
-        """A software bus is served here; an interface of the kernel is joined."""
+        """Return a bus: a software bus is served here, a kernel interface is joined."""
         if endpoint.interface == "fieldtwin":
             return _ServedBus(await SoftBusServer.open(endpoint, bitrate, paced=paced))
         return _KernelBus(endpoint, bitrate)
@@ -127,4 +127,4 @@ class _KernelBus:
         return None
 
     async def aclose(self) -> None:
-        """The kernel's interface stays."""
+        """Do nothing: the kernel's interface stays."""

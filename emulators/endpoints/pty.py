@@ -1,8 +1,8 @@
-"""A virtual serial port: the emulated device holds the pty's master end, the gateway opens a link to the other.
+"""A virtual serial port: the emulated device holds the pty's master end, the gateway opens a link to its slave end.
 
-Knows no protocol. What a real port does and a pty does not is made up for here: the port stays when nobody has it open
-(a spare descriptor of the far end is kept, or reading would fail with EIO), bytes pass unchanged (raw mode), and with
-`pace` a request and its reply take the time that the line would have needed. Parity does not exist on a pty.
+It knows no protocol. It emulates what a real port does and a pty does not: the port stays when no program has it open
+(a spare descriptor of the slave end stays open, because reading would fail with EIO otherwise), bytes pass unchanged
+(raw mode), and with `pace` a request and its reply take the time that the line would need. A pty has no parity.
 """
 
 from __future__ import annotations
@@ -28,20 +28,20 @@ else:
 READ_SIZE = 4096
 SETTLE_CHECK_S = 0.1
 _IDLE_FLAGS = termios.ECHOE | termios.ECHOK | termios.ECHONL if PTYS else 0
-"""Mean something in canonical mode only, and every program that makes a port raw clears one of them at least.
+"""Flags that only have a meaning in canonical mode, and of which every program that makes a port raw clears at least one.
 
-A pty clears parity, and Debian's tcsetattr (glibc 2.36) then fails with EINVAL if nothing else changed either: a port that
-remembers the last program's settings could be opened with 8E1 once and not again. These flags always change.
+A pty clears parity, and Debian's tcsetattr (glibc 2.36) then fails with EINVAL if nothing else changed either: a port
+that keeps the last program's settings could be opened with 8E1 only once. These flags always change.
 """
 FIFO_CHARS = 16
-"""A paced reply appears in pieces of this size, as out of a UART's FIFO: a timer a character would cost more."""
+"""A paced reply appears in pieces of this size, as from a UART's FIFO: one timer per character would cost more."""
 
 
 class PtyEnd(ByteConnection):
-    """The device's end of a virtual serial port. Made by `open`.
+    """The device's end of a virtual serial port. Created by `open`.
 
-    `link` is the path for the other side, stable over restarts; `device` is the pty behind it. The other side may close
-    and reopen as often as it likes; what it did not read stays until it does, or flushes.
+    `link` is the path for the peer, stable over restarts; `device` is the pty behind it. The peer may close and reopen
+    the port any number of times; bytes that it did not read stay until it reads or flushes them.
     """
 
     def __init__(self, link: Path, endpoint: Endpoint, pace: SerialSettings | None, master: int, spare: int) -> None:
@@ -66,10 +66,10 @@ class PtyEnd(ByteConnection):
 
     @classmethod
     async def open(cls, link: Path, endpoint: Endpoint, pace: SerialSettings | None = None) -> PtyEnd:
-        """Make the port and its link, replacing a link that is there. With `pace`, bytes come and go at that line's speed:
-        what is read is there when its last character is.
+        """Create the port and its link, replacing an existing link.
 
-        Raises `EndpointBusy` where something that is no link stands in the way, `Unreachable` where none can be made.
+        With `pace`, bytes are transferred at the speed of that line: a chunk is readable when its last character has
+        arrived. Raises `EndpointBusy` if the path exists and is not a link, `Unreachable` if no port can be created.
         """
         if not PTYS:
             hint = "emulate on tcp, or on a real serial port"
@@ -101,8 +101,11 @@ class PtyEnd(ByteConnection):
             await self._send(data, self._line_is_ours_ns())
 
     async def answer(self, data: bytes, after_s: float) -> None:
-        """Send `data`, `after_s` behind the last character that was heard; with pacing, never before t3.5 of silence, and
-        by the line's time: that this process woke up late takes nothing from the line."""
+        """Send `data`, `after_s` seconds after the last character received.
+
+        With pacing, at least t3.5 of silence passes first, and the time is that of the line: a late wake-up of this
+        process does not delay the line.
+        """
         async with self._writing:
             if self._inward is None:
                 await asyncio.sleep(after_s)
@@ -112,7 +115,7 @@ class PtyEnd(ByteConnection):
             await self._send(data, self._inward.busy_until_ns + pause_ns)
 
     async def aclose(self) -> None:
-        """Close the port; remove the link unless somebody else's port took its place."""
+        """Close the port; remove the link unless a different port has replaced it."""
         if self.lost is None:
             self.feed_lost(closed_here(self.endpoint))
         self._close()
@@ -126,7 +129,7 @@ class PtyEnd(ByteConnection):
         ):
             self._resume_reading()
 
-    # -- the line's time ------------------------------------------------------------------------------------------
+    # -- timing of the line ---------------------------------------------------------------------------------------
 
     async def _send(self, data: bytes, start_ns: int) -> None:
         if self._outward is None:
@@ -141,7 +144,7 @@ class PtyEnd(ByteConnection):
         return round(self._loop.time() * NS_PER_S)
 
     def _line_is_ours_ns(self) -> int:
-        """From when on we may send: the pause of t3.5 after the last character that the other side sent."""
+        """Return when sending is allowed: t3.5 after the last character from the peer."""
         if self._inward is None:
             return self._now_ns()
         return max(self._now_ns(), self._inward.busy_until_ns + self._inward.t3_5_ns)
@@ -149,14 +152,14 @@ class PtyEnd(ByteConnection):
     async def _sleep_until_ns(self, deadline_ns: int) -> None:
         await asyncio.sleep(max(0, deadline_ns - self._now_ns()) / NS_PER_S)
 
-    # -- the operating system's side ------------------------------------------------------------------------------
+    # -- operating system -----------------------------------------------------------------------------------------
 
     def _resume_reading(self) -> None:
         self._reading = True
         self._loop.add_reader(self._master, self._on_readable)
 
     def _on_readable(self) -> None:
-        now_ns = self._now_ns()  # first: what this process does about it takes no time on the line
+        now_ns = self._now_ns()  # taken first: processing in this process takes no time on the line
         try:
             data = os.read(self._master, READ_SIZE)
         except BlockingIOError:
@@ -166,7 +169,7 @@ class PtyEnd(ByteConnection):
             return
         _raise_idle_flags(self._spare)
         if self._inward is not None:
-            self._stop_reading()  # what follows goes behind it, and waits in the pty
+            self._stop_reading()  # later bytes follow it, and wait in the pty
             end_ns = self._inward.send(now_ns, len(data))
             self._on_its_way = self._loop.call_at(end_ns / NS_PER_S, self._arrived, data)
         elif not self.feed(data):
@@ -182,7 +185,7 @@ class PtyEnd(ByteConnection):
         self._loop.remove_reader(self._master)
 
     def _unsettle(self) -> None:
-        """Keep the port open to the next program, whatever the last one set."""
+        """Keep the port ready for the next program, whatever the last one set."""
         _raise_idle_flags(self._spare)
         self._settle_check = self._loop.call_later(SETTLE_CHECK_S, self._unsettle)
 
@@ -227,11 +230,11 @@ class PtyEnd(ByteConnection):
         self._loop.remove_reader(self._master)
         self._loop.remove_writer(self._master)
         self._on_writable()
-        try:  # before the port is closed: its number may be another program's at once
+        try:  # before the port is closed: another program may get its number at once
             if os.readlink(self.link) == self.device:
                 self.link.unlink()
         except OSError:
-            pass  # gone already, or no link any more: not ours to remove
+            pass  # already removed, or no longer a link: not ours to remove
         os.close(self._master)
         os.close(self._spare)
         self._master = self._spare = -1
@@ -239,7 +242,7 @@ class PtyEnd(ByteConnection):
 
 
 def _make_raw(descriptor: int, pace: SerialSettings | None) -> None:
-    """Bytes pass as they are: no echo, no lines, no flow control, no signals, no CR and LF games."""
+    """Make bytes pass unchanged: no echo, lines, flow control or signals, and no conversion of CR and LF."""
     speed = getattr(termios, f"B{pace.baudrate}", termios.B19200) if pace else termios.B19200
     control = termios.tcgetattr(descriptor)[6]
     control[termios.VMIN], control[termios.VTIME] = 1, 0
@@ -255,7 +258,7 @@ def _raise_idle_flags(descriptor: int) -> None:
 
 
 def _replace_link(link: Path, device: str, endpoint: Endpoint) -> None:
-    """Put the link in place in one step: whoever opens it meanwhile finds the old port or the new one."""
+    """Create the link atomically: a program that opens it meanwhile gets either the old port or the new one."""
     if os.path.lexists(link) and not link.is_symlink():
         raise EndpointBusy("a file stands where the link to the virtual serial port goes", where=f"{endpoint}: {link}")
     beside = link.with_name(f".{link.name}.{os.getpid()}")

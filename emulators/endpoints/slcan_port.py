@@ -1,7 +1,8 @@
 """A TCP port of the software CAN bus that speaks slcan: each client that opens its channel is a node.
 
-For programs that know neither the bus's records nor python-can's interface ``fieldtwin``: slcand through socat, python-can's own
-``slcan`` interface with ``socket://HOST:PORT``, terminal programs. What is said is `slcan_protocol`'s.
+For programs that support neither the bus's records nor python-can's interface ``fieldtwin``: slcand through socat,
+python-can's own ``slcan`` interface with ``socket://HOST:PORT``, terminal programs. `slcan_protocol` implements the
+protocol.
 """
 
 from __future__ import annotations
@@ -19,13 +20,13 @@ from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import EndpointBusy, FieldtwinError, Unreachable, os_reason
 
 MAX_OUTBOUND_BYTES = 64 * 1024
-"""What waits for a client that reads slowly; beyond that it loses frames, alone and counted."""
+"""Bytes that wait for a slow client; beyond that it loses frames, which are counted."""
 MAX_CLIENTS = 64
 SOCKET_BUFFER_BYTES = 16 * 1024
 
 
 class SlcanPort:
-    """Make it with `open`; `aclose` it before the bus."""
+    """The slcan listener of a bus. Create it with `open`; close it with `aclose` before the bus."""
 
     def __init__(self, runner: BusRunner) -> None:
         self.runner = runner
@@ -38,7 +39,7 @@ class SlcanPort:
     async def open(cls, runner: BusRunner, endpoint: Endpoint) -> SlcanPort:
         """Listen on a ``tcp://HOST:PORT`` endpoint; port 0 takes a free one (see `bound`).
 
-        Raises `EndpointBusy` when the port is in use, `Unreachable` when it cannot be opened.
+        Raises `EndpointBusy` if the port is in use, `Unreachable` if it cannot be opened.
         """
         port = cls(runner)
         host, number = endpoint.address
@@ -56,11 +57,11 @@ class SlcanPort:
 
     @property
     def bound(self) -> tuple[str, int]:
-        """Host and port that it really has."""
+        """Host and port that are really open."""
         return self._bound
 
     async def aclose(self) -> None:
-        """Stop listening and hang up. Closing twice does nothing."""
+        """Stop listening and disconnect the clients. Closing twice does nothing."""
         if self._server is None:
             return
         server, self._server = self._server, None
@@ -84,7 +85,7 @@ class _Client(asyncio.Protocol):
         self._reading = True
         self.gone: asyncio.Future[None] = asyncio.get_running_loop().create_future()
 
-    # -- the transport's side -------------------------------------------------------------------------------------
+    # -- transport ------------------------------------------------------------------------------------------------
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast(asyncio.Transport, transport)
@@ -109,11 +110,11 @@ class _Client(asyncio.Protocol):
     def abort(self) -> None:
         self._transport.abort()
 
-    # -- the bus's side -------------------------------------------------------------------------------------------
+    # -- bus ------------------------------------------------------------------------------------------------------
 
     def on_frame(self, frame: CanFrame) -> bool:
         if frame.fd:
-            return True  # the protocol has no word for it
+            return True  # the protocol does not support CAN FD
         if self._transport.get_write_buffer_size() + len(self._outbound) > MAX_OUTBOUND_BYTES:
             self._session.controller(overrun_frame())
             return False
@@ -121,7 +122,7 @@ class _Client(asyncio.Protocol):
         return True
 
     def on_confirmed(self, frame: CanFrame) -> None:
-        """This protocol confirms what is queued, not what was on the wire."""
+        """Do nothing: this protocol confirms queued frames, not frames on the wire."""
 
     def on_error(self, frame: CanFrame, *, violation: bool) -> None:
         self._session.controller(frame)
@@ -138,7 +139,7 @@ class _Client(asyncio.Protocol):
     # -- commands -------------------------------------------------------------------------------------------------
 
     def _take(self) -> None:
-        """Carry out whole commands while the bus has room; stop reading when it has none."""
+        """Execute whole commands while the bus has room; stop reading when it has none."""
         while not self._transport.is_closing() and (answer := self._session.step(self._submit)) is not None:
             self._outbound += answer
             self._follow()
@@ -156,11 +157,11 @@ class _Client(asyncio.Protocol):
         return bool(self._node) and self._port.runner.submit(self._node, frame)
 
     def _follow(self) -> None:
-        """Join and leave the bus as the session opened and closed."""
+        """Join or leave the bus when the session opens or closes."""
         if self._session.is_open and not self._node:
             try:
                 self._node = self._port.runner.join(self, self._name, listen_only=self._session.listen_only)
-            except FieldtwinError:  # full, or closing
+            except FieldtwinError:  # the bus is full or closing
                 self._port.turned_away += 1
                 self._transport.abort()
         elif not self._session.is_open:

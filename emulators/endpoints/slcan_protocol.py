@@ -1,11 +1,11 @@
-"""The LAWICEL ASCII protocol ("slcan"), the adapter's side of one client: bytes and frames in, bytes and frames out. No sockets.
+"""The LAWICEL ASCII protocol ("slcan"), the adapter's side for one client. It converts bytes and frames; no sockets.
 
-Commands end with CR; the adapter answers CR (done), BEL (refused), or what was asked for. Served: ``O`` open, ``L`` listen
-only, ``C`` close, ``S0`` to ``S8`` and ``sBBCC`` bit rate (SJA1000 at 16 MHz), ``t T r R`` send, ``V N F`` version, serial
-number, status flags, ``Z0 Z1`` time stamps (milliseconds of the minute), ``X1`` poll by itself, which it always does, ``M m``
-with "everything". Whatever else, CAN FD's letters among it, is refused.
+Commands end with CR; the adapter answers CR (done), BEL (refused), or the requested data. Supported: ``O`` open, ``L``
+listen only, ``C`` close, ``S0`` to ``S8`` and ``sBBCC`` bit rate (SJA1000 at 16 MHz), ``t T r R`` send, ``V N F``
+version, serial number, status flags, ``Z0 Z1`` time stamps (milliseconds of the minute), ``X1`` automatic polling,
+which is always on, ``M m`` with "everything". All other commands are refused, including those of CAN FD.
 
-The bit rate is the bus's: another one is refused, as is anything to send while closed.
+The bit rate is that of the bus: a different one is refused, as is every frame while the channel is closed.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from fieldtwin.gateway.core.clock import NS_PER_MS
 OK, REFUSED = b"\r", b"\a"
 VERSION, SERIAL_NUMBER = b"V1013\r", b"NFT01\r"
 MAX_LINE = 32
-"""The longest command is a frame: T, 8 digits, length, 16 digits, and a time stamp that some send along."""
+"""The longest command is a frame: T, 8 digits, length, 16 digits, and a time stamp that some programs append."""
 
 _BIT_RATES = (10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 800_000, 1_000_000)
 _ALL = {"M": ("00000000",), "m": ("FFFFFFFF",)}
@@ -29,14 +29,14 @@ _HEX = frozenset("0123456789abcdefABCDEF")
 
 
 class SlcanSession:
-    """One client's adapter. `feed` bytes, then `step` until it gives None; `received` turns frames into bytes."""
+    """One client's adapter. `feed` bytes, then `step` until it returns None; `received` turns frames into bytes."""
 
     def __init__(self, bitrate: int) -> None:
         self.is_open = False
         self.listen_only = False
         self.refused = 0
         self.waiting = False
-        """The next command is a frame for which there was no room: `step` again later."""
+        """The next command is a frame for which there was no room: call `step` again later."""
         self._bitrate = bitrate
         self._stamps = False
         self._buffer = bytearray()
@@ -45,14 +45,17 @@ class SlcanSession:
         self._state = 0
 
     def feed(self, data: bytes) -> None:
-        """Bytes from the client. Bounded: of a line without end only its being there is kept."""
+        """Take bytes from the client. Memory is bounded: an overlong line is dropped, and only its presence is recorded."""
         self._buffer += data
         if len(self._buffer) > MAX_LINE and b"\r" not in self._buffer:
             self._buffer.clear()
             self._skipping = True
 
     def step(self, send: Callable[[CanFrame], bool]) -> bytes | None:
-        """Carry out one command; its answer, or None when none is whole, or it is `waiting` because `send` had no room."""
+        """Execute one command and return its answer.
+
+        Returns None if no command is complete, or if it is `waiting` because `send` had no room.
+        """
         self.waiting = False
         end = self._buffer.find(b"\r")
         if end < 0:
@@ -72,7 +75,7 @@ class SlcanSession:
         return answer
 
     def received(self, frame: CanFrame) -> bytes:
-        """A frame as the client is told of it; nothing while closed."""
+        """Return a frame in the form sent to the client; nothing while the channel is closed."""
         if not self.is_open:
             return b""
         letter = "tT"[frame.extended] if not frame.remote else "rR"[frame.extended]
@@ -81,7 +84,7 @@ class SlcanSession:
         return text.encode("ascii")
 
     def controller(self, frame: CanFrame) -> None:
-        """An error frame: this protocol has none, it sets status flags until ``F`` is asked."""
+        """Process an error frame: this protocol has none, so it sets status flags until ``F`` reads them."""
         if tells_overrun(frame):
             self._flags |= _OVERRUN | _RX_FULL
         state = told_state(frame)
@@ -99,7 +102,7 @@ class SlcanSession:
         letter, rest = line[:1], line[1:]
         match letter:
             case "":
-                return OK  # clients send some to clear what stood there before
+                return OK  # clients send some to clear earlier input
             case "t" | "T" | "r" | "R":
                 return self._transmit(letter, rest, send)
             case "O" | "L" if not rest and not self.is_open:
@@ -134,7 +137,7 @@ class SlcanSession:
             return None
         can_id, length, data = int(rest[:digits], 16), int(rest[digits], 16), rest[digits + 1 :]
         expected = 0 if remote else 2 * length
-        # A time stamp behind the data is what a log says; it means nothing here.
+        # A time stamp after the data comes from a log; it has no meaning here.
         if length > 8 or can_id > (0x1FFFFFFF if extended else 0x7FF) or len(data) not in (expected, expected + 4):
             return None
         frame = CanFrame(can_id, bytes.fromhex(data[:expected]), extended=extended, remote=remote, dlc=length)
@@ -145,7 +148,7 @@ class SlcanSession:
 
     @staticmethod
     def _bit_rate(letter: str, rest: str) -> int:
-        """In bit/s; 0 for what is none."""
+        """Return the bit rate in bit/s; 0 for an invalid one."""
         if letter == "S":
             return _BIT_RATES[int(rest)] if len(rest) == 1 and rest in "012345678" else 0
         if len(rest) != 4 or not set(rest) <= _HEX:

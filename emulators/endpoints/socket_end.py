@@ -1,6 +1,6 @@
 """The listening side of TCP and TLS: each client becomes a `ByteConnection`, served by a coroutine of its own.
 
-Knows no protocol. Bounded everywhere: so many clients, so many chunks a client, so many bytes on their way out.
+It knows no protocol. The numbers of clients, of chunks per client and of outgoing bytes are limited.
 """
 
 from __future__ import annotations
@@ -20,11 +20,12 @@ from fieldtwin.gateway.core.errors import ConnectionLost, EndpointBusy, Unreacha
 MAX_CLIENTS = 32
 MAX_PENDING_CHUNKS = 16
 READ_BYTES = 8192
-"""A chunk is at most so much: enough for any pipelining, bounded for a flood. asyncio itself makes room for 256 KiB at each
-read, and getting that from the system takes longer than all else that an answer takes."""
+"""Maximum size of a chunk: enough for any pipelining, and a limit for a flood. asyncio itself allocates 256 KiB for
+each read, which takes longer than all other parts of an answer.
+"""
 CLOSE_WITHIN_S = 1.0
 HANDSHAKE_WITHIN_S = 10.0
-"""Who says nothing when TLS is to begin is gone by then, and never was a client."""
+"""A peer that has not finished the TLS handshake by then is disconnected and never counts as a client."""
 KEEPALIVE_IDLE_S, KEEPALIVE_INTERVAL_S, KEEPALIVE_PROBES = 10, 5, 3
 
 OnClient = Callable[["SocketEnd"], Awaitable[None]]
@@ -52,15 +53,15 @@ class SocketEnd(ByteConnection, asyncio.BufferedProtocol):
         self._answer: Answer | None = None
 
     async def answer_at_once(self, answer: Answer) -> None:
-        """Answer every chunk within the callback that brings it, until lost: no task is woken for a request.
+        """Answer every chunk within the callback that delivers it, until the connection is lost: a request wakes no task.
 
-        `answer` returns what to send, possibly nothing, and whether to hang up behind it. While the client does not take its
-        answers, nothing more is read from it. Raises `ConnectionLost` in the end.
+        `answer` returns the bytes to send, possibly none, and whether to close the connection after them. While the
+        client does not read its answers, nothing more is read from it. Always ends by raising `ConnectionLost`.
         """
         self._answer = answer
         if pending := self.read_pending():
             self._give(pending)
-        await self.read()  # nothing is fed any more: it only ever ends by the loss
+        await self.read()  # nothing is fed any more, so it ends only with the loss
 
     def _give(self, data: bytes) -> None:
         assert self._answer is not None
@@ -85,7 +86,7 @@ class SocketEnd(ByteConnection, asyncio.BufferedProtocol):
             self._raise_if_gone()
 
     async def aclose(self) -> None:
-        """Send what is buffered and close, within a second; what is not taken by then is dropped."""
+        """Send buffered bytes and close, within a second; bytes that the client has not taken by then are dropped."""
         self.feed_lost(closed_here(self.endpoint))
         if self._transport is None or self._closed.done():
             return
@@ -98,7 +99,7 @@ class SocketEnd(ByteConnection, asyncio.BufferedProtocol):
             await asyncio.shield(self._closed)
 
     def evict(self, *, reset: bool = False) -> None:
-        """Close at once, whatever is under way; with `reset` by RST, as a crashed device does."""
+        """Close immediately, dropping buffered bytes; with `reset` by RST, as a crashed device does."""
         if self._transport is not None:
             if reset:
                 sock = self._transport.get_extra_info("socket")
@@ -116,7 +117,7 @@ class SocketEnd(ByteConnection, asyncio.BufferedProtocol):
     # -- called by asyncio ----------------------------------------------------------------------------------------
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        self._transport = cast(asyncio.Transport, transport)  # uvloop's is one in all but its class
+        self._transport = cast(asyncio.Transport, transport)  # uvloop's class is not a subclass of it
         self.last_used_s = self._loop.time()
         name = self._transport.get_extra_info("peername")
         self.peer = f"{name[0]}:{name[1]}" if name else "?"
@@ -165,8 +166,9 @@ class SocketEnd(ByteConnection, asyncio.BufferedProtocol):
 class SocketListener:
     """Listens on an endpoint and runs `on_client(connection)` for each client; when that returns, the client is closed.
 
-    When `max_clients` are connected, the next one takes the place of the one that was silent for longest. Clients on
-    `priority` hosts (addresses) only give way to each other; where nobody may give way, the new one is refused (TG 4.2.1.1).
+    When `max_clients` are connected, the next one replaces the one that was silent for longest. Clients on `priority`
+    hosts (addresses) are only replaced by each other; if no client may be replaced, the new one is refused (TG
+    4.2.1.1).
     """
 
     def __init__(
@@ -191,8 +193,11 @@ class SocketListener:
         max_clients: int = MAX_CLIENTS,
         priority: frozenset[str] = frozenset(),
     ) -> SocketListener:
-        """Listen; port 0 takes a free one (`bound` says which). A ``tls`` endpoint names our certificate with ``cert``,
-        ``key``, and with ``ca`` whose clients are let in. Raises `EndpointBusy`, `Unreachable` or `UsageError`."""
+        """Listen; port 0 takes a free one (`bound` gives it). Raises `EndpointBusy`, `Unreachable` or `UsageError`.
+
+        A ``tls`` endpoint names the server's certificate with ``cert``, ``key``, and with ``ca`` the authority of
+        accepted clients.
+        """
         listener = cls(endpoint, on_client, max_clients, priority)
         loop = asyncio.get_running_loop()
         secured: dict[str, Any] = {}
@@ -213,18 +218,18 @@ class SocketListener:
 
     @property
     def bound(self) -> Endpoint:
-        """The endpoint with the port that is really listened on."""
+        """The endpoint with the port on which the listener really listens."""
         if self._server is None or not self._server.sockets:
             return self._endpoint
         return self._endpoint.with_address(self._endpoint.host, self._server.sockets[0].getsockname()[1])
 
     @property
     def clients(self) -> tuple[SocketEnd, ...]:
-        """Who is connected, oldest first."""
+        """The connected clients, oldest first."""
         return tuple(self._clients)
 
     def connected(self, client: SocketEnd) -> None:
-        """A client was accepted."""
+        """Handle an accepted client."""
         self.accepted += 1
         if len(self._clients) >= self.max_clients and not self._make_room(client):
             self.refused += 1
@@ -236,7 +241,7 @@ class SocketListener:
         task.add_done_callback(self._ended)
 
     def _make_room(self, client: SocketEnd) -> bool:
-        """Close the client that was silent for longest, of those that must give way to this one."""
+        """Close the client that was silent for longest, among those that this one may replace."""
         yielding = [c for c in self._clients if c.host not in self.priority]
         if not yielding and client.host in self.priority:
             yielding = self._clients
@@ -274,13 +279,13 @@ class SocketListener:
     def _ended(self, task: asyncio.Task[None]) -> None:
         self._tasks.discard(task)
         error = None if task.cancelled() else task.exception()
-        if error is not None:  # one client's failure ends that client; it is reported, not swallowed
+        if error is not None:  # a failure ends only that client; it is reported, not swallowed
             report = {"message": f"serving a client of {self.bound} failed", "exception": error, "task": task}
             task.get_loop().call_exception_handler(report)
 
 
 def _keep_alive(sock: socket.socket) -> None:
-    """A client that vanished without a word is noticed in 25 s, not in two hours (row MB-064)."""
+    """Detect a client that vanished without closing in 25 s, not in two hours (row MB-064)."""
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     if hasattr(socket, "TCP_KEEPIDLE"):

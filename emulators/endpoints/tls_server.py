@@ -1,7 +1,7 @@
-"""What a TLS listener needs besides sockets: its certificates, and the role that a client's certificate names.
+"""The parts of a TLS listener besides sockets: its certificates, and the role in a client's certificate.
 
 MODBUS/TCP Security Protocol Specification (MBTLS): TLS 1.2 or later, certificates on both sides, a role in an extension
-of the client's. Reads files; opens no socket and knows no function codes.
+of the client's. It reads files; it opens no socket and knows no function codes.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ _UTF8_STRING, _OCTET_STRING, _BOOLEAN = 0x0C, 0x04, 0x01
 
 
 def make_context(endpoint: Endpoint) -> ssl.SSLContext:
-    """The server's side of the handshake, from the endpoint's ``cert``, ``key`` and ``ca`` (PEM files).
+    """Return the server's TLS context from the endpoint's ``cert``, ``key`` and ``ca`` (PEM files).
 
-    With ``ca`` only clients with a certificate of that authority are let in, as MBTLS demands; without, any is. Raises
-    `UsageError` without ``cert`` and `Unreachable` for files that cannot be used.
+    With ``ca`` only clients with a certificate of that authority are accepted, as MBTLS requires; without it, all are.
+    Raises `UsageError` without ``cert`` and `Unreachable` for files that cannot be used.
     """
     where = str(endpoint)
     cert, key, ca = (endpoint.param(name) for name in ("cert", "key", "ca"))
@@ -28,7 +28,7 @@ def make_context(endpoint: Endpoint) -> ssl.SSLContext:
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.minimum_version = ssl.TLSVersion.TLSv1_2
     try:
-        context.load_cert_chain(cert, key or None, password=lambda: "")  # else OpenSSL asks on the terminal
+        context.load_cert_chain(cert, key or None, password=lambda: "")  # otherwise OpenSSL prompts on the terminal
         if ca:
             context.load_verify_locations(cafile=ca)
             context.verify_mode = ssl.CERT_REQUIRED
@@ -40,9 +40,9 @@ def make_context(endpoint: Endpoint) -> ssl.SSLContext:
 
 
 def client_role(certificate: bytes | None) -> str:
-    """The role in a client's certificate (DER); empty where there is none.
+    """Return the role in a client's certificate (DER); empty if it has none.
 
-    The certificate was verified by the handshake, so its bytes are sound: the extension is found by its object identifier.
+    The handshake has verified the certificate, so its bytes are sound: the extension is found by its object identifier.
     """
     identifier = _oid(ROLE_OID)
     place = (certificate or b"").find(identifier)
@@ -58,7 +58,7 @@ def client_role(certificate: bytes | None) -> str:
 
 
 def _oid(dotted: str) -> bytes:
-    """An object identifier in DER (X.690, 8.19), tag and length included."""
+    """Return an object identifier in DER (X.690, 8.19), tag and length included."""
     first, second, *others = map(int, dotted.split("."))
     data = bytearray((40 * first + second,))
     for arc in others:
@@ -70,7 +70,7 @@ def _oid(dotted: str) -> bytes:
 
 
 def _element(data: bytes) -> tuple[int, bytes, bytes]:
-    """Tag, content and what follows of the element that `data` begins with; tag 0 where there is none."""
+    """Return tag, content and remaining bytes of the first element in `data`; tag 0 if there is none."""
     if len(data) < 2:
         return 0, b"", b""
     size, at = data[1], 2

@@ -1,6 +1,7 @@
-"""The listening side of UDP: datagrams with where they came from, and datagrams back.
+"""The listening side of UDP: it receives datagrams with their senders, and sends datagrams back.
 
-Knows no protocol. There are no clients, only senders; what cannot be queued is dropped and counted, as a network does.
+It knows no protocol. There are no clients, only senders; datagrams that cannot be queued are dropped and counted, as in
+a network.
 """
 
 from __future__ import annotations
@@ -22,12 +23,12 @@ Peer = tuple[str, int]
 
 
 class UdpEnd(asyncio.DatagramProtocol):
-    """A bound UDP socket. Made by `open`; one reader at a time."""
+    """A bound UDP socket. Created by `open`; one reader at a time."""
 
     def __init__(self, endpoint: Endpoint, max_pending: int) -> None:
         self.endpoint = endpoint
         self.dropped = 0
-        """Datagrams that came while `max_pending` were waiting, and replies that the network did not take."""
+        """Datagrams that came while `max_pending` were waiting, and replies that the network did not accept."""
         self._max_pending = max_pending
         self._loop = asyncio.get_running_loop()
         self._transport: asyncio.DatagramTransport | None = None
@@ -39,7 +40,7 @@ class UdpEnd(asyncio.DatagramProtocol):
 
     @classmethod
     async def open(cls, endpoint: Endpoint, max_pending: int = MAX_PENDING) -> UdpEnd:
-        """Bind; port 0 takes a free one (`bound` says which). Raises `EndpointBusy` or `Unreachable`."""
+        """Bind; port 0 takes a free one (`bound` gives it). Raises `EndpointBusy` or `Unreachable`."""
         end = cls(endpoint, max_pending)
         try:
             infos = await end._loop.getaddrinfo(endpoint.host, endpoint.port, type=socket.SOCK_DGRAM)
@@ -53,13 +54,13 @@ class UdpEnd(asyncio.DatagramProtocol):
 
     @property
     def bound(self) -> Endpoint:
-        """The endpoint with the port that is really listened on."""
+        """The endpoint with the port on which the socket really listens."""
         if self._transport is None:
             return self.endpoint
         return self.endpoint.with_address(self.endpoint.host, self._transport.get_extra_info("sockname")[1])
 
     async def receive(self) -> tuple[bytes, Peer]:
-        """The next datagram and its sender. Raises `ConnectionLost` once this end is closed."""
+        """Return the next datagram and its sender. Raises `ConnectionLost` once this end is closed."""
         while not self._pending:
             if self._lost is not None:
                 raise ConnectionLost(self._lost.message, where=self._lost.where)
@@ -73,10 +74,10 @@ class UdpEnd(asyncio.DatagramProtocol):
         return self._pending.popleft()
 
     async def send(self, data: bytes, peer: Peer) -> None:
-        """Send `data` to `peer`. Whether it arrives nobody knows. Raises `ConnectionLost` once this end is closed."""
+        """Send `data` to `peer`, without a delivery report. Raises `ConnectionLost` once this end is closed."""
         if self._lost is not None or self._transport is None:
             raise self._lost or closed_here(self.endpoint)
-        if self._full:  # 64 KiB wait already (asyncio's own mark)
+        if self._full:  # 64 KiB already wait (asyncio's limit)
             self.dropped += 1
             return
         self._transport.sendto(data, peer)
@@ -100,7 +101,9 @@ class UdpEnd(asyncio.DatagramProtocol):
     # -- called by asyncio ----------------------------------------------------------------------------------------
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        self._transport = cast(asyncio.DatagramTransport, transport)  # asyncio's own does not say that it is one
+        self._transport = cast(
+            asyncio.DatagramTransport, transport
+        )  # asyncio's own class does not declare that it is one
 
     def datagram_received(self, data: bytes, addr: tuple[str, int]) -> None:
         if len(self._pending) >= self._max_pending:
@@ -116,7 +119,7 @@ class UdpEnd(asyncio.DatagramProtocol):
         self._full = False
 
     def error_received(self, exc: Exception) -> None:
-        self.dropped += 1  # a reply's port is closed by now: that sender's affair
+        self.dropped += 1  # the port of the reply's receiver is closed by now, which is the sender's problem
 
     def connection_lost(self, exc: Exception | None) -> None:
         reason = getattr(exc, "strerror", None) or "closed"

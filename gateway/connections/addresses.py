@@ -1,4 +1,4 @@
-"""The address of our end of a socket, as the peer sees it where nothing between the two translates addresses."""
+"""The local address of a socket, which is also the address that the peer sees unless it is translated in between."""
 
 from __future__ import annotations
 
@@ -6,6 +6,6 @@ import asyncio
 
 
 def address_of(transport: asyncio.BaseTransport) -> str:
-    """``HOST:PORT`` of this end; empty where the transport has no such address."""
+    """Return ``HOST:PORT`` of the local end, or an empty text if the transport has no such address."""
     name = transport.get_extra_info("sockname")
     return f"{name[0]}:{name[1]}" if isinstance(name, tuple) and len(name) >= 2 else ""

@@ -1,10 +1,11 @@
 """A CAN adapter of any kind that python-can knows: PCAN, Kvaser, slcan, gs_usb, IXXAT, Vector, its virtual bus...
 
-``can:INTERFACE/CHANNEL`` with python-can's own names: ``can:pcan/PCAN_USBBUS1?bitrate=250000``, ``can:kvaser/0``,
-``can:slcan//dev/ttyACM0@115200``. The adapter's driver is imported when it is opened, so a computer without it only
-misses it then. Reading blocks in a thread: few drivers have a descriptor that a loop could watch.
+Endpoints use python-can's own names, ``can:INTERFACE/CHANNEL``: ``can:pcan/PCAN_USBBUS1?bitrate=250000``,
+``can:kvaser/0``, ``can:slcan//dev/ttyACM0@115200``. The adapter's driver is imported when the adapter is opened, so a
+computer needs it only then. Reading blocks in a thread, because few drivers have a descriptor that an event loop could
+watch.
 
-What the frames mean is not known here.
+This module does not interpret frames.
 """
 
 from __future__ import annotations
@@ -24,25 +25,25 @@ from fieldtwin.gateway.core.errors import ConnectionLost, Desync, EndpointBusy, 
 from fieldtwin.gateway.wallclock import WallClock
 
 POLL_S = 0.05
-"""How long the reading thread waits in the driver: closing takes as long at most."""
+"""The time that the reading thread waits in the driver; closing takes up to this long."""
 
 SEND_TIMEOUT_S = 2.0
 
 _OWN = frozenset({"bitrate", "listen"})
-"""Parameters of the endpoint that are read here; others are the driver's (``?app_name=CANalyzer``)."""
+"""Parameters of the endpoint that are read here; others are passed to the driver (``?app_name=CANalyzer``)."""
 
 RATELESS = frozenset({"virtual", "udp_multicast"})
 """Interfaces without a bit rate."""
 
 
 class AdapterConnection(CanConnection):
-    """One handle on an adapter. Make it with `open`. `bitrate` is what the adapter was set to, 0 where it has none."""
+    """One handle on an adapter. Make it with `open`. `bitrate` is the adapter's setting, 0 if it has none."""
 
     def __init__(self, endpoint: Endpoint, bus: can.BusABC, bitrate: int = 0, max_pending: int = 4096) -> None:
         super().__init__(CANConnection(), endpoint, max_pending)
         self.bitrate = bitrate
         self.malformed = 0
-        """What the driver delivered and is no classic frame (CAN FD)."""
+        """Received frames that are not classic CAN frames (CAN FD)."""
         self._bus = bus
         self._clock = WallClock()
         self._loop = asyncio.get_running_loop()
@@ -54,11 +55,11 @@ class AdapterConnection(CanConnection):
 
     @classmethod
     async def open(cls, endpoint: Endpoint, bitrate: int, *, max_pending: int = 4096) -> AdapterConnection:
-        """Open the adapter at `bitrate` bit/s, or at ``?bitrate=`` of the endpoint. ``?listen=1``: it does not even acknowledge.
+        """Open the adapter at `bitrate` bit/s, or at ``?bitrate=`` of the endpoint.
 
-        Raises `UsageError` for an interface that python-can has not, a driver that is not installed, and an adapter that
-        would have to guess its bit rate (a node at a wrong one destroys everybody's frames); `EndpointBusy` or
-        `Unreachable` where there is no such adapter.
+        With ``?listen=1`` it does not even acknowledge. Raises `UsageError` for an interface that python-can does not
+        have, a driver that is not installed, and an adapter that would have to guess its bit rate (a node at a wrong
+        one destroys the frames of all nodes); `EndpointBusy` or `Unreachable` if the adapter is in use or missing.
         """
         rate = _bitrate(endpoint, bitrate)
         words = _words(endpoint, rate)
@@ -71,8 +72,10 @@ class AdapterConnection(CanConnection):
         return cls(endpoint, bus, rate, max_pending)
 
     async def send(self, frame: CanFrame) -> None:
-        """Give `frame` to the driver. Raises `ConnectionLost` when the adapter is gone, `WireError` when its queue stays
-        full for `SEND_TIMEOUT_S`."""
+        """Pass `frame` to the driver.
+
+        Raises `ConnectionLost` if the adapter is gone, `WireError` if its queue stays full for `SEND_TIMEOUT_S`.
+        """
         message = message_of(frame, self.endpoint)
         async with self._turn:
             if self._lost is not None:
@@ -102,7 +105,7 @@ class AdapterConnection(CanConnection):
         self._sender.shutdown()
         try:
             self._bus.shutdown()
-        except (OSError, can.CanError):  # unplugged: slcan says good-bye to a port that is gone, and leaves it open
+        except (OSError, can.CanError):  # unplugged: slcan writes to the port, which is gone, and leaves it open
             port = getattr(self._bus, "serialPortOrig", None)
             if port is not None:
                 port.close()
@@ -123,7 +126,7 @@ class AdapterConnection(CanConnection):
         try:
             self._loop.call_soon_threadsafe(what, item)
         except RuntimeError:
-            self._stopping.set()  # the loop is closed: nobody is there to be told
+            self._stopping.set()  # the loop is closed: stop reading
 
     def _take(self, message: can.Message) -> None:
         if self._lost is not None:
@@ -139,7 +142,7 @@ class AdapterConnection(CanConnection):
                 remote=message.is_remote_frame,
                 error=message.is_error_frame,
                 dlc=min(message.dlc, 8),
-                t_ns=self._clock.monotonic_ns(),  # drivers' own stamps have other origins
+                t_ns=self._clock.monotonic_ns(),  # the drivers' time stamps have other origins
             )
         except Desync:
             self.malformed += 1
@@ -165,7 +168,7 @@ def _bitrate(endpoint: Endpoint, asked: int) -> int:
 
 
 def _words(endpoint: Endpoint, rate: int) -> dict[str, Any]:
-    """What python-can's constructor is given."""
+    """Return the arguments for python-can's constructor."""
     if endpoint.interface not in can.VALID_INTERFACES:
         known = sorted(set(can.VALID_INTERFACES) | {"socketcan", "fieldtwin"})
         raise UsageError(f"{endpoint}: unknown kind of CAN interface {endpoint.interface!r}", expected=", ".join(known))
@@ -190,7 +193,7 @@ def _typed(text: str) -> Any:
 
 
 def _listen_only(endpoint: Endpoint) -> dict[str, Any]:
-    """How this driver is told to be silent, as far as python-can can tell it."""
+    """Return the arguments that make this driver listen only, as far as python-can supports it."""
     match endpoint.interface:
         case "slcan":
             return {"listen_only": True}
@@ -199,13 +202,13 @@ def _listen_only(endpoint: Endpoint) -> dict[str, Any]:
         case "kvaser":
             return {"driver_mode": False}  # DRIVER_MODE_SILENT
         case "virtual" | "udp_multicast":
-            return {}  # nothing acknowledges there
+            return {}  # this bus has no acknowledgements
         case interface:
             raise UsageError(f"{endpoint}: python-can has no listen-only mode for {interface}", got="listen=1")
 
 
 def can_listen_only(endpoint: Endpoint) -> bool:
-    """Whether ``?listen=1`` is possible there."""
+    """Return whether ``?listen=1`` is possible for this endpoint."""
     return endpoint.interface in ("slcan", "pcan", "ixxat", "kvaser", "virtual", "udp_multicast")
 
 
@@ -234,7 +237,7 @@ def _no_driver(endpoint: Endpoint, error: Exception) -> UsageError:
 
 
 def _shut_unwanted(opening: asyncio.Future[can.BusABC]) -> None:
-    """Whoever asked for the adapter went away before it was open."""
+    """Close an adapter whose opening was cancelled by the caller."""
     if not opening.cancelled() and opening.exception() is None:
         opening.result().shutdown()
 

@@ -1,7 +1,7 @@
 """A kernel CAN interface (SocketCAN), through python-can.
 
-The kernel owns the interface: it must exist, be up, and run at the bit rate that the system file names; all three are
-checked and nothing is set. Frames come by `add_reader`, no threads. What the frames mean is not known here.
+The kernel owns the interface: it must exist, be up, and run at the bit rate that the system file names. All three are
+checked; none is changed. Frames arrive through `add_reader`, without threads. This module does not interpret frames.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from fieldtwin.gateway.core.errors import ConnectionLost, Desync, Unreachable, U
 from fieldtwin.gateway.wallclock import WallClock
 
 FRAMES_PER_TURN = 256
-"""Frames taken from the kernel before the loop serves others; what is left keeps the descriptor readable."""
+"""The number of frames that are taken from the kernel before the event loop runs other tasks; the rest stays readable."""
 
 RECEIVE_BUFFER_BYTES = 4 << 20
 
 FIRST_BACKOFF_S, LAST_BACKOFF_S = 0.001, 0.05
 SEND_TIMEOUT_S = 2.0
-"""A transmit queue that stays full for so long has nobody who acknowledges, or a bus that is off."""
+"""If the transmit queue stays full for this long, no node acknowledges, or the controller is bus-off."""
 
 
 class SocketCanConnection(CanConnection):
@@ -41,12 +41,12 @@ class SocketCanConnection(CanConnection):
     def __init__(self, endpoint: Endpoint, bus: can.BusABC, max_pending: int = 4096) -> None:
         super().__init__(CANConnection(), endpoint, max_pending)
         self.malformed = 0
-        """What the kernel delivered and is no classic frame (CAN FD)."""
+        """Received frames that are not classic CAN frames (CAN FD)."""
         self.tx_retries = 0
-        """Attempts to send that met a full transmit queue."""
+        """Attempts to send while the transmit queue was full."""
         self._bus = bus
         self._clock = WallClock()
-        self._turn = asyncio.Lock()  # keeps the order of concurrent senders, through back-off too
+        self._turn = asyncio.Lock()  # keeps the order of concurrent senders, also while they back off
         self._loop = asyncio.get_running_loop()
         _enlarge(bus.fileno())
         self._loop.add_reader(bus.fileno(), self._on_readable)
@@ -55,8 +55,8 @@ class SocketCanConnection(CanConnection):
     async def open(cls, endpoint: Endpoint, bitrate: int, *, max_pending: int = 4096) -> SocketCanConnection:
         """Join ``can:socketcan/IFACE``.
 
-        Raises `Unreachable` where the kernel has no SocketCAN, no such interface, or it is down; `UsageError` where it
-        runs at another bit rate than `bitrate` (bit/s; a virtual interface has none and takes any).
+        Raises `Unreachable` if the kernel has no SocketCAN, or the interface does not exist or is down; `UsageError` if
+        it runs at a bit rate other than `bitrate` (bit/s; a virtual interface has no bit rate and accepts any).
         """
         if endpoint.interface != "socketcan":
             raise UsageError(f"{endpoint} is no kernel CAN interface", expected="can:socketcan/IFACE")
@@ -68,9 +68,9 @@ class SocketCanConnection(CanConnection):
         return cls(endpoint, bus, max_pending)
 
     async def send(self, frame: CanFrame) -> None:
-        """Give `frame` to the kernel, backing off while its transmit queue is full (ENOBUFS).
+        """Pass `frame` to the kernel, backing off while its transmit queue is full (ENOBUFS).
 
-        Raises `ConnectionLost` when the interface is gone, `WireError` when the queue stays full for `SEND_TIMEOUT_S`.
+        Raises `ConnectionLost` if the interface is gone, `WireError` if the queue stays full for `SEND_TIMEOUT_S`.
         """
         message = message_of(frame, self.endpoint)
         async with self._turn:
@@ -93,14 +93,14 @@ class SocketCanConnection(CanConnection):
         try:
             self._bus.send(message, timeout=0)
         except can.CanOperationError as e:
-            # python-can gives no number where the socket is not writable: full as well.
+            # python-can reports no number if the socket is not writable: that also means a full queue.
             if e.error_code in (errno.ENOBUFS, errno.EAGAIN, None):
                 return False
             raise self._end(e) from e
         return True
 
     async def aclose(self) -> None:
-        """Close the socket; frames that the kernel has are still sent."""
+        """Close the socket; the kernel still sends the frames that it has taken."""
         self._stop(closed_here(self.endpoint))
         self.inbound.data_stream.clear()
 
@@ -118,7 +118,7 @@ class SocketCanConnection(CanConnection):
         if message.is_fd:
             self.malformed += 1
             return
-        # The kernel stamps in UTC; its age is what carries over to the monotonic clock.
+        # The kernel's time stamps are UTC; the age of a frame gives its time on the monotonic clock.
         age_ns = max(0, self._clock.utc_ns() - int(message.timestamp * NS_PER_S))
         try:
             frame = CanFrame(
@@ -148,7 +148,7 @@ class SocketCanConnection(CanConnection):
 
 
 def _check(endpoint: Endpoint, bitrate: int) -> None:
-    """Refuse an interface that is not there, no CAN, down, or at another bit rate, before python-can opens a socket."""
+    """Refuse an interface that does not exist, is not CAN, is down, or has another bit rate, before python-can opens a socket."""
     try:
         socket.socket(socket.PF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
         link = query_link(endpoint.path)
@@ -190,6 +190,6 @@ def _up(endpoint: Endpoint) -> str:
 
 
 def _enlarge(descriptor: int) -> None:
-    """A larger receive buffer, as far as the kernel allows: the usual one holds some hundred frames."""
+    """Enlarge the receive buffer as far as the kernel allows: the default holds a few hundred frames."""
     with socket.socket(fileno=os.dup(descriptor)) as can_socket:
         can_socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)

@@ -1,4 +1,4 @@
-"""What can be known of a CAN endpoint without joining its bus. Opens nothing, sends nothing."""
+"""The properties of a CAN endpoint that can be determined without joining its bus. Opens nothing, sends nothing."""
 
 from __future__ import annotations
 
@@ -10,9 +10,12 @@ from fieldtwin.gateway.core.errors import Unreachable
 
 @dataclass(frozen=True, slots=True)
 class CanFacts:
-    """`bitrate` in bit/s is what the medium runs at, 0 where that is not known. `needs_bitrate`: it must be told one
-    (an adapter). `listen_only`: it is set so that nothing can be sent. `can_listen_only`: ``?listen=1`` works there.
-    `state`, `tx_errors` and `rx_errors` are the controller's, where the driver tells them."""
+    """Properties of a CAN endpoint.
+
+    `bitrate` is that of the medium in bit/s, 0 if unknown. `needs_bitrate` says that the endpoint has to name one (an
+    adapter). `listen_only` says that it is set so that nothing can be sent, `can_listen_only` that ``?listen=1`` is
+    possible. `state`, `tx_errors` and `rx_errors` are those of the controller, if the driver reports them.
+    """
 
     interface: str
     bitrate: int = 0
@@ -25,7 +28,7 @@ class CanFacts:
 
 
 def can_facts(endpoint: Endpoint) -> CanFacts:
-    """Ask the kernel, or read the endpoint. Raises `Unreachable` for a kernel interface that is not there."""
+    """Ask the kernel, or read the endpoint. Raises `Unreachable` for a kernel interface that does not exist."""
     interface = endpoint.interface
     if interface == "fieldtwin":
         return CanFacts(interface)

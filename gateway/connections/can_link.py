@@ -1,7 +1,7 @@
-"""What the kernel knows about a network interface: is it CAN, is it up, at which bit rate (rtnetlink(7)).
+"""The kernel's information about a network interface: is it CAN, is it up, at which bit rate (rtnetlink(7)).
 
-Read-only: the kernel owns a CAN interface's bit rate, it is checked and never set. Reading bytes is apart from asking
-the kernel, so that the former can be tested anywhere. Nothing here sends or receives a frame.
+Read-only: the kernel owns a CAN interface's bit rate, which is checked and never set. Decoding is separate from asking
+the kernel, so that it can be tested on any system. This module sends and receives no frames.
 """
 
 from __future__ import annotations
@@ -29,9 +29,10 @@ _TIMEOUT_S = 1.0
 
 @dataclass(frozen=True, slots=True)
 class CanLink:
-    """A network interface. `bitrate` in bit/s is 0 where the interface has none (vcan) or none was set.
+    """A network interface. `bitrate` in bit/s is 0 if the interface has none (vcan) or none was set.
 
-    `kind` is the driver's word for virtual ones (``vcan``, ``vxcan``, ``can`` for controllers), else empty.
+    `kind` is the driver's name for it (``vcan`` and ``vxcan`` for virtual interfaces, ``can`` for controllers), else
+    empty.
     """
 
     is_can: bool
@@ -41,14 +42,14 @@ class CanLink:
     listen_only: bool = False
     """The controller does not even acknowledge."""
     state: str = ""
-    """The controller's: ``error-active``, ``error-passive``, ``bus-off``...; empty where it has none."""
+    """The controller's state: ``error-active``, ``error-passive``, ``bus-off``...; empty if it has none."""
     tx_errors: int = 0
     rx_errors: int = 0
-    """The controller's error counters (ISO 11898-1, 12.1.4), 0 where the driver does not tell them."""
+    """The controller's error counters (ISO 11898-1, 12.1.4), 0 if the driver does not report them."""
 
 
 def query_link(name: str) -> CanLink:
-    """Ask the kernel about interface `name`. Raises `OSError`: ENODEV when there is none."""
+    """Ask the kernel about interface `name`. Raises `OSError`: ENODEV if it does not exist."""
     index = socket.if_nametoindex(name)
     request = _MESSAGE.pack(_MESSAGE.size + _LINK.size, _RTM_GETLINK, _NLM_F_REQUEST, 1, 0)
     with socket.socket(socket.AF_NETLINK, socket.SOCK_RAW, socket.NETLINK_ROUTE) as netlink:
@@ -58,7 +59,7 @@ def query_link(name: str) -> CanLink:
 
 
 def read_link(answer: bytes) -> CanLink:
-    """Read an RTM_NEWLINK message. Raises `OSError` where the kernel answered with an error, or with something else."""
+    """Read an RTM_NEWLINK message. Raises `OSError` if the kernel answered with an error or a different message."""
     if len(answer) < _MESSAGE.size + _LINK.size:
         raise OSError(0, "the kernel's answer about the interface is too short")
     length, kind_of_message, *_ = _MESSAGE.unpack_from(answer)
@@ -89,7 +90,7 @@ def _number(data: bytes, size: int) -> int:
 
 
 def _attributes(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Type and payload of each attribute; a broken tail ends the walk."""
+    """Yield type and payload of each attribute; a damaged tail ends the iteration."""
     at = 0
     while at + _ATTRIBUTE.size <= len(data):
         length, kind = _ATTRIBUTE.unpack_from(data, at)

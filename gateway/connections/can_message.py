@@ -1,4 +1,4 @@
-"""Our frames as python-can's messages, for whoever sends through it."""
+"""Conversion of frames to python-can's messages, for ends that send through python-can."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ from fieldtwin.gateway.core.errors import UsageError
 
 
 def message_of(frame: CanFrame, endpoint: Endpoint) -> can.Message:
-    """`frame` to be sent at `endpoint`. Raises `UsageError` for an error frame: those are the bus's own."""
+    """Return the message for `frame`, to be sent at `endpoint`. Raises `UsageError` for an error frame, which a node
+    cannot send.
+    """
     if frame.error:
         raise UsageError("an error frame cannot be sent", got=str(frame), where=str(endpoint))
     return can.Message(

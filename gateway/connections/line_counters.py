@@ -1,6 +1,6 @@
-"""What a serial port's driver counted and what its control lines say: ``TIOCGICOUNT`` and ``TIOCMGET`` of Linux (tty_ioctl(4)).
+"""The counters and control lines of a serial port's driver: ``TIOCGICOUNT`` and ``TIOCMGET`` of Linux (tty_ioctl(4)).
 
-A pty, many USB adapters and other operating systems count nothing; then there is None, never zeros. Only reads.
+A pty, many USB adapters and other operating systems have no counters; the result is then None, never zeros. Only reads.
 """
 
 from __future__ import annotations
@@ -19,8 +19,11 @@ _LINES = {"CTS": 0x020, "DSR": 0x100, "DCD": 0x040, "RI": 0x080, "DTR": 0x002, "
 
 @dataclass(frozen=True, slots=True)
 class LineCounters:
-    """Since the driver was loaded: characters both ways, and errors of reception. `overrun`: the UART was not read in time;
-    `buffer_overrun`: the kernel's buffer was full; `breaks`: the line was held at 0 for longer than a character."""
+    """Counters since the driver was loaded: characters in both directions, and receive errors.
+
+    `overrun`: the UART was not read in time; `buffer_overrun`: the kernel's buffer was full; `breaks`: the line was
+    held at 0 for longer than a character.
+    """
 
     rx: int = 0
     tx: int = 0
@@ -31,7 +34,7 @@ class LineCounters:
     buffer_overrun: int = 0
 
     def since(self, before: LineCounters) -> LineCounters:
-        """What was counted from `before` to this; counters wrap at 32 bits."""
+        """Return the differences from `before`; counters wrap at 32 bits."""
         return LineCounters(
             *((getattr(self, f.name) - getattr(before, f.name)) & 0xFFFF_FFFF for f in fields(LineCounters))
         )
@@ -46,11 +49,11 @@ class CountsErrors(Protocol):
     """A connection whose port may count errors."""
 
     def counters(self) -> LineCounters | None:
-        """What the port has counted, None where it counts nothing."""
+        """Return the port's counters, or None if it has none."""
         ...
 
     def control_lines(self) -> dict[str, bool]:
-        """CTS, DSR, DCD, RI (inputs) and DTR, RTS (ours); empty where the port has none."""
+        """Return CTS, DSR, DCD, RI (inputs) and DTR, RTS (outputs); empty if the port has none."""
         ...
 
 
@@ -62,13 +65,13 @@ def unpack_counters(data: bytes) -> LineCounters:
 
 
 def read_counters(descriptor: int) -> LineCounters | None:
-    """Ask the driver; None where it has no such counters."""
+    """Ask the driver; None if it has no such counters."""
     answer = _ask(descriptor, TIOCGICOUNT, _INTS.size)
     return unpack_counters(answer) if answer is not None else None
 
 
 def read_control_lines(descriptor: int) -> dict[str, bool]:
-    """Ask the driver; empty where it has no such lines."""
+    """Ask the driver; empty if it has no such lines."""
     answer = _ask(descriptor, TIOCMGET, _INT.size)
     if answer is None:
         return {}

@@ -1,7 +1,7 @@
-"""The gateway's listening side: a TCP port, with TLS where it is asked for, whose clients become `ByteConnection`s.
+"""The gateway's listening side: a TCP port, optionally with TLS, whose clients become `ByteConnection`s.
 
-It must never know a protocol: who may enter is asked of its owner by address, what a client says is its owner's business,
-and so is what a role in its certificate allows.
+This module must not know a protocol. Its owner decides by address which clients may connect, interprets what they send,
+and decides what the role in a client's certificate permits.
 """
 
 from __future__ import annotations
@@ -22,15 +22,17 @@ from fieldtwin.gateway.core.errors import ConnectionLost, EndpointBusy, Unreacha
 MAX_CLIENTS = 32
 BACKLOG = 64
 CLIENT_CHUNKS = 16
-"""Chunks that may wait for us a client (64 KiB); then its socket is not read, and TCP holds it back."""
+"""The number of chunks of a client that may wait (64 KiB); then its socket is not read, and TCP holds the client back."""
 
 ACCEPT_PAUSE_S = 0.1
-"""How long to wait when the system has no descriptor left for another client."""
+"""The time to wait when the system has no free descriptor for another client."""
 
 
 class ClientConnection(TcpConnection, Client):
-    """One client. `peer` is its address, `last_used_s` the loop's time when it last said something, `role` what its
-    certificate names (MBTLS 8.4), empty without one and without TLS."""
+    """One client. `peer` is its address, `last_used_s` the loop's time when it last sent data.
+
+    `role` is the role that its certificate names (MBTLS 8.4), empty without a role and without TLS.
+    """
 
     def __init__(self, endpoint: Endpoint, peer: str, port: int) -> None:
         super().__init__(endpoint, CLIENT_CHUNKS)
@@ -47,7 +49,7 @@ class ClientConnection(TcpConnection, Client):
         self.last_used_s = self._loop.time()
 
     async def take(self, sock: socket.socket, tls: ssl.SSLContext | None) -> None:
-        """Become the connection of an accepted socket, and shake hands where a context is given."""
+        """Become the connection of an accepted socket, with a TLS handshake if a context is given."""
         self._secured = tls is not None
         limit_s = HANDSHAKE_LIMIT_S if tls is not None else None
         await self._loop.connect_accepted_socket(lambda: self._wire, sock, ssl=tls, ssl_handshake_timeout=limit_s)
@@ -55,11 +57,14 @@ class ClientConnection(TcpConnection, Client):
             shaken = self._wire.transport.get_extra_info("ssl_object")
             assert isinstance(shaken, ssl.SSLObject)
             self.role = role_in(shaken.getpeercert(binary_form=True) or b"")
-        if self._lost is not None:  # its place was given away meanwhile
+        if self._lost is not None:  # evicted meanwhile
             self._wire.transport.abort()
 
     def on_end_of_stream(self, error: ConnectionLost) -> bool:
-        """Without TLS, which has no half-closed connections: what arrived before is read, and may still be answered."""
+        """Without TLS, keep the connection half-open: data that arrived before is read, and may still be answered.
+
+        TLS has no half-closed connections.
+        """
         if self._secured:
             return super().on_end_of_stream(error)
         self._end_of_stream = error
@@ -72,7 +77,7 @@ class ClientConnection(TcpConnection, Client):
         return super()._waits(waiter)
 
     def evict(self, why: str) -> None:
-        """End it at once."""
+        """End the connection immediately."""
         self.feed_lost(ConnectionLost(why, where=f"{self.endpoint}: {self.peer}"))
         self.inbound.data_stream.clear()
         if hasattr(self._wire, "transport"):
@@ -83,11 +88,11 @@ OnClient = Callable[[Client], Awaitable[None]]
 
 
 class TcpListener:
-    """Runs `on_client(connection)` for each client that `admits` lets in; when that returns, the client is closed.
+    """Runs `on_client(connection)` for each client that `admits` accepts; when that returns, the client is closed.
 
-    When `max_clients` are connected, the next one takes the place of the one that has been silent for longest
-    (TG 4.2.1, case MB-065). One that has been silent for `idle_s` is closed as well; 0: never. `refused` counts who was not
-    admitted, `unshaken` whose TLS handshake came to nothing, `retired` who was silent for too long.
+    When `max_clients` are connected, the next one takes the place of the one that has been silent for longest (TG
+    4.2.1, case MB-065). A client that has been silent for `idle_s` is closed as well; 0 means never. `refused` counts
+    clients that were not admitted, `unshaken` failed TLS handshakes, `retired` clients that were silent for too long.
     """
 
     def __init__(
@@ -124,9 +129,9 @@ class TcpListener:
         admits: Callable[[str], bool] = lambda address: True,
         idle_s: float = 0.0,
     ) -> TcpListener:
-        """Listen on a ``tcp://`` or ``tls://`` endpoint; port 0 takes a free one (`bound` says which).
+        """Listen on a ``tcp://`` or ``tls://`` endpoint; port 0 uses a free one (`bound` has its number).
 
-        Raises `EndpointBusy`, or `Unreachable` that says what to do about it.
+        Raises `EndpointBusy`, or `Unreachable` with a hint how to solve it.
         """
         if endpoint.scheme not in ("tcp", "tls"):
             raise UsageError("cannot listen there", expected="tcp://HOST:PORT or tls://HOST:PORT", got=str(endpoint))
@@ -134,7 +139,7 @@ class TcpListener:
         tls = await loop.run_in_executor(None, server_context, endpoint) if endpoint.scheme == "tls" else None
         sock: socket.socket | None = None
         try:
-            # The first address only: a name with an IPv4 and an IPv6 address would get two different free ports.
+            # Use the first address only: a name with an IPv4 and an IPv6 address would get two different free ports.
             family, kind, proto, _, address = (
                 await loop.getaddrinfo(endpoint.host, endpoint.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
             )[0]
@@ -151,14 +156,14 @@ class TcpListener:
 
     @property
     def bound(self) -> Endpoint:
-        """The endpoint with the port that is really listened on."""
+        """Return the endpoint with the port that is actually listened on."""
         if self._sock.fileno() < 0:
             return self._endpoint
         return self._endpoint.with_address(self._endpoint.host, self._sock.getsockname()[1])
 
     @property
     def clients(self) -> tuple[ClientConnection, ...]:
-        """Who is connected, oldest first."""
+        """Return the connected clients, oldest first."""
         return tuple(self._clients)
 
     async def aclose(self) -> None:
@@ -177,7 +182,7 @@ class TcpListener:
         while True:
             try:
                 sock, address = await loop.sock_accept(self._sock)
-            except OSError:  # no descriptors left, or the client went before it was accepted
+            except OSError:  # no free descriptors, or the client left before it was accepted
                 await asyncio.sleep(ACCEPT_PAUSE_S)
                 continue
             if not self._admits(address[0]):
@@ -205,12 +210,12 @@ class TcpListener:
         self._clients.remove(client)
         shaking = self._shaking.pop(client, None)
         if shaking is not None:
-            shaking.cancel()  # there is no connection yet that could be closed
+            shaking.cancel()  # no connection exists yet that could be closed
         else:
             client.evict(why)
 
     def _retire(self) -> None:
-        """Close who has been silent for too long, and look again when the next one may have been."""
+        """Close the clients that were silent for too long, and schedule the next check."""
         if self._retiring is not None:
             self._retiring.cancel()
             self._retiring = None
@@ -230,7 +235,7 @@ class TcpListener:
         except BaseException as e:
             sock.close()
             self._forget(client)
-            if isinstance(e, OSError):  # it went while it was being accepted, or is none that TLS lets in
+            if isinstance(e, OSError):  # it left while being accepted, or its TLS handshake failed
                 self.unshaken += self._tls is not None
                 return
             raise
@@ -251,7 +256,7 @@ class TcpListener:
     def _ended(self, task: asyncio.Task[None]) -> None:
         self._tasks.discard(task)
         error = None if task.cancelled() else task.exception()
-        if error is not None:  # one client's failure ends that client; it is reported, not swallowed
+        if error is not None:  # a client's failure ends that client only; it is reported
             report = {"message": f"serving a client of {self._endpoint} failed", "exception": error, "task": task}
             task.get_loop().call_exception_handler(report)
 

@@ -1,6 +1,6 @@
-"""The plant's `Connector`: an endpoint's scheme decides which of the operating system's ends opens it.
+"""The plant's `Connector`: it opens an endpoint with the end of the operating system that the scheme requires.
 
-It must never know that a prototype exists: mapping an endpoint to an emulator's is done by whoever wraps it.
+This module must not know that a simulation exists: a wrapper around it may map an endpoint to that of an emulator.
 """
 
 from __future__ import annotations
@@ -17,11 +17,12 @@ BYTE_SCHEMES = "rtu:, ascii:, tcp:, rtu+tcp:, udp: or tls:"
 class OsConnector(Connector):
     """Opens serial ports, TCP and TLS streams, UDP sockets and CAN buses of this computer.
 
-    Each kind of wire is imported when the first one is opened: a plant without CAN does not load python-can.
+    The code for each kind of link is imported when the first one is opened: a plant without CAN does not load
+    python-can.
     """
 
     async def open_bytes(self, endpoint: Endpoint) -> ByteConnection:
-        """Open one of `BYTE_SCHEMES`. Raises as `Connector` says."""
+        """Open one of `BYTE_SCHEMES`. Raises the errors of `Connector`."""
         match endpoint.scheme:
             case "rtu" | "ascii":
                 if sys.platform == "win32":  # COM ports have no descriptors
@@ -54,8 +55,10 @@ class OsConnector(Connector):
                 raise UsageError(f"{endpoint}: {scheme}: cannot be opened here", expected=BYTE_SCHEMES)
 
     async def open_can(self, endpoint: Endpoint, bitrate: int) -> CanConnection:
-        """Open ``can:socketcan/CHANNEL``, ``can:fieldtwin/HOST:PORT``, or any other interface of python-can. Raises as
-        `Connector` says."""
+        """Open ``can:socketcan/CHANNEL``, ``can:fieldtwin/HOST:PORT``, or any other interface of python-can.
+
+        Raises the errors of `Connector`.
+        """
         if not endpoint.is_can:
             raise UsageError(f"{endpoint} is no CAN bus", expected="can:INTERFACE/CHANNEL")
         match endpoint.interface:

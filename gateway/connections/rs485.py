@@ -1,7 +1,8 @@
 """RS485 direction control by the kernel (Linux: ioctl TIOCSRS485, Documentation/driver-api/serial/serial-rs485.rst).
 
-The driver raises RTS, which opens the transmitter, before the first character and drops it behind the last one: no
-program can do that in time from outside. Bytes and one ioctl; it must never know what the port is used for.
+The driver raises RTS, which opens the transmitter, before the first character and drops it after the last one: a
+program outside the kernel cannot do that in time. This module handles bytes and one ioctl; it must not know what the
+port is used for.
 """
 
 from __future__ import annotations
@@ -20,19 +21,20 @@ _NO_SUCH_REQUEST = errno.ENOTTY
 
 
 def settings_sent(driver: bytes) -> bytes:
-    """The struct serial_rs485 to set, given the one that the driver has: RTS high while sending and low otherwise.
+    """Return the struct serial_rs485 to set, given the one that the driver has: RTS high while sending and low
+    otherwise.
 
-    Delays, termination and what else the driver or the device tree says about the board stay as they are.
+    Delays, termination and other settings of the board from the driver or the device tree are not changed.
     """
     flags, *rest = _SERIAL_RS485.unpack(driver)
     return _SERIAL_RS485.pack((flags | ENABLED | RTS_ON_SEND) & ~RTS_AFTER_SEND, *rest)
 
 
 def let_driver_switch(fd: int) -> None:
-    """Turn RS485 mode on. Raises `OSError`: ENOTTY where the port has none (ptys, most USB adapters), or drops it."""
-    import fcntl  # not on Windows, where there is no such request
+    """Turn RS485 mode on. Raises `OSError`: ENOTTY if the port has none (ptys, most USB adapters) or does not keep it."""
+    import fcntl  # not on Windows, which has no such request
 
     driver = fcntl.ioctl(fd, TIOCGRS485, bytes(_SERIAL_RS485.size))
     kept = fcntl.ioctl(fd, TIOCSRS485, settings_sent(driver))
-    if not _SERIAL_RS485.unpack(kept)[0] & ENABLED:  # the kernel gives back what it made of the request
+    if not _SERIAL_RS485.unpack(kept)[0] & ENABLED:  # the kernel returns the settings that it applied
         raise OSError(_NO_SUCH_REQUEST, "the driver does not keep the setting")

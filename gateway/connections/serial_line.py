@@ -1,10 +1,10 @@
-"""A serial port as a `ByteConnection`, where ports have descriptors (`serial_threads` is for other systems).
+"""A serial port as a `ByteConnection`, on systems whose ports have descriptors (`serial_threads` is for other systems).
 
-`serial_port` finds, locks and configures the port; reading and writing are plain non-blocking descriptor work of the event
-loop, so no thread stands behind a port and a chunk is delivered when the driver has it.
+`serial_port` finds, locks and configures the port. Reading and writing are non-blocking operations of the event loop on
+the descriptor, so a port needs no thread and a chunk is delivered when the driver has it.
 
-It must never know a protocol: no frame, no gap, no unit id. A frame that arrives in five pieces, because a USB adapter
-hands over every 16 ms, is five chunks here.
+This module must not know a protocol: no frames, gaps or unit IDs. A frame that arrives in five pieces, because a USB
+adapter delivers data every 16 ms, is five chunks here.
 """
 
 from __future__ import annotations
@@ -24,17 +24,18 @@ with suppress(ImportError):  # Windows: `serial_threads` is used there
     import termios
 
 DRAIN_LIMIT_S = 1.0
-"""How long closing waits for the last bytes to leave; a shutdown as a whole has 2 s."""
+"""The time in seconds that closing waits for the last bytes to be sent; a whole shutdown has 2 s."""
 
 
 class SerialConnection(ByteConnection):
     """One end of a serial line (SPEC: an RS232 connection).
 
-    Bounded: at most `max_pending` chunks of `CHUNK` bytes wait here; then the port is not read until half of them are
-    gone, and the operating system's buffer, and then the line's flow control if it has one, takes the rest.
+    At most `max_pending` chunks of `CHUNK` bytes wait here. Then the port is not read until half of them have been
+    taken; meanwhile the operating system's buffer, and then the flow control of the line if it has one, holds the rest.
 
-    Unplugged, or a pty whose other side is gone: what arrived is still read, then `read` and `write` raise
-    `ConnectionLost`. The descriptor is closed at once, so that the port gets its old name back when it returns.
+    If the port is unplugged, or the other side of a pty is gone, the bytes that arrived are still read; then `read` and
+    `write` raise `ConnectionLost`. The descriptor is closed immediately, so that the port gets its old name back when
+    it returns.
     """
 
     def __init__(self, port: Port, endpoint: Endpoint, max_pending: int = 1024) -> None:
@@ -47,17 +48,18 @@ class SerialConnection(ByteConnection):
         self._room: asyncio.Future[None] | None = None
         self._reading = False
         self.ignored = _ignored_settings(self._fd, endpoint)
-        """Settings that the port's driver took without a word and does not apply, such as ``parity E`` on a pty."""
+        """Settings that the port's driver accepted silently but does not apply, such as ``parity E`` on a pty."""
         self._resume()
 
     @classmethod
     async def open(cls, endpoint: Endpoint, max_pending: int = 1024) -> SerialConnection:
-        """Lock and configure the port; what the line said before is thrown away.
+        """Lock and configure the port; bytes that were received before are discarded.
 
-        Raises `Unreachable` when there is no such port or no permission, `EndpointBusy` when another program holds it,
-        `UsageError` when the port cannot do the baud rate or frame, or has no RS485 mode and is asked for it.
+        Raises `Unreachable` if the port does not exist or permission is missing, `EndpointBusy` if another program uses
+        it, `UsageError` if the port does not support the baud rate or frame, or has no RS485 mode although it is
+        requested.
         """
-        # In a thread: opening a USB adapter is a conversation with it, and a sick one takes seconds to answer.
+        # In a thread: opening a USB adapter exchanges messages with it, and a faulty one takes seconds to answer.
         opening = asyncio.get_running_loop().run_in_executor(None, open_port, endpoint)
         try:
             port = await asyncio.shield(opening)
@@ -67,10 +69,10 @@ class SerialConnection(ByteConnection):
         return cls(port, endpoint, max_pending)
 
     async def write(self, data: bytes) -> None:
-        """Hand `data` to the driver, waiting while its buffer is full; writers take turns, so no two are mixed.
+        """Pass `data` to the driver, waiting while its buffer is full. Concurrent writes are not mixed.
 
-        Handed over is not sent: the last character leaves up to ``len(data)`` character times later
-        (`SerialSettings.char_time_s`), longer behind a USB adapter. Raises `ConnectionLost`.
+        The bytes are not sent yet when this returns: the last character is sent up to ``len(data)`` character times
+        later (`SerialSettings.char_time_s`), and later still with a USB adapter. Raises `ConnectionLost`.
         """
         async with self._turn:
             rest = memoryview(data)
@@ -86,18 +88,18 @@ class SerialConnection(ByteConnection):
                     raise self._loss() from e
 
     async def aclose(self) -> None:
-        """Let what was written leave (at most `DRAIN_LIMIT_S`), then close. Closing twice does nothing."""
+        """Wait until written bytes have been sent (at most `DRAIN_LIMIT_S`), then close. Closing twice does nothing."""
         if self._lost is None:
             await self._drain()
             self._fail(closed_here(self.endpoint))
         self.inbound.data_stream.clear()
 
     def counters(self) -> LineCounters | None:
-        """What the driver counted, errors among it; None where it counts nothing."""
+        """Return the driver's counters, including errors, or None if it has none."""
         return read_counters(self._fd) if self._lost is None else None
 
     def control_lines(self) -> dict[str, bool]:
-        """CTS, DSR, DCD, RI, DTR and RTS as they are now; empty where the port has none."""
+        """Return CTS, DSR, DCD, RI, DTR and RTS as they are now; empty if the port has none."""
         return read_control_lines(self._fd) if self._lost is None else {}
 
     def on_room(self) -> None:
@@ -137,17 +139,17 @@ class SerialConnection(ByteConnection):
             self._room.set_result(None)
 
     def _fail(self, error: FieldtwinError) -> None:
-        """End the connection; only the first reason counts."""
+        """End the connection; only the first reason is kept."""
         if self._lost is None:
             self.feed_lost(error)
             self._reading = False
             self._loop.remove_reader(self._fd)
             self._loop.remove_writer(self._fd)
             self._port.close()
-            self._on_writable()  # a writer that waits learns of it
+            self._on_writable()  # wakes a writer that waits
 
     async def _drain(self) -> None:
-        """Wait until the driver's buffer is empty; throw away what does not leave, or close(2) waits 30 s for it."""
+        """Wait until the driver's buffer is empty, and discard what cannot be sent, since close(2) would wait 30 s for it."""
         deadline_s = self._loop.time() + DRAIN_LIMIT_S
         try:
             while self._lost is None and self._port.out_waiting:
@@ -156,16 +158,16 @@ class SerialConnection(ByteConnection):
                     return
                 await asyncio.sleep(0.005)
         except (OSError, termios.error):
-            return  # gone while it was closing: there is nothing left to wait for
+            return  # lost while closing: nothing is left to wait for
 
 
 def _ignored_settings(fd: int, endpoint: Endpoint) -> tuple[str, ...]:
-    """Compare what the driver kept with what was asked for. A pty clears parity silently and keeps the rest."""
+    """Compare the driver's settings with the requested ones. A pty clears parity silently and keeps the rest."""
     asked = endpoint.serial
     try:
         cflag = cast(int, termios.tcgetattr(fd)[2])
     except termios.error:
-        return ()  # unplugged already; the first read says so
+        return ()  # already unplugged; the first read reports it
     ignored = []
     kept_parity = "N" if not cflag & termios.PARENB else "O" if cflag & termios.PARODD else "E"
     if kept_parity != asked.parity:

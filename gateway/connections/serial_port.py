@@ -1,7 +1,7 @@
-"""Opening a serial port: the one file on the gateway's side that imports ``serial``.
+"""Open a serial port. This is the only file of the gateway that imports ``serial``.
 
-pyserial finds, locks and configures the port: it knows the baud rates and quirks of each system, Windows' COM ports among them.
-How bytes get in and out is `serial_line`'s, or `serial_threads`'.
+pyserial finds, locks and configures the port: it knows the baud rates and peculiarities of each system, including the
+COM ports of Windows. `serial_line` and `serial_threads` transfer the bytes.
 """
 
 from __future__ import annotations
@@ -31,16 +31,17 @@ except ImportError:  # Windows
 Port = serial.Serial
 
 CHUNK = 4096
-"""Most bytes taken in one read: the size of the kernel's own buffer of a tty."""
+"""The largest number of bytes taken in one read: the size of the kernel's own buffer of a tty."""
 
 _BUSY = (errno.EAGAIN, errno.EBUSY, errno.EWOULDBLOCK)
 _ABSENT = (errno.ENOENT, errno.ENXIO, errno.ENODEV)
 
 
 def open_port(endpoint: Endpoint, read_s: float = 0.0, write_s: float = 0.0) -> Port:
-    """Lock and configure the port. `read_s`, `write_s`: how long reading and writing may wait, 0 for not at all.
+    """Lock and configure the port. `read_s` and `write_s` limit the waiting of reads and writes in seconds; 0 does not
+    wait.
 
-    Raises as `SerialConnection.open`. May take seconds: call it in a thread.
+    Raises the errors of `SerialConnection.open`. It may take seconds: call it in a thread.
     """
     settings = endpoint.serial
     try:
@@ -73,7 +74,10 @@ def open_port(endpoint: Endpoint, read_s: float = 0.0, write_s: float = 0.0) -> 
 
 
 def _is_pty(path: str) -> bool:
-    """A pty drops parity silently, and glibc calls it an error where nothing else was to be set: 8E1 twice is refused."""
+    """Return whether the port is a pty, which drops parity silently.
+
+    glibc reports that as an error if no other setting changes, so a second 8E1 is refused.
+    """
     return os.path.realpath(path).startswith("/dev/pts/")
 
 
@@ -94,7 +98,7 @@ def _set_rs485(port: Port, endpoint: Endpoint) -> None:
 
 
 def close_unwanted(opening: asyncio.Future[Port]) -> None:
-    """For an opening that nobody waits for any more."""
+    """Close a port whose opening was cancelled by the caller."""
     if not opening.cancelled() and opening.exception() is None:
         opening.result().close()
 
@@ -113,12 +117,12 @@ def _cannot_open(endpoint: Endpoint, number: int, text: str) -> Unreachable:
 
 
 def lost(endpoint: Endpoint, why: str) -> ConnectionLost:
-    """What a port that is gone is told as."""
+    """Return the error for a port that is gone."""
     return ConnectionLost(f"the serial port is gone: {why}", where=str(endpoint))
 
 
 def ports_here() -> list[str]:
-    """The serial ports that this computer has now, by name."""
+    """Return the names of the serial ports that this computer has now."""
     return sorted(port.device for port in list_ports.comports())
 
 
@@ -128,7 +132,7 @@ def _ports_hint() -> str:
 
 
 def _group_hint(path: str) -> str:
-    """Which group may use the port: dialout on Debian, uucp elsewhere; the file itself knows."""
+    """Return a hint with the group that may use the port, read from the file: dialout on Debian, uucp on other systems."""
     if grp is None:
         return ""
     try:

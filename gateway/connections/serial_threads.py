@@ -1,7 +1,7 @@
-"""A serial port as a `ByteConnection` where ports have no descriptors that a loop could watch: Windows' COM ports.
+"""A serial port as a `ByteConnection` on systems whose ports have no descriptors for an event loop: Windows' COM ports.
 
-A thread reads, another writes; both wait in pyserial. Slower to deliver than `serial_line` by a thread's waking, else the same.
-It must never know a protocol.
+One thread reads and another writes; both wait in pyserial. Delivery is slower than in `serial_line` by the time that it
+takes to wake a thread; otherwise the two are the same. This module must not know a protocol.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from fieldtwin.gateway.core.connection import ByteConnection, RS232Connection, c
 from fieldtwin.gateway.core.endpoint import Endpoint
 
 POLL_S = 0.05
-"""How long the reading thread waits in the driver: closing takes as long at most."""
+"""The time that the reading thread waits in the driver; closing takes up to this long."""
 WRITE_S = 5.0
-"""A port that takes nothing for so long is gone: flow control that never lets go, an adapter that hangs."""
+"""A port that accepts no bytes for this long is considered lost: flow control that blocks forever, or an adapter that hangs."""
 
 
 class ThreadedSerialConnection(ByteConnection):
-    """One end of a serial line, as `SerialConnection`: the same bounds, the same errors."""
+    """One end of a serial line, with the same limits and errors as `SerialConnection`."""
 
     def __init__(self, port: Port, endpoint: Endpoint, max_pending: int = 1024) -> None:
         """Take over an open `port`; use `open`."""
@@ -41,7 +41,7 @@ class ThreadedSerialConnection(ByteConnection):
 
     @classmethod
     async def open(cls, endpoint: Endpoint, max_pending: int = 1024) -> ThreadedSerialConnection:
-        """As `SerialConnection.open`."""
+        """Open a port as `SerialConnection.open` does."""
         opening = asyncio.get_running_loop().run_in_executor(None, open_port, endpoint, POLL_S, WRITE_S)
         try:
             port = await asyncio.shield(opening)
@@ -51,7 +51,7 @@ class ThreadedSerialConnection(ByteConnection):
         return cls(port, endpoint, max_pending)
 
     async def write(self, data: bytes) -> None:
-        """Hand `data` to the driver; writers take turns. Raises `ConnectionLost`."""
+        """Pass `data` to the driver; concurrent writes are not mixed. Raises `ConnectionLost`."""
         async with self._turn:
             if self._lost is not None:
                 raise self._loss()
@@ -61,12 +61,12 @@ class ThreadedSerialConnection(ByteConnection):
                 OSError,
                 ValueError,
                 TypeError,
-            ) as e:  # pyserial's own are OSErrors; others where it was closed meanwhile
+            ) as e:  # pyserial's own are OSErrors; others if it was closed meanwhile
                 self.feed_lost(lost(self.endpoint, str(e)))
                 raise self._loss() from e
 
     async def aclose(self) -> None:
-        """Let what was written leave, then close. Closing twice does nothing."""
+        """Wait until written bytes have been sent, then close. Closing twice does nothing."""
         self.feed_lost(closed_here(self.endpoint))
         if not self._stopping.is_set():
             self._stopping.set()
@@ -79,11 +79,11 @@ class ThreadedSerialConnection(ByteConnection):
             self._room.set()
 
     def counters(self) -> LineCounters | None:
-        """None: these systems tell no counters."""
+        """Return None: these systems have no counters."""
         return None
 
     def control_lines(self) -> dict[str, bool]:
-        """CTS, DSR, DCD, RI, DTR and RTS as they are now; empty where the port has none."""
+        """Return CTS, DSR, DCD, RI, DTR and RTS as they are now; empty if the port has none."""
         try:
             port = self._port
             lines = {"CTS": port.cts, "DSR": port.dsr, "DCD": port.cd, "RI": port.ri, "DTR": port.dtr, "RTS": port.rts}
@@ -120,4 +120,4 @@ class ThreadedSerialConnection(ByteConnection):
         try:
             self._loop.call_soon_threadsafe(what, item)
         except RuntimeError:
-            self._stopping.set()  # the loop is closed: nobody is there to be told
+            self._stopping.set()  # the loop is closed: stop reading

@@ -1,10 +1,10 @@
-"""The software CAN bus, from the plant's side: an asyncio end, and an interface of python-can.
+"""The client side of the software CAN bus: an asyncio end, and an interface of python-can.
 
-The bus is a TCP server somewhere; a frame is a record of 24 bytes (gateway/core/canframe.py). What models the bus there,
-and who else is on it, is not known here.
+The bus is a TCP server; a frame is a record of 24 bytes (gateway/core/canframe.py). This module does not know how the
+bus is modelled, or which other nodes are on it.
 
-`SoftBus` is registered with python-can as ``fieldtwin``, so any program that uses python-can joins the bus:
-``python -m can.logger -i fieldtwin -c HOST:PORT``, ``canopen.Network.connect(interface="fieldtwin", channel=...)``.
+`SoftBus` is registered with python-can as ``fieldtwin``, so any program that uses python-can can join the bus: ``python
+-m can.logger -i fieldtwin -c HOST:PORT``, ``canopen.Network.connect(interface="fieldtwin", channel=...)``.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ from fieldtwin.gateway.wallclock import WallClock
 OPEN_TIMEOUT_S = 5.0
 CLOSE_TIMEOUT_S = 1.0
 SEND_BUFFER_BYTES = 8 * 1024
-"""The kernel's, for python-can: what is sent next waits behind all that it holds."""
+"""The size of the kernel's send buffer, for python-can. It is small because a new frame waits behind all buffered ones."""
 
 
 class SoftBusConnection(CanConnection):
     """One node on a software CAN bus. Make it with `open`.
 
-    Received frames carry the bus's exact end of frame as `t_ns`, on this host's monotonic clock. Error frames among them tell of
-    this node's controller (gateway/core/can_error.py).
+    Received frames carry the bus's exact end of frame as `t_ns`, on this host's monotonic clock. Error frames among
+    them report the state of this node's controller (gateway/core/can_error.py).
     """
 
     def __init__(self, endpoint: Endpoint, max_pending: int = 4096) -> None:
@@ -55,10 +55,10 @@ class SoftBusConnection(CanConnection):
 
     @classmethod
     async def open(cls, endpoint: Endpoint, bitrate: int, *, max_pending: int = 4096) -> SoftBusConnection:
-        """Join the bus at ``can:fieldtwin/HOST:PORT``, which must run at `bitrate` bit/s (0: whatever it has).
+        """Join the bus at ``can:fieldtwin/HOST:PORT``, which must run at `bitrate` bit/s (0: any bit rate).
 
-        Raises `Unreachable` when nobody is there (or no bus), `UsageError` when it runs at another bit rate,
-        `EndpointBusy` when it is full.
+        Raises `Unreachable` if the endpoint does not answer or is not a bus, `UsageError` if it runs at a different bit
+        rate, `EndpointBusy` if it is full.
         """
         host, port = endpoint.address
         where = str(endpoint)
@@ -91,10 +91,10 @@ class SoftBusConnection(CanConnection):
         wire.take_frames()
 
     async def send(self, frame: CanFrame) -> None:
-        """Hand `frame` to the bus's transmit queue, waiting while it is full. Raises `ConnectionLost`.
+        """Pass `frame` to the bus's transmit queue, waiting while it is full. Raises `ConnectionLost`.
 
-        A node has at most the bus's transmit window of unconfirmed frames under way, so what is sent next is never
-        behind seconds of frames in socket buffers.
+        A node has at most the bus's transmit window of unconfirmed frames outstanding, so a new frame never waits for
+        seconds of frames in socket buffers.
         """
         if frame.error:
             raise UsageError("an error frame cannot be sent", got=str(frame), where=str(self.endpoint))
@@ -109,14 +109,14 @@ class SoftBusConnection(CanConnection):
             self._wire.write(pack_record(frame))
 
     async def aclose(self) -> None:
-        """Leave the bus once it has sent what was handed to it (waiting `CLOSE_TIMEOUT_S` at most)."""
+        """Leave the bus after it has sent the frames passed to it (waiting at most `CLOSE_TIMEOUT_S`)."""
         try:
             async with asyncio.timeout(CLOSE_TIMEOUT_S):
                 while self._lost is None and self._in_flight:
                     self._progress.clear()
                     await self._progress.wait()
         except TimeoutError:
-            pass  # a slow bus: the rest is in its hands
+            pass  # a slow bus: it sends the rest later
         self.feed_lost(closed_here(self.endpoint))
         self._progress.set()
         self.inbound.data_stream.clear()
@@ -124,7 +124,7 @@ class SoftBusConnection(CanConnection):
             await self._wire.aclose()
 
     def on_record(self, record: bytes) -> None:
-        """One record from the bus. Raises `Desync` when it is none."""
+        """Handle one record from the bus. Raises `Desync` if it is invalid."""
         frame, confirmed = unpack_record(record)
         if confirmed:
             self.confirmed += 1
@@ -134,13 +134,13 @@ class SoftBusConnection(CanConnection):
             self.feed(replace(frame, t_ns=frame.t_ns + self._offset_ns) if self._offset_ns else frame)
 
     def on_lost(self, error: FieldtwinError) -> None:
-        """The bus is gone."""
+        """Handle the loss of the bus."""
         self.feed_lost(error)
         self._progress.set()
 
 
 class _Wire(asyncio.Protocol):
-    """The TCP connection: cuts the stream into records; the first is the answer to the hello."""
+    """The TCP connection: cuts the stream into records; the first one is the answer to the hello."""
 
     def __init__(self, connection: SoftBusConnection) -> None:
         loop = asyncio.get_running_loop()
@@ -153,7 +153,7 @@ class _Wire(asyncio.Protocol):
         self._gone: asyncio.Future[None] = loop.create_future()
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        transport = cast(asyncio.Transport, transport)  # uvloop's is one in all but its class
+        transport = cast(asyncio.Transport, transport)  # uvloop's has the same methods, but another base class
         self._transport = transport
         self._connection.local = address_of(transport)
 
@@ -166,7 +166,7 @@ class _Wire(asyncio.Protocol):
             self.take_frames()
 
     def take_frames(self) -> None:
-        """Hand over whole records, from now on as they come."""
+        """Deliver whole records, from now on as they arrive."""
         self._joined = True
         whole = len(self._buffer) - len(self._buffer) % RECORD_SIZE
         records = bytes(self._buffer[:whole])
@@ -182,7 +182,7 @@ class _Wire(asyncio.Protocol):
         reason = f"the software CAN bus is gone: {exc}" if exc else "the software CAN bus closed"
         error = ConnectionLost(reason, where=self._where())
         if not self.answer.done():
-            # Something that is no bus, or a bus that is just closing: either way nobody to talk to.
+            # The server is not a bus, or a bus that is closing; neither can be used.
             self.answer.set_result((bytes(self._buffer), 0))
         self._connection.on_lost(error)
         if not self._gone.done():
@@ -211,17 +211,18 @@ class _Wire(asyncio.Protocol):
 class SoftBus(can.BusABC):
     """python-can's interface ``fieldtwin``. `channel` is ``HOST:PORT`` of a software CAN bus.
 
-    `bitrate` (bit/s) is checked against the bus's; 0 takes the bus's. With `fd` it sends and receives CAN FD
-    frames too, and `data_bitrate` (bit/s, 0: any) is checked likewise. With `receive_own_messages` own frames come back,
-    ``is_rx`` false, when they were on the wire. Time stamps are seconds since 1970, from the bus's exact end of frame.
-    `recv` takes exactly one record from the socket, so its descriptor stays readable while more wait; `fileno` serves
-    `can.Notifier` with a loop. Here, at python-can's border, errors are python-can's: `CanInitializationError` when the
-    bus cannot be joined, `CanOperationError` when it is gone, `CanTimeoutError` when it takes no more frames.
+    `bitrate` (bit/s) is checked against the bus's; 0 accepts any. With `fd` it also sends and receives CAN FD frames,
+    and `data_bitrate` (bit/s, 0: any) is checked likewise. With `receive_own_messages` own frames are received, with
+    ``is_rx`` false, after they were sent on the bus. Time stamps are seconds since 1970, from the bus's exact end of
+    frame. `recv` takes exactly one record from the socket, so its descriptor stays readable while more wait; `fileno`
+    serves `can.Notifier` with a loop. Errors are those of python-can: `CanInitializationError` if the bus cannot be
+    joined, `CanOperationError` if it is gone, `CanTimeoutError` if it accepts no more frames.
 
-    Error frames come as from the kernel's interface and in its layout, past all filters: when this node's controller becomes
-    error-passive, bus-off or active again, and when frames for it were lost; with `bus_errors` for each error on the wire too.
+    Error frames have the layout of the kernel's interface and pass all filters. They are received when this node's
+    controller becomes error-passive, bus-off or active again, and when frames for it were lost; with `bus_errors` also
+    for each error on the bus.
 
-    A program that asks for its own messages and never receives is held back by the bus.
+    A program that requests its own messages and never receives them is held back by the bus.
     """
 
     def __init__(
@@ -235,7 +236,7 @@ class SoftBus(can.BusABC):
         fd: bool = False,
         data_bitrate: int = 0,
         bus_errors: bool = False,
-        single_handle: bool = True,  # what python-can's programs pass to every interface; every handle is single here
+        single_handle: bool = True,  # python-can's programs pass it to every interface; every handle is single here
     ) -> None:
         if data_bitrate and not fd:
             raise can.CanInitializationError("a data bit rate is for CAN FD: fd=True")
@@ -282,14 +283,14 @@ class SoftBus(can.BusABC):
         return answer
 
     def fileno(self) -> int:
-        """The socket's descriptor, for `select` and `add_reader`; -1 after `shutdown`."""
+        """Return the socket's descriptor, for `select` and `add_reader`; -1 after `shutdown`."""
         return self._socket.fileno()
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
         """Return the next message, or None after `timeout` seconds (None: wait without a limit).
 
-        If another thread calls `shutdown` meanwhile, it returns None at the end of its time-out, or at once without one:
-        python-can's Notifier polls until it is stopped itself. Raises `can.CanOperationError` if the bus is gone.
+        If another thread calls `shutdown` meanwhile, it returns None at the end of its timeout, or immediately without
+        one: python-can's Notifier polls until it is stopped itself. Raises `can.CanOperationError` if the bus is gone.
         """
         deadline_ns = self._clock.monotonic_ns() + int((timeout or 0) * NS_PER_S)
         try:
@@ -297,17 +298,17 @@ class SoftBus(can.BusABC):
         except can.CanOperationError:
             if not self._is_shutdown:
                 raise
-        threading.Event().wait(max(0, deadline_ns - self._clock.monotonic_ns()) / NS_PER_S)  # nothing sets it
+        threading.Event().wait(max(0, deadline_ns - self._clock.monotonic_ns()) / NS_PER_S)  # never set
         return None
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
         try:
             if not select.select([self._socket], [], [], timeout)[0]:
                 return None, False
-            # Never more than the rest of one record: what follows must keep the descriptor readable.
+            # Never more than the rest of one record: further records must keep the descriptor readable.
             data = self._socket.recv(self._record_size - len(self._partial))
         except BlockingIOError:
-            return None, False  # another thread was quicker
+            return None, False  # another thread was faster
         except (OSError, ValueError) as e:  # ValueError: shut down by another thread
             raise can.CanOperationError(f"the software CAN bus is gone: {e}") from e
         if not data:
@@ -320,7 +321,7 @@ class SoftBus(can.BusABC):
             frame, own = unpack_record(record)
         except Desync as e:
             raise can.CanOperationError(str(e)) from e
-        return self._message(frame, own), frame.error  # filters are for frames of the bus
+        return self._message(frame, own), frame.error  # python-can's filters are for frames of the bus only
 
     def _message(self, frame: CanFrame, own: bool) -> can.Message:
         return can.Message(
@@ -339,19 +340,19 @@ class SoftBus(can.BusABC):
         )
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """Hand `msg` to the bus, waiting up to `timeout` seconds while it takes no more (None: as long as it takes)."""
+        """Pass `msg` to the bus, waiting up to `timeout` seconds while it accepts no more (None: without a limit)."""
         if msg.is_fd and not self._fd:
             raise can.CanOperationError("a CAN FD frame needs an interface that was opened with fd=True")
         record = pack_record(_frame_of(msg), fd=self._fd)
         deadline_ns = None if timeout is None else self._clock.monotonic_ns() + int(timeout * NS_PER_S)
         with self._sending:
-            self._flush(deadline_ns)  # a record that a time-out cut in two comes first
+            self._flush(deadline_ns)  # first the rest of a record that a timeout cut in two
             self._unsent = record
             try:
                 self._flush(deadline_ns)
             except can.CanTimeoutError:
                 if len(self._unsent) == self._record_size:
-                    self._unsent = b""  # not a byte of it left: it was not sent
+                    self._unsent = b""  # no byte of it was sent
                     raise
 
     def _flush(self, deadline_ns: int | None) -> None:
@@ -362,29 +363,29 @@ class SoftBus(can.BusABC):
                     raise can.CanTimeoutError("the software CAN bus takes no more frames now")
                 self._unsent = self._unsent[self._socket.send(self._unsent) :]
             except can.CanTimeoutError:
-                raise  # an OSError too, by way of TimeoutError
+                raise  # CanTimeoutError is also an OSError, through TimeoutError
             except BlockingIOError:
                 pass  # filled up between select and send
             except (OSError, ValueError) as e:
                 raise can.CanOperationError(f"the software CAN bus is gone: {e}") from e
 
     def shutdown(self) -> None:
-        """Leave the bus once it has taken what was sent (waiting `CLOSE_TIMEOUT_S` at most). Twice does nothing."""
+        """Leave the bus after it has taken the frames sent (waiting at most `CLOSE_TIMEOUT_S`). A second call does nothing."""
         if self._is_shutdown:
             return
         super().shutdown()
         deadline_ns = self._clock.monotonic_ns() + int(CLOSE_TIMEOUT_S * NS_PER_S)
         try:
-            # Closing with unread records would reset the connection, and the bus would lose what it has not read yet.
+            # Closing with unread records would reset the connection, and the bus would lose frames that it has not read yet.
             self._socket.shutdown(socket.SHUT_WR)
             self._socket.setblocking(True)
             while (left_ns := deadline_ns - self._clock.monotonic_ns()) > 0:
                 self._socket.settimeout(left_ns / NS_PER_S)
                 if not self._socket.recv(65536):
                     break
-            self._socket.shutdown(socket.SHUT_RDWR)  # a `recv` of another thread waits no longer
+            self._socket.shutdown(socket.SHUT_RDWR)  # ends a `recv` of another thread
         except OSError:
-            pass  # the bus was gone already, or is slow
+            pass  # the bus was already gone, or is slow
         self._socket.close()
 
 

@@ -1,8 +1,8 @@
-"""Joining the software CAN bus: the request, and what the bus's answer means. Bytes only, no sockets.
+"""The request to join the software CAN bus, and the bus's answer. Bytes only, no sockets.
 
-A hello is a record of 24 bytes like any other on that wire; bit 7 of its first byte tells it from a frame's. In network
-byte order: mark 80h, version, status, options, bit rate u32, the bus's monotonic clock u64 (ns), ``ftcb``, transmit
-window u16, two zero bytes. The joining side speaks first; bit rate 0 means whatever the bus has.
+A hello is a record of 24 bytes like any other on that connection; bit 7 of its first byte distinguishes it from a
+frame's. In network byte order: mark 80h, version, status, options, bit rate u32, the bus's monotonic clock u64 (ns),
+``ftcb``, transmit window u16, two zero bytes. The joining side sends first; bit rate 0 accepts any bit rate.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ _WELCOME, _WRONG_BITRATE, _UNKNOWN_VERSION, _FULL = range(4)
 
 @dataclass(frozen=True, slots=True)
 class Welcome:
-    """What the bus told: its bit rate, how many unconfirmed frames it takes, and its clock when it answered."""
+    """The bus's answer: its bit rate, how many unconfirmed frames it accepts, and its clock when it answered."""
 
     bitrate: int
     window: int
     bus_ns: int
     data_bitrate: int = 0
-    """bit/s, rounded down to kbit/s; 0 on a connection that carries no CAN FD."""
+    """bit/s, rounded down to kbit/s; 0 on a connection without CAN FD."""
 
     def clock_offset_ns(self, asked_ns: int, answered_ns: int) -> int:
-        """What to add to the bus's time stamps to get this host's monotonic time.
+        """Return the difference to add to the bus's time stamps to get this host's monotonic time.
 
-        `asked_ns` and `answered_ns` are this host's clock around the hello. Zero on one host, where all processes share
-        a clock; otherwise right to half the round trip.
+        `asked_ns` and `answered_ns` are this host's clock before and after the hello. The result is zero on one host,
+        where all processes share a clock; otherwise it is accurate to half the round trip.
         """
         if asked_ns <= self.bus_ns <= answered_ns:
             return 0
@@ -52,11 +52,11 @@ def ask(
     fd: bool = False,
     data_bitrate: int = 0,
 ) -> bytes:
-    """The request to join a bus of `bitrate` bit/s (0: any), with or without a confirmation of each own frame.
+    """Return the request to join a bus of `bitrate` bit/s (0: any), with or without a confirmation of each own frame.
 
-    `errors`: error frames when the state of this node's controller changes, or frames for it were lost (as a kernel's interface
-    tells); `violations`: one for each error on the wire too (as with ``berr-reporting``). `fd`: records carry CAN FD, and the bus
-    must have the `data_bitrate` (0: any).
+    `errors` requests error frames when the state of this node's controller changes, or frames for it were lost (as with
+    a kernel interface); `violations` also requests one for each error on the bus (as with ``berr-reporting``). `fd`
+    says that records carry CAN FD, and the bus must have the `data_bitrate` (0: any).
     """
     options = (_CONFIRM if confirmations else 0) | (_ERRORS if errors else 0) | (_VIOLATIONS if violations else 0)
     version, data_kbitrate = (_FD_VERSION, data_bitrate // 1000) if fd else (_VERSION, 0)
@@ -64,10 +64,10 @@ def ask(
 
 
 def read_answer(record: bytes, wanted_bitrate: int, where: str, *, fd: bool = False, data_bitrate: int = 0) -> Welcome:
-    """The bus's answer to `ask`. `where` names the endpoint in errors.
+    """Return the bus's answer to `ask`. `where` names the endpoint in errors.
 
-    Raises `UsageError` for a wrong bit rate, `EndpointBusy` when the bus is full, `Unreachable` when the other end is of
-    another version or no software CAN bus at all.
+    Raises `UsageError` for a wrong bit rate, `EndpointBusy` if the bus is full, `Unreachable` if the other end has a
+    different version or is not a software CAN bus.
     """
     if len(record) != RECORD_SIZE:
         raise Unreachable("what answers there is no software CAN bus", got=f"{len(record)} bytes", where=where)

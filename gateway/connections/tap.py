@@ -1,8 +1,8 @@
-"""Taps: observers on a `Connector` that see every chunk and frame both ways, and can do nothing else.
+"""Taps: observers on a `Connector` that see every chunk and frame in both directions, and cannot affect them.
 
-A tap never changes, delays or drops what it sees; one that fails is taken off and reported, and the wire goes on.
-Received items are stamped when the medium delivers them, whether or not anybody reads them; sent ones when they have
-been handed to the medium (a write that fails or is cancelled was not sent).
+A tap never changes, delays or drops what it sees; a tap that fails is removed and reported, and the connection
+continues. Received items are time-stamped when the medium delivers them, whether or not they are read later; sent items
+when they have been passed to the medium (a write that fails or is cancelled was not sent).
 """
 
 from __future__ import annotations
@@ -23,9 +23,10 @@ from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid
 
 
 class TappedConnector(Connector):
-    """Opens what `inner` opens, and lets `taps` observe it.
+    """Opens connections with `inner`, and lets `taps` observe them.
 
-    Wrapped outermost, so that the taps are told the plant's endpoint whatever it is mapped to.
+    It is the outermost wrapper, so that the taps receive the endpoint in the plant even if it is mapped to a different
+    one.
     """
 
     def __init__(self, inner: Connector, taps: Sequence[Tap], clock: Clock) -> None:
@@ -34,7 +35,7 @@ class TappedConnector(Connector):
 
     @property
     def failed_taps(self) -> int:
-        """Taps that raised and were taken off."""
+        """Return the number of taps that raised and were removed."""
         return self._observers.failed
 
     async def open_bytes(self, endpoint: Endpoint) -> ByteConnection:
@@ -57,7 +58,7 @@ class _Observers:
         for tap in self._taps:
             try:
                 tap.on_bytes(endpoint, direction, t_ns, chunk)
-            except Exception as e:  # an observer may not harm what it observes
+            except Exception as e:  # an observer must not harm the connection
                 self._take_off(tap, endpoint, e)
 
     def saw_frame(self, endpoint: Endpoint, direction: Direction, frame: CanFrame) -> None:
@@ -69,7 +70,7 @@ class _Observers:
                 self._take_off(tap, endpoint, e)
 
     def _take_off(self, tap: Tap, endpoint: Endpoint, error: Exception) -> None:
-        """Off with it, and say so. Whoever goes through the taps now still has those of before."""
+        """Remove the tap and report it. A loop over the taps that is running now still uses the previous tuple."""
         self._taps = tuple(other for other in self._taps if other is not tap)
         self.failed += 1
         asyncio.get_running_loop().call_exception_handler(
@@ -78,13 +79,13 @@ class _Observers:
 
 
 class _TappedBytes(ByteConnection):
-    """The same stream object as the inner connection's; only the calls pass through here."""
+    """The same stream object as the inner connection's; only the calls pass through this class."""
 
     def __init__(self, inner: ByteConnection, endpoint: Endpoint, observers: _Observers) -> None:
         super().__init__(inner.inbound, endpoint, inner.max_pending)
         self._inner, self.local = inner, inner.local
         self._observers = observers
-        for chunk in inner.inbound.data_stream:  # arrived while it was being opened
+        for chunk in inner.inbound.data_stream:  # arrived while opening
             observers.saw_bytes(endpoint, Direction.RECEIVED, chunk)
         inner.on_arrival = self._arrived
 
@@ -103,7 +104,7 @@ class _TappedBytes(ByteConnection):
         if self.on_arrival is not None:  # another tapped connector around this one
             self.on_arrival(chunk)
 
-    # What is awaited is the inner connection's own: one coroutine less to be woken through, each time.
+    # Return the inner connection's own coroutine: a coroutine around it would cost time at every wake-up.
 
     def read(self) -> Coroutine[Any, Any, bytes]:
         return self._inner.read()
@@ -123,13 +124,13 @@ class _TappedBytes(ByteConnection):
 
 
 class _TappedCan(CanConnection):
-    """As `_TappedBytes`, for frames. What an overrun dropped was not received, and is counted by the inner end."""
+    """As `_TappedBytes`, for frames. Frames dropped by an overrun were not received; the inner end counts them."""
 
     def __init__(self, inner: CanConnection, endpoint: Endpoint, observers: _Observers) -> None:
         self._inner = inner  # before the base class, which sets `overruns`
         self._observers = observers
         self.bitrate = int(getattr(inner, "bitrate", 0))
-        """What the medium runs at (bit/s), 0 where it does not know."""
+        """The bit rate of the medium (bit/s), 0 if it is not known."""
         super().__init__(cast(CANConnection, inner.inbound), endpoint, inner.max_pending)
         self.local = inner.local
         for frame in inner.inbound.data_stream:
@@ -146,7 +147,7 @@ class _TappedCan(CanConnection):
 
     @overruns.setter
     def overruns(self, value: int) -> None:
-        self._inner.overruns = max(value, self._inner.overruns)  # it only grows; the base class starts it at 0
+        self._inner.overruns = max(value, self._inner.overruns)  # it only increases; the base class starts it at 0
 
     def feed(self, item: CanFrame) -> bool:
         return self._inner.feed(item)
@@ -172,7 +173,7 @@ class _TappedCan(CanConnection):
 
 @dataclass(frozen=True, slots=True)
 class Captured:
-    """One chunk or frame, as a tap saw it."""
+    """One chunk or frame, as a tap received it."""
 
     t_ns: int
     endpoint: Endpoint
@@ -181,7 +182,7 @@ class Captured:
 
 
 class CaptureTap(Tap):
-    """Keeps the last `capacity` chunks and frames in memory; `dropped` counts the older ones that had to go."""
+    """Keeps the last `capacity` chunks and frames in memory; `dropped` counts the older ones that were removed."""
 
     def __init__(self, capacity: int = 10_000) -> None:
         self._seen: deque[Captured] = deque(maxlen=capacity)
@@ -189,11 +190,11 @@ class CaptureTap(Tap):
 
     @property
     def captured(self) -> list[Captured]:
-        """What is kept, oldest first."""
+        """Return the kept items, oldest first."""
         return list(self._seen)
 
     def stream(self, endpoint: Endpoint, direction: Direction) -> bytes:
-        """All bytes kept of one direction of one endpoint, in order: chunk borders mean nothing."""
+        """Return all kept bytes of one direction of one endpoint, in order, without chunk boundaries, which mean nothing."""
         kept = (c.item for c in self._seen if c.endpoint == endpoint and c.direction is direction)
         return b"".join(item for item in kept if isinstance(item, bytes))
 
@@ -210,17 +211,18 @@ class CaptureTap(Tap):
 
 
 class TapFile(Tap):
-    """Writes JSON lines: ``{"t_ns", "endpoint", "direction", "hex"}``; a frame adds ``"frame"`` as candump writes it.
+    """Writes JSON lines: ``{"t_ns", "endpoint", "direction", "hex"}``; a frame adds ``"frame"`` in candump's notation.
 
-    A line is in the operating system's hands when the call returns, so a file that ends with a crash is whole but for
-    that. At most `max_bytes` are written. `dropped` counts what was not, `error` says why if the disk did it: a capture
-    that ends early never ends the run.
+    A line has been passed to the operating system when the call returns, so after a crash at most the last line is
+    incomplete. At most `max_bytes` are written. `dropped` counts items that were not written, and `error` gives the
+    reason if the disk caused it: a capture that ends early never ends the run.
     """
 
     def __init__(self, path: Path, max_bytes: int = 1 << 30, *, head: Mapping[str, object] | None = None) -> None:
-        """Start the file anew. `head`, if there is one, is its first line, of which run it is; it has a key ``started``.
+        """Create the file, replacing an old one. `head`, if given, is its first line and describes the run; it has a
+        key ``started``.
 
-        Raises `FileInvalid` when that is not possible.
+        Raises `FileInvalid` if the file cannot be created.
         """
         self.path = path
         self.dropped = 0
@@ -240,15 +242,15 @@ class TapFile(Tap):
         line: dict[str, Any] = {"t_ns": t_ns, "endpoint": str(endpoint), "direction": direction.value}
         line |= {"hex": frame.data.hex(), "frame": str(frame)}
         if frame.error:
-            line["error"] = True  # candump's notation does not tell an error frame from a data frame
+            line["error"] = True  # candump's notation does not distinguish an error frame from a data frame
         self._write(line)
 
     def on_refusal(self, refusal: Mapping[str, object]) -> None:
-        """A write that did not reach its device, with its ``t_ns``: no traffic, but part of what happened."""
+        """Record a write that did not reach its device, with its ``t_ns``: not traffic, but part of the history."""
         self._write({"t_ns": refusal["t_ns"], "refused": dict(refusal)})
 
     def close(self) -> None:
-        """Finish the file. Closing twice does nothing; what comes afterwards is counted as dropped."""
+        """Finish the file. Closing twice does nothing; items that arrive later are counted as dropped."""
         file, self._file = self._file, None
         if file is not None:
             try:

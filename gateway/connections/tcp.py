@@ -1,6 +1,6 @@
 """A TCP connection as a `ByteConnection`.
 
-It must never know a protocol: where an ADU begins is not its business, and a segment's border means nothing.
+This module must not know a protocol: it does not look for the start of an ADU, and segment boundaries mean nothing.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import ConnectionLost, Unreachable
 
 CHUNK = 4096
-"""Most bytes taken in one read; with `max_pending` it bounds the memory of a connection (4 MiB)."""
+"""The largest number of bytes taken in one read; with `max_pending` it limits the memory of a connection (4 MiB)."""
 
 WRITE_HIGH_WATER = 64 * 1024
-"""Bytes that may wait for the network before `write` waits too."""
+"""The number of bytes that may wait for the network before `write` waits too."""
 
 OPEN_TIMEOUT_S = 5.0
 CLOSE_LIMIT_S = 0.5
 
-# A peer that lost its power says nothing. Idle, it is asked after 10 s and given up 15 s later; with data
-# underway it is given up 20 s after the last acknowledgement (Modbus TCP Implementation Guide 4.2.2).
+# A peer that lost its power sends nothing. An idle peer is probed after 10 s and given up 15 s later; with data
+# outstanding it is given up 20 s after the last acknowledgement (Modbus TCP Implementation Guide 4.2.2).
 KEEPALIVE_IDLE_S = 10
 KEEPALIVE_INTERVAL_S = 5
 KEEPALIVE_PROBES = 3
@@ -35,27 +35,28 @@ UNACKNOWLEDGED_MS = 20_000
 class TcpConnection(ByteConnection):
     """One end of a TCP stream.
 
-    Bounded: at most `max_pending` chunks of `CHUNK` bytes wait here, then the socket is not read until half of them are
-    gone and TCP holds the sender back. End of stream, reset, or no sign of life: `ConnectionLost` after what arrived.
+    At most `max_pending` chunks of `CHUNK` bytes wait here. Then the socket is not read until half of them have been
+    taken, and TCP holds the sender back. After the end of the stream, a reset, or no sign of life, the bytes that
+    arrived are read, then `ConnectionLost` is raised.
     """
 
     def __init__(self, endpoint: Endpoint, max_pending: int = 1024) -> None:
-        """Not connected yet; use `open`."""
+        """Create an unconnected object; use `open`."""
         super().__init__(TCPConnection(), endpoint, max_pending)
         self._wire = _Wire(self)
 
     @classmethod
     async def open(cls, endpoint: Endpoint, timeout_s: float = OPEN_TIMEOUT_S, max_pending: int = 1024) -> Self:
-        """Connect to the endpoint's host and port, trying each address that the name has.
+        """Connect to the endpoint's host and port, trying each address of the name.
 
-        Raises `Unreachable` that says what failed: the name, the route, nobody listening, or no answer in time.
+        Raises `Unreachable` with the cause: the name, the route, a refused connection, or no answer in time.
         """
         connection = cls(endpoint, max_pending)
         await connection._connect(timeout_s)
         return connection
 
     async def _connect(self, timeout_s: float, tls: ssl.SSLContext | None = None, name: str | None = None) -> None:
-        """Connect, with TLS where a context is given; the server then has to be `name`."""
+        """Connect, with TLS if a context is given; the server's certificate then has to name `name`."""
         where = str(self.endpoint)
         loop = asyncio.get_running_loop()
         try:
@@ -73,7 +74,7 @@ class TcpConnection(ByteConnection):
             raise Unreachable(f"no answer within {timeout_s:g} s", where=where) from e
         if not refused:
             raise Unreachable("the name has no address", where=where)
-        # A host without IPv6 says little of ::1, which localhost is too; 127.0.0.1 is the one that counts.
+        # For localhost, the failure of 127.0.0.1 counts: a host without IPv6 gives no useful error for ::1.
         telling = next((e for e in refused if isinstance(e, ConnectionRefusedError)), refused[-1])
         raise self._cannot_open(telling) from telling
 
@@ -85,7 +86,7 @@ class TcpConnection(ByteConnection):
         return Unreachable(f"cannot connect: {error.strerror or error}", where=where)
 
     async def write(self, data: bytes) -> None:
-        """Hand `data` to the network, waiting while `WRITE_HIGH_WATER` bytes are unsent. Raises `ConnectionLost`."""
+        """Pass `data` to the network, waiting while `WRITE_HIGH_WATER` bytes are unsent. Raises `ConnectionLost`."""
         if self._lost is None and not self._wire.closing:
             self._wire.transport.write(data)
             await self._wire.room.wait()
@@ -95,12 +96,12 @@ class TcpConnection(ByteConnection):
             raise _ended(self.endpoint)
 
     def on_end_of_stream(self, error: ConnectionLost) -> bool:
-        """Take note that the far side sends nothing more. True: it may still be sent to."""
+        """Note that the peer sends no more data. Return True if data may still be sent to it."""
         self.feed_lost(error)
         return False
 
     async def aclose(self) -> None:
-        """Send what was written (at most `CLOSE_LIMIT_S`), then close. Closing twice does nothing."""
+        """Send the data written (waiting at most `CLOSE_LIMIT_S`), then close. Closing twice does nothing."""
         self.feed_lost(closed_here(self.endpoint))
         self.inbound.data_stream.clear()
         self._wire.transport.close()
@@ -117,7 +118,7 @@ class TcpConnection(ByteConnection):
 
 
 class _Wire(asyncio.BufferedProtocol):
-    """What asyncio calls. A buffered protocol, because a plain one is handed up to 256 KiB a chunk."""
+    """The protocol object that asyncio calls. A plain protocol would receive up to 256 KiB per chunk, so it is a buffered one."""
 
     transport: asyncio.Transport
 
@@ -139,7 +140,7 @@ class _Wire(asyncio.BufferedProtocol):
             self.transport.resume_reading()
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        transport = cast(asyncio.Transport, transport)  # uvloop's is one in all but its class
+        transport = cast(asyncio.Transport, transport)  # uvloop's has the same methods, but another base class
         self.transport = transport
         transport.set_write_buffer_limits(high=WRITE_HIGH_WATER)
         _tune(transport.get_extra_info("socket"))
@@ -178,18 +179,18 @@ def _ended(endpoint: Endpoint) -> ConnectionLost:
 
 
 async def resolve(endpoint: Endpoint, kind: socket.SocketKind) -> list[str]:
-    """The addresses of the endpoint's host, each once, in the system's order of preference. Raises `Unreachable`."""
+    """Return the addresses of the endpoint's host, each once, in the system's order of preference. Raises `Unreachable`."""
     loop = asyncio.get_running_loop()
     try:
         found = await loop.getaddrinfo(endpoint.host, endpoint.port, type=kind)
-    except (OSError, UnicodeError) as e:  # UnicodeError: a label of no or more than 63 characters
+    except (OSError, UnicodeError) as e:  # UnicodeError: a label that is empty or longer than 63 characters
         why = getattr(e, "strerror", None) or str(e)
         raise Unreachable(f"the name {endpoint.host!r} does not resolve: {why}", where=str(endpoint)) from e
     return list(dict.fromkeys(str(address[0]) for *_, address in found))
 
 
 def _tune(sock: socket.socket) -> None:
-    """Send at once (requests are small and wait for their reply), and notice a peer that is gone."""
+    """Disable delayed sending (requests are small and wait for their reply), and detect a peer that is gone."""
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     for name, value in (
@@ -198,5 +199,5 @@ def _tune(sock: socket.socket) -> None:
         ("TCP_KEEPCNT", KEEPALIVE_PROBES),
         ("TCP_USER_TIMEOUT", UNACKNOWLEDGED_MS),
     ):
-        if hasattr(socket, name):  # not every system has each of them
+        if hasattr(socket, name):  # some systems do not have all of them
             sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)

@@ -1,7 +1,7 @@
 """TLS over TCP as a `ByteConnection` (MODBUS/TCP Security Protocol Specification, MBTLS below; port 802).
 
-Both sides show certificates; ours may carry a role, by which the server decides what we may do. Certificates and keys
-are files: nothing secret is in an endpoint. It must never know the protocol inside.
+Both sides present certificates; the local one may carry a role, by which the server decides what the client may do.
+Certificates and keys are files: an endpoint contains no secrets. This module must not know the protocol inside.
 """
 
 from __future__ import annotations
@@ -20,39 +20,40 @@ from fieldtwin.gateway.core.errors import Unreachable, UsageError
 class TlsConnection(TcpConnection):
     """A `TcpConnection` inside TLS 1.2 or later.
 
-    The endpoint's ``ca`` is a file of the authorities that are trusted (else the system's), ``cert`` and ``key`` are ours
-    (one file may hold both), ``name`` is whom the server's certificate must name, where that is not the host. The server
-    is always verified. It may refuse our certificate only after `open` (TLS 1.3): then the first read or write says so.
+    The endpoint's ``ca`` is a file of the trusted authorities (else the system's), ``cert`` and ``key`` are the local
+    certificate and key (one file may hold both), and ``name`` is the name that the server's certificate must have if it
+    is not the host. The server is always verified. The server may refuse the local certificate only after `open` (TLS
+    1.3): then the first read or write raises the error.
     """
 
     def __init__(self, endpoint: Endpoint, max_pending: int = 1024) -> None:
         super().__init__(endpoint, max_pending)
         self.role = ""
-        """The role in our certificate (MBTLS 8.4), which the server was shown; empty without one."""
+        """The role in the local certificate (MBTLS 8.4), which was presented to the server; empty without one."""
 
     @classmethod
     async def open(cls, endpoint: Endpoint, timeout_s: float = OPEN_TIMEOUT_S, max_pending: int = 1024) -> Self:
-        """Connect and shake hands.
+        """Connect and perform the handshake.
 
-        Raises `Unreachable` as `TcpConnection.open` does, and where a file cannot be read, a certificate is refused, or
-        the far side speaks no TLS; `UsageError` for a ``key`` without ``cert``.
+        Raises `Unreachable` as `TcpConnection.open` does, and if a file cannot be read, a certificate is refused, or
+        the peer does not use TLS; `UsageError` for a ``key`` without ``cert``.
         """
         connection = cls(endpoint, max_pending)
         make_context = partial(_context, endpoint)
-        # In a thread: the system's authorities alone are a few hundred files or one big one.
+        # In a thread: reading the system's authorities alone means a few hundred files or one large one.
         context, connection.role = await asyncio.get_running_loop().run_in_executor(None, make_context)
         await connection._connect(timeout_s, context, endpoint.param("name") or endpoint.host)
         return connection
 
     @property
     def peer_role(self) -> str:
-        """The role in the server's certificate; empty without one."""
+        """Return the role in the server's certificate; empty without one."""
         certificate = self._ssl_object().getpeercert(binary_form=True)
         return role_in(certificate) if certificate else ""
 
     @property
     def version(self) -> str:
-        """The version of TLS spoken, such as ``TLSv1.3``."""
+        """Return the TLS version in use, such as ``TLSv1.3``."""
         return self._ssl_object().version() or ""
 
     def _ssl_object(self) -> ssl.SSLObject:
@@ -71,12 +72,15 @@ class TlsConnection(TcpConnection):
 
 
 def client_context(endpoint: Endpoint) -> ssl.SSLContext:
-    """What who connects needs to shake hands: ``ca``, ``cert``, ``key`` as of `TlsConnection`. Reads files, raises as `open`."""
+    """Return the context of a TLS client, with ``ca``, ``cert`` and ``key`` as in `TlsConnection`.
+
+    Reads files, and raises the errors of `open`.
+    """
     return _context(endpoint)[0]
 
 
 def _context(endpoint: Endpoint) -> tuple[ssl.SSLContext, str]:
-    """What is needed to shake hands, and our role. Reads files."""
+    """Return the context for the handshake, and the role in the local certificate. Reads files."""
     where = str(endpoint)
     ca, certificate, key = (endpoint.param(name) for name in ("ca", "cert", "key"))
     if key and not certificate:
@@ -102,7 +106,7 @@ def _context(endpoint: Endpoint) -> tuple[ssl.SSLContext, str]:
 
 
 def _first_certificate(path: str) -> bytes:
-    """Our certificate in DER: the first of the file; those behind it are of the authorities between."""
+    """Return the local certificate in DER: the first of the file; intermediate certificates may follow it."""
     begin, end = "-----BEGIN CERTIFICATE-----", "-----END CERTIFICATE-----"
     with open(path, encoding="ascii", errors="replace") as file:
         text = file.read()
@@ -110,7 +114,7 @@ def _first_certificate(path: str) -> bytes:
 
 
 def _no_password() -> str:
-    return ""  # else OpenSSL asks on the terminal
+    return ""  # otherwise OpenSSL asks on the terminal
 
 
 def _reason(error: ssl.SSLError) -> str:

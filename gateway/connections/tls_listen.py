@@ -1,7 +1,8 @@
-"""The server's side of TLS: what a listening port needs besides sockets (MODBUS/TCP Security, MBTLS; port 802).
+"""The TLS context of a listening port (MODBUS/TCP Security, MBTLS; port 802).
 
-Both sides show certificates, ours included: a client without one of the authority that we trust does not get in (MBTLS
-R-08). Its role, where its certificate names one, is for whoever decides what it may do. Reads files; opens no socket.
+Both sides present certificates: a client without a certificate of the trusted authority is not admitted (MBTLS R-08).
+The role in its certificate, if any, is for the code that decides what the client may do. This module reads files and
+opens no sockets.
 """
 
 from __future__ import annotations
@@ -12,11 +13,11 @@ from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import Unreachable, UsageError
 
 HANDSHAKE_LIMIT_S = 10.0
-"""A client that has not shaken hands by then is not going to."""
+"""The time limit of a client's handshake in seconds."""
 
 
 def check_files(endpoint: Endpoint) -> None:
-    """Raises `UsageError` where a ``tls://`` endpoint to listen on does not name the files that it takes."""
+    """Raise `UsageError` if a ``tls://`` endpoint to listen on does not name the required files."""
     missing = [name for name in ("cert", "ca") if not endpoint.param(name)]
     if missing:
         raise UsageError(
@@ -29,8 +30,11 @@ def check_files(endpoint: Endpoint) -> None:
 
 
 def server_context(endpoint: Endpoint) -> ssl.SSLContext:
-    """TLS 1.2 or later, from the endpoint's PEM files: ``cert`` and ``key`` are ours (one file may hold both), ``ca`` the
-    authorities whose clients are let in. Raises `UsageError` as `check_files`, `Unreachable` for files of no use."""
+    """Return a context for TLS 1.2 or later from the endpoint's PEM files.
+
+    ``cert`` and ``key`` are the server's own (one file may hold both), ``ca`` has the authorities whose clients are
+    admitted. Raises `UsageError` as `check_files`, `Unreachable` for unusable files.
+    """
     check_files(endpoint)
     where = str(endpoint)
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)

@@ -1,7 +1,7 @@
 """The role extension of a certificate (MODBUS/TCP Security Protocol Specification, 8.4).
 
-An X.509 extension with object identifier 1.3.6.1.4.1.50316.802.1 whose value is one UTF8String. Read from DER (X.690)
-as far as it takes to get there; nothing here verifies anything. Pure.
+It is an X.509 extension with object identifier 1.3.6.1.4.1.50316.802.1 whose value is one UTF8String. The DER (X.690)
+is decoded only as far as needed to find it, and nothing is verified. Pure.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ _SEQUENCE, _OID, _OCTET_STRING, _UTF8_STRING, _EXTENSIONS = 0x30, 0x06, 0x04, 0x
 
 
 def role_in(certificate: bytes) -> str:
-    """The role in a DER certificate; empty where there is none, or where the bytes are no certificate."""
+    """Return the role in a DER certificate; empty if it has none, or if the bytes are not a certificate."""
     for _, certificate_body in _elements(certificate, _SEQUENCE):
         for _, to_be_signed in _elements(certificate_body, _SEQUENCE):
             for _, wrapped in _elements(to_be_signed, _EXTENSIONS):
@@ -38,7 +38,7 @@ def _text(value: tuple[int, bytes]) -> str:
 
 
 def _elements(data: bytes, wanted: int | None = None) -> Iterator[tuple[int, bytes]]:
-    """Tag and content of each element in `data`, or of those tagged `wanted`; a broken one ends the walk."""
+    """Yield tag and content of each element in `data`, or of those tagged `wanted`; a damaged element ends the iteration."""
     at = 0
     while at + 2 <= len(data):
         tag, length = data[at], data[at + 1]

@@ -1,7 +1,8 @@
-"""A UDP socket as a `ByteConnection`: each chunk is one datagram, and each `write` is one.
+"""A UDP socket as a `ByteConnection`: each chunk is one datagram, and so is each `write`.
 
-There is no connection to be lost: a far side that is gone shows by silence, or by the network's word that nobody
-listens. It must never know a protocol; what a datagram holds, and whether two of them came in order, is not its business.
+There is no connection that could be lost: an absent peer shows only by silence, or by an error of the network that the
+port is closed. This module must not know a protocol, and neither the content of a datagram nor the order of datagrams
+concerns it.
 """
 
 from __future__ import annotations
@@ -21,24 +22,24 @@ OPEN_TIMEOUT_S = 5.0
 
 
 class UdpConnection(ByteConnection):
-    """One end of a conversation by datagrams (to the SPEC, a TCP connection: it has no other word for a network).
+    """One end of an exchange of datagrams (in the SPEC, a TCP connection, since it has no other network connection).
 
-    Only the far side's datagrams are taken. `max_pending` of them wait here; further ones are dropped and counted, as
-    the network does. Do not read with `read_pending`, which joins what waits, where borders matter.
+    Only datagrams of the peer are accepted. At most `max_pending` of them wait here; further ones are dropped and
+    counted, as in the network. If boundaries matter, do not use `read_pending`, which joins the waiting datagrams.
     """
 
     def __init__(self, endpoint: Endpoint, max_pending: int = 256) -> None:
-        """No socket yet; use `open`."""
+        """Create an object without a socket; use `open`."""
         super().__init__(TCPConnection(), endpoint, max_pending)
         self.dropped = 0
-        """Datagrams that came while `max_pending` were waiting, and empty ones."""
+        """Datagrams that arrived while `max_pending` were waiting, and empty ones."""
         self._wire = _Wire(self)
 
     @classmethod
     async def open(cls, endpoint: Endpoint, timeout_s: float = OPEN_TIMEOUT_S, max_pending: int = 256) -> UdpConnection:
-        """A socket for the endpoint's host and port. Whether anybody is there, only a reply can tell.
+        """Open a socket for the endpoint's host and port. Only a reply shows whether the peer exists.
 
-        Raises `Unreachable` where the name has no address or there is no route to it.
+        Raises `Unreachable` if the name has no address or no route leads to it.
         """
         where = str(endpoint)
         connection = cls(endpoint, max_pending)
@@ -76,7 +77,7 @@ class UdpConnection(ByteConnection):
 
 
 class _Wire(asyncio.DatagramProtocol):
-    """What asyncio calls."""
+    """The protocol object that asyncio calls."""
 
     transport: asyncio.DatagramTransport
 
@@ -87,7 +88,7 @@ class _Wire(asyncio.DatagramProtocol):
         self.gone = asyncio.Event()
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        self.transport = cast(asyncio.DatagramTransport, transport)  # on 3.11 it is none by inheritance
+        self.transport = cast(asyncio.DatagramTransport, transport)  # on Python 3.11 it is not a subclass
         cast(asyncio.WriteTransport, transport).set_write_buffer_limits(high=WRITE_HIGH_WATER)
         self._connection.local = address_of(transport)
 

@@ -1,4 +1,5 @@
-"""What a run leaves for people and for other programs: JUnit XML, one HTML file, waveforms.
+"""The outputs of a run for people and for other programs: JUnit XML, one HTML file, waveforms.
 
-Takes a `Report` (see `model`), reads nothing else, and must never know how scenarios are run.
+Each writer takes a `Report` (see `model`) and reads nothing else. This package must never depend on how scenarios are
+run.
 """

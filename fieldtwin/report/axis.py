@@ -1,4 +1,6 @@
-"""What all lanes of a timing diagram share: the time axis, labels on the left, text where there is room for it."""
+"""The common parts of all lanes of a timing diagram: the time axis, labels on the left, and text where there is room
+for it.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,7 @@ CHAR = 6.3
 
 @dataclass
 class Axis:
-    """From times to places, in px from the left."""
+    """Converts times to positions, in px from the left."""
 
     start_ns: int
     span_ns: int
@@ -27,7 +29,7 @@ class Axis:
 
 
 def label(name: str, below: str = "") -> list[Markup]:
-    """A lane's name on the left, the whole of it in its title, and a line below it."""
+    """Return a lane's label on the left, with the full name as its title, and a line below it."""
     most = int((LEFT - 14) / 6.9)  # lane names are bold
     shown = name if len(name) <= most else name[: most // 2 - 1] + "…" + name[-(most - most // 2) :]
     parts = [el("text", el("title", name), shown, cls="lane", x=8.0, y=15.0)]
@@ -37,7 +39,7 @@ def label(name: str, below: str = "") -> list[Markup]:
 
 
 def fitted(said: str, x1: float, x2: float, y: float, cls: str, *, cut: bool = False) -> list[Markup]:
-    """Text inside a box, if there is room for it, or for the beginning of it."""
+    """Return text inside a box if there is room for it; with `cut`, also the beginning of a longer text."""
     room = int((x2 - x1 - 8) / CHAR)
     if len(said) > room and (not cut or room < 3):
         return []
@@ -46,5 +48,5 @@ def fitted(said: str, x1: float, x2: float, y: float, cls: str, *, cut: bool = F
 
 
 def seconds(t_ns: int) -> str:
-    """Of the run, for titles."""
+    """Return a time of the run, for titles."""
     return f"{t_ns / NS_PER_S:.4f} s"

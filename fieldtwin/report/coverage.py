@@ -1,7 +1,8 @@
-"""What a run has touched of all that there is: registers and objects, refusals, transitions, faults in states.
+"""The coverage of a run: registers and objects, refusals, transitions, faults in states.
 
-`Collector` listens to a trace (or is fed one) and gives `Counts`, which add up over scenarios. What is missing is worked out
-from the profiles when the report is written. Bounded by what the system has, and `MOST` for what it has not.
+`Collector` listens to a trace (or is fed with one) and gives `Counts`, which add up over scenarios. What is missing is
+derived from the profiles when the report is written. The counts are bounded by the contents of the system, and by
+`MOST` for everything else.
 """
 
 from __future__ import annotations
@@ -22,13 +23,13 @@ from fieldtwin.scenarios.trace import Event, Kind
 from fieldtwin.twin.site.system import System
 
 MOST = 2000
-"""Different things of a kind that are counted."""
+"""Number of different things of a kind that are counted."""
 
 K = TypeVar("K", bound=Hashable)
 
 
 class Collector:
-    """Counts one run's events. Subscribe `feed` to a trace: what a full trace has dropped is counted as well."""
+    """Counts one run's events. Subscribe `feed` to a trace: then events that a full trace drops are counted too."""
 
     def __init__(self, system: System | None, machines: Iterable[Machine] = ()) -> None:
         self.counts = Counts()
@@ -42,17 +43,17 @@ class Collector:
         self.take(event, self._decoder.feed(event))
 
     def finish(self) -> Counts:
-        """The run is over."""
+        """End the run and return its counts."""
         self.add(self._decoder.finish())
         return self.counts
 
     def add(self, exchanges: Iterable[Exchange]) -> None:
-        """Exchanges that the end of a trace ended."""
+        """Take exchanges that were finished by the end of a trace."""
         for exchange in exchanges:
             self._exchange(exchange)
 
     def take(self, event: Event, exchanges: Iterable[Exchange]) -> None:
-        """The same for who has decoded the event already."""
+        """Take an event that the caller has already decoded into `exchanges`."""
         if event.kind is Kind.FRAME:
             self.add(exchanges)
         elif event.kind is Kind.STATE and event.where in self._machines:
@@ -100,7 +101,7 @@ def _count(counter: Counter[K], key: K) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """A tag of a device: how often it was read and written, refused, and whether it can be at all."""
+    """A tag of a device: how often it was read, written and refused, and whether it can be read and written at all."""
 
     name: str
     where: str
@@ -112,14 +113,14 @@ class Place:
 
     @property
     def missing(self) -> list[str]:
-        """``read``, ``written``: what never happened and could have."""
+        """``read``, ``written``: the accesses that are possible and never happened."""
         missing = ["read"] if self.readable and not self.read else []
         return missing + (["written"] if self.writable and not self.written else [])
 
 
 @dataclass(frozen=True)
 class DeviceCoverage:
-    """A device: its tags, and how often something else was touched, as text."""
+    """A device: its tags, and how often anything else was accessed, as text."""
 
     device: str
     profile: str
@@ -127,13 +128,15 @@ class DeviceCoverage:
     others: tuple[tuple[str, int], ...] = field(default=())
 
     def share(self, what: str) -> tuple[int, int]:
-        """How many tags were ``read`` or ``written``, of how many that can be."""
+        """Return how many tags were ``read`` or ``written``, and how many can be."""
         able = [p for p in self.places if (p.readable if what == "read" else p.writable)]
         return sum(what not in p.missing for p in able), len(able)
 
 
 def devices_covered(system: System, counts: Counts) -> list[DeviceCoverage]:
-    """Every device of the system. What a tag's registers share with a longer read counts for the tag."""
+    """Return the coverage of every device of the system. A longer read that includes a tag's registers counts for the
+    tag.
+    """
     return [_device(config, counts) for config in system.devices.values()]
 
 
@@ -156,7 +159,9 @@ _Key = tuple[str, str, str, int, int, int]
 
 
 def _things(config: DeviceConfig) -> Iterator[tuple[str, RegisterRange | tuple[int, int], bool, bool]]:
-    """What a device has by name: tags, and mailboxes by their head. Name, place, can be read, may be written."""
+    """Yield what a device has by name: tags, and mailboxes by their head. Each as name, place, whether readable,
+    whether writable.
+    """
     profile = config.profile
     for tag in profile.tags.values():
         yield tag.name, tag.at or tag.object or (0, 0), tag.readable, tag.name in config.writable
@@ -183,12 +188,12 @@ def _where(key: _Key) -> str:
 
 
 def exceptions_missing(counts: Counts) -> list[int]:
-    """Exception codes of the standard that nobody sent."""
+    """Return the exception codes of the standard that no device sent."""
     seen = {code for _, code in counts.exceptions}
     return [code for code in ModbusExceptionReply.NAMES if code not in seen]
 
 
 def aborts_missing(counts: Counts) -> list[int]:
-    """Abort codes of the standard that nobody sent."""
+    """Return the abort codes of the standard that no device sent."""
     seen = {code for _, code in counts.aborts}
     return [code for code in MEANINGS if code not in seen]

@@ -1,4 +1,4 @@
-"""Coverage as tables of the HTML report: what was touched, and always what was not."""
+"""Coverage as tables of the HTML report: what was accessed, and always what was not."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MOST_ROWS = 200
 
 
 def coverage_section(report: Report, counts: Counts) -> Markup:
-    """Everything that was counted."""
+    """Return the section with everything that was counted."""
     parts: list[Markup] = []
     if report.system is not None:
         devices = devices_covered(report.system, counts)
@@ -136,7 +136,9 @@ def _problems(counts: Counts) -> Markup:
 
 
 def _transitions(machine: Machine, counts: Counts) -> Markup:
-    """From each state (row) to each (column): how often, never, or not in the machine's table at all."""
+    """Return the table of transitions from each state (row) to each state (column): how often, never, or not in the
+    machine's table.
+    """
     taken = {(a, b): n for (variable, a, b), n in counts.transitions.items() if variable == machine.variable}
     known = list(dict.fromkeys([*machine.states, *(s for pair in taken for s in pair)]))
     rows = []
@@ -163,7 +165,7 @@ def _transitions(machine: Machine, counts: Counts) -> Markup:
 
 
 def _pairs(report: Report, counts: Counts) -> Markup:
-    """Which faults there were in which states."""
+    """Return the table of faults that were active in each state."""
     faults = list(dict.fromkeys([*report.faults, *sorted(counts.faults)]))
     columns = [(m.variable, s) for m in report.machines for s in m.states]
     title = el("h3", "Faults in states")

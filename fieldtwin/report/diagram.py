@@ -1,7 +1,8 @@
-"""A timing diagram of a window as inline SVG: faults, wires, program states and values under one time axis.
+"""A timing diagram of a window as inline SVG: faults, buses, program states and values under one time axis.
 
-Each lane is a block of a fixed height; what does not fit as text is in the title of its mark (shown when pointed at) and in
-the table of frames below. Colours are the page's variables, so that light, dark and print each have their own.
+Each lane is a block of a fixed height. Text that does not fit is in the title of its mark (shown when the mouse points
+at it) and in the table of frames below. Colours are variables of the page, so that light, dark and print each have
+their own.
 """
 
 from __future__ import annotations
@@ -23,11 +24,11 @@ MOST_STATES = 6
 MOST_BUSES = 6
 MOST_FAULTS = 8
 MOST_MARKS = 250
-"""Marks of a lane; more would only be black."""
+"""Largest number of marks in a lane; more would make it solid black."""
 
 
 def timing_diagram(window: Window, system: System | None, title: str) -> Markup:
-    """The drawing."""
+    """Return the drawing."""
     axis = Axis(window.start_ns, window.span_ns)
     lanes: list[tuple[float, list[Markup]]] = []
     lanes += [_fault_lane(axis, bar) for bar in window.faults[:MOST_FAULTS]]
@@ -67,8 +68,9 @@ def _buses(window: Window) -> list[str]:
 
 
 def _chosen(window: Window, lanes: dict[str, list[Step]]) -> list[str]:
-    """Those named; then of the same devices, then others; words before numbers, and what changed most. What is not named and
-    always the same is left out, but for a state in words."""
+    """Return the lanes to draw: the named ones, then those of the same devices, then others; words before numbers, and
+    those that changed most first. A lane that is not named and never changes is left out, except for a state in words.
+    """
     names = window.check.names
     devices = {name.rpartition(".")[0] for name in names}
 
@@ -111,7 +113,9 @@ def _fault_lane(axis: Axis, bar: FaultBar) -> tuple[float, list[Markup]]:
 
 
 def _wire_lane(axis: Axis, window: Window, bus: str, system: System | None) -> tuple[float, list[Markup]]:
-    """Requests that wait for an answer are boxes as long as the wait, messages are ticks; words where there is room."""
+    """Return the lane of a bus. A request is a box as long as the wait for its answer, a message is a tick; text is
+    added where there is room.
+    """
     config = system.buses.get(bus) if system else None
     timeout_ns = round((config.timeout_s if config else 1.0) * NS_PER_S)
     exchanges = sorted((e for e in window.exchanges if e.bus == bus), key=lambda e: e.t_ns)
@@ -138,11 +142,11 @@ def _wire_lane(axis: Axis, window: Window, bus: str, system: System | None) -> t
 
 
 _RANK = {"message": 3, "asked": 2, "wrote": 1}
-"""What is named first where there is not room for all; what went wrong before everything."""
+"""Priority of the labels where there is not room for all; errors come first."""
 
 
 def _words(words: list[tuple[int, float, float, str, str]]) -> list[Markup]:
-    """Rank, y, x, text, kind of each: as many as fit beside each other."""
+    """Return as many labels as fit without overlap. Each of `words` is rank, y, x, text, kind."""
     placed: dict[float, list[tuple[float, float]]] = {}
     marks = []
     for _, y, x1, said, kind in sorted(words):
@@ -155,12 +159,12 @@ def _words(words: list[tuple[int, float, float, str, str]]) -> list[Markup]:
 
 
 def _row(exchange: Exchange) -> int:
-    """Requests and what waits for them above, messages below."""
+    """Return the row of an exchange: requests above, messages below."""
     return 0 if exchange.latency_ns is not None or exchange.problem == "no reply" else 1
 
 
 def _scan_lane(axis: Axis, window: Window, system: System | None) -> list[tuple[float, list[Markup]]]:
-    """The scans that changed something, each with what it changed; the others left nothing to draw."""
+    """Return the lane of the scans that changed something, each with its changes; other scans are not drawn."""
     changed: dict[int, list[str]] = {}
     for name, steps in window.states.items():
         for step in steps:
@@ -183,7 +187,7 @@ def _kind(exchange: Exchange) -> str:
 
 
 def _short(exchange: Exchange) -> str:
-    """A few words on what it was: the service and where, or what went wrong."""
+    """Return a short description: the service and its place, or the problem."""
     if exchange.problem == "exception" and exchange.exception is not None:
         return f"exception {exchange.exception:02X}"
     if exchange.problem == "abort" and exchange.abort is not None:

@@ -1,4 +1,4 @@
-"""Reports as files: in a folder that is made where it is missing, as a CI job's first report finds it."""
+"""Writes reports as files. A missing folder is created, because a CI job's first report has none."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from fieldtwin.gateway.core.errors import FileInvalid
 
 
 def put(path: Path, content: str | bytes) -> None:
-    """Write the file; raises `FileInvalid` where that is not possible."""
+    """Write the file. Raises `FileInvalid` if that is not possible."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(content if isinstance(content, bytes) else content.encode())

@@ -1,9 +1,9 @@
-"""The HTML report: one file, no network, no script, readable on paper as well.
+"""The HTML report: one file, without network access and scripts, and printable.
 
     write_html(report, path)
 
-Bounded: at most `MOST_DRAWN` failures are drawn, within `BUDGET` characters; every other one stands in the tables with the
-line that runs it again.
+It is bounded: at most `MOST_DRAWN` failures are drawn, within `BUDGET` characters; every other one is in the tables,
+with the command that runs it again.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from fieldtwin.report.style import style
 from fieldtwin.report.window import MOST_FRAMES, Study, Window
 
 MOST_DRAWN = 16
-"""Failures with a diagram and frames."""
+"""Largest number of failures with a diagram and frames."""
 BUDGET = 2_500_000
 """Characters of all diagrams and frames; the first failures take what they need."""
 MOST_SCENARIOS = 2000
 MOST_CHECKS = 3000
 """Rows of the tables of checks, over all scenarios."""
 MOST_SAID = 2000
-"""Characters of what a check expected, and of what it got."""
+"""Characters of a check's expected value, and of its actual value."""
 PER_SCENARIO = 2
 """Checks of one scenario that are drawn."""
 _ORDER = (Verdict.ERROR, Verdict.FAILED, Verdict.INCONCLUSIVE, Verdict.SKIPPED, Verdict.PASSED)
@@ -39,12 +39,12 @@ MARKS = {
 
 
 def write_html(report: Report, path: Path) -> None:
-    """Write the report; raises `FileInvalid` where that is not possible."""
+    """Write the report. Raises `FileInvalid` if that is not possible."""
     put(path, render_html(report))
 
 
 def render_html(report: Report) -> str:
-    """The whole page."""
+    """Return the whole page."""
     parts, failures = _study(report)
     body = [
         _header(report),
@@ -60,7 +60,7 @@ def render_html(report: Report) -> str:
 
 
 def pill(verdict: Verdict, *, big: bool = False) -> Markup:
-    """The verdict as a word in its colour."""
+    """Return the verdict as a coloured word."""
     return el("span", f"{MARKS[verdict]} {verdict.value}", cls=f"pill {verdict.value}" + (" big" if big else ""))
 
 
@@ -143,7 +143,7 @@ def _verdict_table(report: Report) -> Markup:
 
 
 def _attempts(scenario: ScenarioResult) -> list[Markup]:
-    """How often it ran, and why each attempt before the last one was inconclusive."""
+    """Return the reason why each attempt before the last one was inconclusive."""
     return [
         el("p", f"attempt {n} of {scenario.attempts} was inconclusive: {_cut(reason, MOST_SAID)}", cls="small")
         for n, reason in enumerate(scenario.earlier, 1)
@@ -151,7 +151,7 @@ def _attempts(scenario: ScenarioResult) -> list[Markup]:
 
 
 def _why(scenario: ScenarioResult) -> str:
-    """The reason, or the first check that did not pass."""
+    """Return the scenario's reason, or its first check that did not pass."""
     if scenario.reason or scenario.verdict is Verdict.PASSED:
         return _cut(scenario.reason, 300)
     first = next((c for c in scenario.checks if c.verdict is scenario.verdict), None)
@@ -169,7 +169,7 @@ def _cut(said: str, most: int) -> str:
 
 
 def _study(report: Report) -> tuple[list[tuple[Report, Counts]], list[Markup]]:
-    """Go through every trace once: the counts of all, by system, each with the report for that system; and the sections of the
+    """Read every trace once. Return the counts by system, each with the report for that system, and the sections of the
     failures."""
     parts: dict[SystemKey | None, tuple[Report, Counts]] = {}
     sections, drawn, used, plain = [], 0, 0, []
@@ -200,7 +200,7 @@ def _study(report: Report) -> tuple[list[tuple[Report, Counts]], list[Markup]]:
 
 
 def _coverage(parts: Sequence[tuple[Report, Counts]]) -> Markup:
-    """Coverage, system by system."""
+    """Return the coverage, one section per system."""
     if len(parts) == 1:
         return coverage_section(*parts[0])
     every: list[Markup] = []
@@ -253,7 +253,7 @@ def _place(scenario: ScenarioResult) -> str:
 
 
 def _plain(scenarios: Sequence[tuple[int, ScenarioResult]]) -> Markup:
-    """Failures that are not drawn: there were enough."""
+    """Return the table of the failures that are not drawn because of the limits."""
     rows = [
         el(
             "tr", el("td", pill(s.verdict)), el("td", s.title, cls="name"), el("td", _why(s)),
@@ -318,7 +318,7 @@ def _moment(window: Window) -> Markup:
 
 
 def _checks(report: Report) -> Markup:
-    """Every check of every scenario, folded."""
+    """Return every check of every scenario, in sections that can be unfolded."""
     parts: list[Markup] = [el("h2", "Checks", id="checks")]
     room = MOST_CHECKS
     for scenario in report.scenarios:
@@ -337,7 +337,7 @@ def _checks(report: Report) -> Markup:
 
 
 def _struck(scenario: ScenarioResult) -> list[Markup]:
-    """How often each fault struck."""
+    """Return how often each fault struck."""
     return [el("p", f"fault {fault.text}", cls="small") for fault in scenario.faults]
 
 
@@ -360,7 +360,7 @@ def _check_table(checks: Iterable[CheckResult]) -> Markup:
 
 
 def _lines(said: str) -> Markup | str:
-    """A text of several lines keeps them."""
+    """Keep the lines of a text of several lines."""
     return el("pre", said) if "\n" in said else said
 
 

@@ -1,11 +1,11 @@
 """JUnit XML in pytest's dialect (``xunit2`` with properties), as Jenkins and GitLab read it.
 
-A scenario with a seed is a test case; its class is the system and the target. A failure's message is the first check that
-failed, its text all of them and the line that runs it again. INCONCLUSIVE is ``skipped`` with a type of its own: JUnit has
-no word for it, and it neither passed nor failed.
+A scenario with a seed is a test case; its class is the system and the target. A failure's message is the first check
+that failed, and its text contains all of them and the command that runs it again. INCONCLUSIVE is ``skipped`` with its
+own type: JUnit has no word for a result that neither passed nor failed.
 
-`Flavour.JENKINS` writes only what junit-10.xsd allows, the schema by which Jenkins' xUnit plugin accepts or refuses a file. That
-schema has no properties of test cases: they become lines at the beginning of ``system-out``.
+`Flavour.JENKINS` writes only what junit-10.xsd allows, the schema by which Jenkins' xUnit plugin accepts or refuses a
+file. That schema has no properties of test cases: they become lines at the beginning of ``system-out``.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ MOST_TEXT = 20_000
 
 
 class Flavour(Enum):
-    """The reader that a file is written for."""
+    """The reader for which a file is written."""
 
     COMMON = "common"
     """pytest's dialect: test cases have properties."""
@@ -32,7 +32,7 @@ class Flavour(Enum):
 
 
 def write_junit(report: Report, path: Path, flavour: Flavour = Flavour.COMMON) -> None:
-    """Write the file; raises `FileInvalid` where that is not possible."""
+    """Write the file. Raises `FileInvalid` if that is not possible."""
     put(path, render_junit(report, flavour))
 
 
@@ -80,7 +80,7 @@ def _case(suite: ET.Element, report: Report, scenario: ScenarioResult, flavour: 
     facts = [
         (name, value) for name in ("case", "role", "danger", "basis", "clause") if (value := getattr(scenario, name))
     ]
-    if scenario.file:  # no attribute: Jenkins' xUnit plugin skips whole files for that
+    if scenario.file:  # not an attribute, for which Jenkins' xUnit plugin skips the file
         facts.append(("file", f"{scenario.file}:{scenario.line}" if scenario.line else scenario.file))
     if scenario.earlier:
         facts.append(("attempts", str(scenario.attempts)))
@@ -106,7 +106,7 @@ def _case(suite: ET.Element, report: Report, scenario: ScenarioResult, flavour: 
 
 
 def _message(scenario: ScenarioResult) -> str:
-    """The reason, or the first check that ended like the scenario."""
+    """Return the scenario's reason, or the first check with the scenario's verdict."""
     if scenario.reason:
         return scenario.reason
     first = next((c for c in scenario.checks if c.verdict is scenario.verdict), None)
@@ -125,7 +125,7 @@ def _text(scenario: ScenarioResult) -> str:
 
 
 def _line(check: CheckResult) -> str:
-    """``4 failed at 13.300 s: ctd.pressure is good; expected good; got bad (file:31)``."""
+    """Return a check as ``4 failed at 13.300 s: ctd.pressure is good; expected good; got bad (file:31)``."""
     at = f" at {check.t_ns / 1e9:.3f} s" if check.t_ns is not None else ""
     said = f"{check.number} {check.verdict.value}{at}: {check.text}"
     for name, value in (("expected", check.expected), ("got", check.got), ("because", check.reason)):
@@ -134,7 +134,7 @@ def _line(check: CheckResult) -> str:
 
 
 def _bounded(said: str) -> str:
-    """The beginning and the end: how to run it again stands there."""
+    """Return the beginning and the end of a long text: the command that runs it again is at the end."""
     if len(said) <= MOST_TEXT:
         return said
     half = MOST_TEXT // 2

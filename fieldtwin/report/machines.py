@@ -1,4 +1,4 @@
-"""The state machines of a system's programs: which states there are and what can follow what."""
+"""The state machines of a system's programs: their states and possible transitions."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ from fieldtwin.twin.site.system import System
 
 
 def machines_of(system: System) -> tuple[Machine, ...]:
-    """Of every program that has a table (`fieldtwin.plc.states`). Raises `FileInvalid` for a program that cannot be made."""
+    """Return the state machine of every program that has a table (`fieldtwin.plc.states`). Raises `FileInvalid` for a
+    program that cannot be made.
+    """
     found = []
     for name, form in system.plc.programs.items():
         program = load_program(form.source, [str(system.path.parent)])

@@ -1,6 +1,6 @@
-"""HTML and SVG as values: text is escaped unless it is markup already, so that a name out of a file stays a name.
+"""HTML and SVG as values: text is escaped unless it is markup already, so that a name from a file cannot become markup.
 
-Knows elements and nothing of reports.
+This module knows elements, and nothing about reports.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from html import escape
 
 
 class Markup(str):
-    """Text that is HTML. Only this module and constants of the code make it."""
+    """Text that is HTML. Only this module and constants of the code may create it."""
 
     __slots__ = ()
 
@@ -21,21 +21,21 @@ Child = str | Iterable["Child"] | None
 _VOID = frozenset({"br", "hr", "meta", "link", "img", "col"})
 _SVG_EMPTY = frozenset({"rect", "path", "line", "circle", "polyline", "use"})
 _UNSEEN = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\ud800-\udfff\ufffe\uffff\u202a-\u202e\u2066-\u2069]")
-"""What no document may hold or what turns the direction of reading: shown as a replacement character."""
+"""Characters that no document may hold, or that change the direction of reading: shown as a replacement character."""
 
 
 def text(value: object) -> Markup:
-    """A text for element content and attributes: escaped, and without characters that no document may hold."""
+    """Return text for element content and attributes: escaped, and without characters that no document may hold."""
     return value if isinstance(value, Markup) else Markup(escape(_UNSEEN.sub("\ufffd", str(value))))
 
 
 def clean(value: object) -> str:
-    """The same without escaping, for writers that escape by themselves."""
+    """Return the same text without escaping, for writers that escape by themselves."""
     return _UNSEEN.sub("\ufffd", str(value))
 
 
 def join(children: Child) -> Markup:
-    """Children one behind the other."""
+    """Concatenate children."""
     if children is None:
         return Markup("")
     if isinstance(children, str):
@@ -44,7 +44,9 @@ def join(children: Child) -> Markup:
 
 
 def el(name: str, /, *children: Child, **attributes: object) -> Markup:
-    """An element. ``cls`` is the class, ``_`` in a name stands for ``-``; None leaves an attribute out, True: it has no value."""
+    """Return an element. ``cls`` is the class, and ``_`` in a name means ``-``. None leaves an attribute out; True
+    writes it without a value.
+    """
     parts = [name]
     for key, value in attributes.items():
         attribute = "class" if key == "cls" else key.replace("_", "-")
@@ -62,7 +64,9 @@ def el(name: str, /, *children: Child, **attributes: object) -> Markup:
 
 
 def page(title: str, style: Markup, body: Child) -> str:
-    """Return a whole HTML document with the style sheet `style`; the parts of `body` follow each other in its main element."""
+    """Return a whole HTML document with the style sheet `style`; the parts of `body` follow each other in its main
+    element.
+    """
     head = el(
         "head",
         el("meta", charset="utf-8"),

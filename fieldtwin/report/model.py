@@ -1,4 +1,4 @@
-"""What a report is made of: results of scenarios with their traces, and what they were run against. Plain values."""
+"""The data of a report: results of scenarios with their traces, and the systems that they ran against. Plain values."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Verdict(Enum):
 
     @property
     def bad(self) -> bool:
-        """Whether somebody has to look: FAILED and ERROR."""
+        """Whether a person has to look at it: FAILED and ERROR."""
         return self in (Verdict.FAILED, Verdict.ERROR)
 
 
@@ -34,9 +34,9 @@ class Verdict(Enum):
 class CheckResult:
     """A step, an expectation or an always-on check of a scenario.
 
-    `number` is how people find it again (``3``, ``always 1``), `where` its place (file:line). `since_ns` to `t_ns` is the
-    time that it looked at, ns since the run's start, `t_ns` when it was decided; None where it was not reached. `names` are the
-    tags, variables and devices that it is about: the diagram shows these.
+    `number` identifies it for people (``3``, ``always 1``), `where` is its place (file:line). `since_ns` to `t_ns` is
+    the time that it checked, in ns since the run's start; `t_ns` is when it was decided, None if it was not reached.
+    `names` are the tags, variables and devices that it is about: the diagram shows these.
     """
 
     number: str
@@ -50,12 +50,14 @@ class CheckResult:
     where: str = ""
     names: tuple[str, ...] = ()
     vacuous: bool = False
-    """Nothing came up that this check could have judged; another run of the scenario may judge it."""
+    """Nothing happened that this check could have judged; another run of the scenario may judge it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Struck:
-    """A fault that was put in: on which device or bus, how often it struck, and whether it need not strike (`optional`)."""
+    """A fault that was injected: its device or bus, how often it struck, and whether it is permitted not to strike
+    (`optional`).
+    """
 
     id: str
     name: str
@@ -65,7 +67,7 @@ class Struck:
 
     @property
     def is_set(self) -> bool:
-        """Whether it is no fault, but a value that a step has set; it strikes when the device gives it away."""
+        """Whether it is not a fault, but a value that a step has set; it strikes when the device sends that value."""
         return self.id == f"set {self.on}"
 
     @property
@@ -78,7 +80,7 @@ class Struck:
 
 @dataclass
 class Counts:
-    """What was touched, how often. `touched` and `refused`: (device, access, table, address, count, subindex)."""
+    """What was accessed, and how often. `touched` and `refused`: (device, access, table, address, count, subindex)."""
 
     services: Counter[tuple[str, str]] = field(default_factory=Counter)
     problems: Counter[tuple[str, str]] = field(default_factory=Counter)
@@ -92,7 +94,7 @@ class Counts:
     """(fault's name, PROGRAM.VARIABLE, state)."""
 
     def add(self, other: Counts) -> None:
-        """Add another run's."""
+        """Add the counts of another run."""
         for each in fields(self):
             getattr(self, each.name).update(getattr(other, each.name))
 
@@ -101,15 +103,15 @@ class Counts:
 class ScenarioResult:
     """One scenario against one target with one seed.
 
-    `case` is the id that it goes by, `role` whom it judges (controller, master, device), `danger` what it may do to what is there
-    (observe, read, write, disrupt), `basis` why a conformance case asks what it asks (standard, robustness, field problem),
-    `clause` its source.
+    `case` is its id, `role` the role under test (controller, master, device), `danger` its impact level (observe, read,
+    write, disrupt), `basis` the reason for a conformance case (standard, robustness, field problem), `clause` its
+    source.
 
-    `faults` says how often each fault struck that the scenario put in.
+    `faults` says how often each fault struck that the scenario injected.
 
-    `reproduce` is the one line that runs it again. `simulated_s` is the run's own time, `took_s` the host's. `trace` are
-    the events that are still in memory, `dropped` how many are not; `trace_hash` is over all. `counts` is what a `Collector` that
-    listened to the run has counted; without them the report counts what is in `trace`.
+    `reproduce` is the command that runs it again. `simulated_s` is the run's own time, `took_s` the host's. `trace` are
+    the events that are still in memory, `dropped` the number of those that are not; `trace_hash` is over all. `counts`
+    are the counts of a `Collector` that listened to the run; without them the report counts the events in `trace`.
     """
 
     name: str
@@ -137,37 +139,39 @@ class ScenarioResult:
     clause: str = ""
     faults: Sequence[Struck] = ()
     evidence: Sequence[str] = ()
-    """Lines of what was on the wire: before the check that failed, or where that is not in `trace`."""
+    """Lines about the traffic on the bus: before the failed check, or if the traffic is not in `trace`."""
     system: System | None = None
-    """What it ran against; None: the system of its report."""
+    """The system that it ran against; None: the system of its report."""
 
     @property
     def why(self) -> str:
-        """The reason with what the deciding check saw."""
+        """The reason, with the actual value of the deciding check."""
         got = next((check.got for check in self.checks if check.verdict is self.verdict and check.got), "")
         return f"{self.reason}: {got}" if got and got not in self.reason else self.reason
 
     @property
     def attempts(self) -> int:
-        """How often it ran."""
+        """Number of times that it ran."""
         return len(self.earlier) + 1
 
     @property
     def title(self) -> str:
-        """The name, with the seed where several runs of a scenario need telling apart."""
+        """The name, with the seed if it has one, to distinguish several runs of a scenario."""
         return f"{self.name} [seed {self.seed}]" if self.seed is not None else self.name
 
 
 @dataclass(frozen=True)
 class Machine:
-    """A program's state variable (``PROGRAM.VARIABLE``): its states in the order of their codes, and what can follow what."""
+    """A program's state variable (``PROGRAM.VARIABLE``): its states in the order of their codes, and its possible
+    transitions.
+    """
 
     variable: str
     states: tuple[str, ...]
     transitions: tuple[tuple[str, str], ...] = ()
 
     def name_of(self, value: Any) -> str:
-        """The state's name for its code; what is none is shown as it is."""
+        """Return the state's name for its code; a value that is not a code is returned as text."""
         if isinstance(value, int) and not isinstance(value, bool) and 0 <= value < len(self.states):
             return self.states[value]
         return str(value)
@@ -177,14 +181,14 @@ SystemKey = tuple[Path, str]
 
 
 def key_of(system: System) -> SystemKey:
-    """Return what tells one system file, as it was read, from another."""
+    """Return the identity of a system file, as it was read."""
     return system.path, system.hash
 
 
 @dataclass(frozen=True)
 class Report:
-    """A run: one or many scenarios. `requirements` are those that are to be covered, id to text; ids that only scenarios name are
-    added. `versions` is anything worth knowing: fieldtwin, Python, platform. `started` is ISO 8601."""
+    """A run of one or many scenarios. `requirements` are those to be covered, id to text; ids that only scenarios name
+    are added. `versions` is other useful information: fieldtwin, Python, platform. `started` is ISO 8601."""
 
     title: str
     scenarios: Sequence[ScenarioResult]
@@ -197,11 +201,11 @@ class Report:
     requirements: Mapping[str, str] = field(default_factory=dict)
     machines: Sequence[Machine] = ()
     faults: Sequence[str] = ()
-    """The faults that there are to be injected, by name; those that ran are added."""
+    """The available faults, by name; those that ran are added."""
     framings: Mapping[str, str] = field(default_factory=dict)
-    """What is spoken on wires in the traces that are no bus of the system: rtu, ascii, mbap, udp or can."""
+    """The framing of each bus in the traces that is not a bus of the system: rtu, ascii, mbap, udp or can."""
     served: Sequence[str] = ()
-    """The wires on which the far end asks."""
+    """The buses on which the remote client sends the requests."""
     machines_of: Mapping[SystemKey, Sequence[Machine]] = field(default_factory=dict)
     """The state machines of the systems of scenarios, where these are not `system`."""
 
@@ -224,12 +228,12 @@ class Report:
 
     @property
     def counts(self) -> dict[Verdict, int]:
-        """How many scenarios ended how."""
+        """Number of scenarios with each verdict."""
         return {v: sum(s.verdict is v for s in self.scenarios) for v in Verdict}
 
     @property
     def verdict(self) -> Verdict:
-        """The worst of all scenarios; a run of none is inconclusive."""
+        """The worst verdict of all scenarios; a run without scenarios is inconclusive."""
         found = {s.verdict for s in self.scenarios}
         for verdict in (Verdict.ERROR, Verdict.FAILED, Verdict.INCONCLUSIVE, Verdict.SKIPPED):
             if verdict in found:

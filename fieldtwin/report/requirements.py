@@ -1,4 +1,4 @@
-"""The requirement matrix: what each requirement was judged by. A requirement is met when everything that names it passed."""
+"""The requirement matrix: the scenarios that judge each requirement. A requirement is met if all of them passed."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from fieldtwin.report.markup import Markup, el, join
 from fieldtwin.report.model import Report, Verdict
 
 MOST_COLUMNS = 16
-"""Scenarios across; with more of them, each requirement lists its own."""
+"""Largest number of scenarios as columns; if there are more, each requirement lists its own."""
 MOST_ROWS = 1000
 MOST_NAMED = 12
 _WORST = (Verdict.FAILED, Verdict.ERROR, Verdict.INCONCLUSIVE, Verdict.SKIPPED, Verdict.PASSED)
@@ -18,7 +18,7 @@ Cells = Mapping[tuple[str, str], Counter[Verdict]]
 
 
 def requirement_verdicts(report: Report) -> dict[str, Verdict | None]:
-    """Every requirement's verdict: the worst of what names it, None where nothing does."""
+    """Return every requirement's verdict: the worst of the scenarios that name it, None if none does."""
     found: dict[str, Verdict | None] = dict.fromkeys(report.requirements)
     for scenario in report.scenarios:
         for id in scenario.requirements:
@@ -28,7 +28,7 @@ def requirement_verdicts(report: Report) -> dict[str, Verdict | None]:
 
 
 def requirement_section(report: Report) -> Markup:
-    """The matrix, or for many scenarios a list."""
+    """Return the matrix, or a list if there are many scenarios."""
     verdicts = requirement_verdicts(report)
     if not verdicts:
         return el("p", "No scenario names a requirement, and none is to be covered.")
@@ -79,7 +79,7 @@ def _cell(count: Counter[Verdict] | None) -> Markup:
 
 
 def _count(count: Counter[Verdict]) -> str:
-    """The worst verdict; with several seeds, how many of how many."""
+    """Return the worst verdict; with several seeds, also how many have it and how many there are."""
     worst, total = _worst(count), sum(count.values())
     return worst.value if total == 1 else f"{count[worst]} of {total} {worst.value}"
 

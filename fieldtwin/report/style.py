@@ -1,4 +1,4 @@
-"""The looks of the report: the style sheet beside this file, which goes into every report whole."""
+"""The style sheet of the report, from the file in this folder. Every report includes it completely."""
 
 from __future__ import annotations
 
@@ -10,5 +10,5 @@ from fieldtwin.report.markup import Markup
 
 @cache
 def style() -> Markup:
-    """The style sheet."""
+    """Return the style sheet."""
     return Markup(files("fieldtwin.report").joinpath("style.css").read_text(encoding="utf-8"))

@@ -13,16 +13,18 @@ from fieldtwin.report.markup import Markup, el
 from fieldtwin.report.window import Step, Window, thin_steps
 
 MOST_POINTS = 300
-"""Changes of a lane that are drawn."""
+"""Largest number of changes that are drawn in a lane."""
 _QUALITIES = {"": "good", "good": "good", "simulated": "good", "substituted": "doubt", "uncertain": "doubt"}
 _FEW = 3
-"""So many different numbers of a state are words: a line would say nothing."""
+"""A state with at most this many different numbers is drawn as words, because a line would not be informative."""
 
 
 def value_lane(
     axis: Axis, window: Window, name: str, steps: list[Step], unit: str = "", words: Mapping[Any, str] | None = None
 ) -> tuple[float, list[Markup]]:
-    """Height and marks. `words` are what values are called; a state is drawn as a number where it counts."""
+    """Return height and marks of a lane. `words` are the names of values; a state with more values is drawn as a
+    number.
+    """
     drawn = _thinned(steps)
     numbers = [s.value for s in drawn if _is_number(s.value)]
     is_state = not any(s.quality for s in drawn)
@@ -70,7 +72,7 @@ def _thinned(steps: list[Step]) -> list[Step]:
 
 
 def _risers(axis: Axis, steps: Sequence[Step], y: object) -> Markup:
-    """The upright pieces between two values that follow each other."""
+    """Return the vertical lines between two consecutive values."""
     assert callable(y)
     parts = [
         f"M{axis.x(b.t_ns):.1f} {y(a.value):.1f}V{y(b.value):.1f}"
@@ -81,7 +83,7 @@ def _risers(axis: Axis, steps: Sequence[Step], y: object) -> Markup:
 
 
 def _boxes(axis: Axis, window: Window, steps: Sequence[Step], words: Mapping[Any, str], cls: str) -> list[Markup]:
-    """Each value from its beginning to its end, with a slanted edge, as logic analysers draw them."""
+    """Return a box for each value from its start to its end, with slanted edges, as logic analysers draw them."""
     marks = []
     for step, end_ns in _merged(window, steps):
         x1, x2, top = axis.x(step.t_ns), axis.x(end_ns), 4.0
@@ -99,7 +101,7 @@ def _boxes(axis: Axis, window: Window, steps: Sequence[Step], words: Mapping[Any
 
 
 def _merged(window: Window, steps: Sequence[Step], *, by_quality: bool = False) -> Iterable[tuple[Step, int]]:
-    """Spans, with neighbours of the same value (or of the same quality and reason) as one."""
+    """Yield spans, with neighbours of the same value (or of the same quality and reason) merged into one."""
 
     def same(a: Step, b: Step) -> bool:
         if by_quality:

@@ -1,9 +1,9 @@
 """A run as a value change dump (IEEE 1364-2005, clause 18), for GTKWave and other waveform viewers.
 
-One scope a device and bus, one for what programs say (``plc``), one for faults. Numbers are ``real``, what is true or false
-a ``wire``, words (states, decoded frames) a ``reg`` of ASCII characters, to be shown as such. A tag has its quality beside it
-(0 good, 1 substituted, 2 simulated, 3 uncertain, 4 bad); without a value its number stays what it was, and the quality says
-that it does not count. Secret tags are left out.
+There is one scope for each device and bus, one for the variables of programs (``plc``), and one for faults. Numbers are
+``real``, booleans a ``wire``, and words (states, decoded frames) a ``reg`` of ASCII characters, to be displayed as
+such. A tag has a second variable for its quality (0 good, 1 substituted, 2 simulated, 3 uncertain, 4 bad); while it has
+no value, its number keeps the last one, and the quality shows that it is not valid. Secret tags are left out.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from fieldtwin.scenarios.trace import Event, Kind
 from fieldtwin.twin.site.system import System
 
 MOST_CHARACTERS = 48
-"""Characters of a word; longer ones end with a dot."""
+"""Characters of a word; a longer one is cut and ends with a dot."""
 _QUALITY_BITS = 3
 _QUALITIES = {str(q): int(q) for q in Quality}
-_FIRST, _LAST = 33, 126  # printable characters: what identifiers are made of
+_FIRST, _LAST = 33, 126  # printable characters, of which identifiers consist
 
 
 @dataclass(slots=True)
@@ -42,12 +42,14 @@ class _Signal:
 
 
 class _Signals:
-    """All variables by scope and name, made where they are first seen. A second pass writes what a first one declared."""
+    """All variables by scope and name, created when they are first seen. A first pass declares them, and a second one
+    writes them.
+    """
 
     def __init__(self) -> None:
         self.scopes: dict[str, dict[str, _Signal]] = {}
         self.plain: dict[str, str] = {}
-        """What each scope is called in the file."""
+        """The name of each scope in the file."""
         self._names: dict[str, set[str]] = {}
         self._count = 0
 
@@ -60,13 +62,13 @@ class _Signals:
         if found is None:
             found = signals[name] = _Signal(kind, bits or _bits(kind), self._next_id(), self._free(f".{scope}", name))
         elif kind == "reg" and found.kind != "reg" and not bits:
-            found.kind, found.bits = "reg", _bits("reg")  # a word after numbers: all of it is words
+            found.kind, found.bits = "reg", _bits("reg")  # a word after numbers: the whole variable becomes words
         elif kind == "real" and found.kind == "wire":
             found.kind, found.bits = "real", 64
         return found
 
     def _free(self, within: str, name: str) -> str:
-        """The name as a viewer takes it, and another one where two become the same."""
+        """Return a name that viewers accept, with a number appended if it is already in use."""
         taken = self._names.setdefault(within, set())
         plain = _plain(name)
         number = 2
@@ -88,7 +90,7 @@ class _Signals:
 
 
 Change = tuple[int, str, str, Any, int]
-"""Time, scope, name, value, bits (0: as the value says)."""
+"""Time, scope, name, value, bits (0: derived from the value)."""
 
 
 def write_vcd(
@@ -98,7 +100,7 @@ def write_vcd(
     machines: Sequence[Machine] = (),
     comment: str = "",
 ) -> None:
-    """Write the events of a run. With `system`, frames are decoded. Raises `FileInvalid` where that is not possible."""
+    """Write the events of a run. With `system`, frames are decoded. Raises `FileInvalid` if that is not possible."""
     try:
         with path.open("w", encoding="ascii", newline="\n") as file:
             _write(file, events, system, machines, comment)
@@ -186,7 +188,7 @@ def _bits(kind: str) -> int:
 
 
 def _change(signal: _Signal, value: Any) -> str | None:
-    """The line that sets `signal`; None for a number that is none."""
+    """Return the line that sets `signal`; None if the value is not a finite number."""
     if signal.kind == "wire":
         return f"{int(bool(value))}{signal.id}"
     if signal.kind == "real":
@@ -204,5 +206,5 @@ def _change(signal: _Signal, value: Any) -> str | None:
 
 
 def _plain(name: str) -> str:
-    """An identifier that every reader takes."""
+    """Return an identifier that every reader accepts."""
     return re.sub(r"[^A-Za-z0-9_]", "_", name) or "_"

@@ -1,7 +1,7 @@
-"""The time around a failure, cut out of a trace: what was on the wires, in which states programs were, what tags said.
+"""The time around a failure, extracted from a trace: frames on the buses, states of programs, values of tags.
 
-One pass over the events for all windows of a scenario; each keeps at most `MOST_FRAMES` frames, `MOST_LANES` tags and
-`MOST_STEPS` changes of each. Draws nothing.
+All windows of a scenario are filled in one pass over the events; each keeps at most `MOST_FRAMES` frames before the
+failure, `MOST_EXCHANGES` exchanges, and `MOST_STEPS` changes of each tag and state. Draws nothing.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from fieldtwin.report.model import CheckResult, Counts, Report, ScenarioResult
 from fieldtwin.scenarios.trace import Event, Kind
 
 MOST_FRAMES = 160
-"""Frames before the failure; a quarter as many behind it."""
+"""Number of frames before the failure; after it, a quarter as many."""
 MOST_STEPS = 600
 MOST_EXCHANGES = 1500
 LONGEST_NS = 60 * NS_PER_S
-"""Of what led to a failure, this much is drawn at most."""
+"""Longest time before a failure that is drawn."""
 
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """A tag or state has had `value` since `t_ns`. `quality` is "" for a state."""
+    """A tag or state that has had `value` since `t_ns`. `quality` is "" for a state."""
 
     t_ns: int
     value: Any
@@ -38,7 +38,7 @@ class Step:
 
 @dataclass(frozen=True, slots=True)
 class FaultBar:
-    """A fault was on from `on_ns` to `off_ns` (None: it still was)."""
+    """A fault that was active from `on_ns` to `off_ns` (None: it still was)."""
 
     id: str
     name: str
@@ -60,7 +60,9 @@ class FrameLine:
 
 @dataclass
 class Window:
-    """Around `check`, from `start_ns` to `end_ns`. `cut` are frames that were left out. `lost`: the trace begins later."""
+    """The window around `check`, from `start_ns` to `end_ns`. `cut` is the number of frames that were left out. `lost`:
+    the trace begins later.
+    """
 
     check: CheckResult
     start_ns: int
@@ -74,10 +76,10 @@ class Window:
     before: deque[FrameLine] = field(default_factory=lambda: deque(maxlen=MOST_FRAMES))
     after: list[FrameLine] = field(default_factory=list)
     bad: dict[tuple[str, int], str] = field(default_factory=dict)
-    """What was wrong with the frame on a bus at a time."""
+    """The problem of the frame on a bus at a time."""
     frames: int = 0
     thinned: set[str] = field(default_factory=set)
-    """Buses, tags and variables of which not all is kept: there was too much of it."""
+    """Buses, tags and variables of which only a part is kept, because there was too much."""
 
     @property
     def lines(self) -> list[FrameLine]:
@@ -94,7 +96,7 @@ class Window:
 
 
 def around(check: CheckResult, end_ns: int) -> Window | None:
-    """The window of a check; None for one that was never decided."""
+    """Return the window of a check; None for a check that was never decided."""
     if check.t_ns is None:
         return None
     at = check.t_ns
@@ -105,7 +107,7 @@ def around(check: CheckResult, end_ns: int) -> Window | None:
 
 
 class Study:
-    """One pass over a scenario's trace: its counts, and the windows around the checks that are given."""
+    """One pass over a scenario's trace: its counts, and the windows around the given checks."""
 
     def __init__(self, report: Report, scenario: ScenarioResult) -> None:
         self._decoder = Decoder(report.system, report.served, report.framings)
@@ -120,7 +122,9 @@ class Study:
         self._off: list[FaultBar] = []
 
     def run(self, checks: Sequence[CheckResult]) -> tuple[Counts, list[Window]]:
-        """What the scenario's trace holds. The counts are those that a listener made, where it made some."""
+        """Read the scenario's trace and return its counts and windows. If a listener has already counted, its counts
+        are returned.
+        """
         trace = self._scenario.trace
         end_ns = trace[-1].t_ns if trace else 0
         windows = [w for w in (around(c, end_ns) for c in checks) if w is not None and trace]
@@ -149,7 +153,7 @@ class Study:
         return (self._collector.finish() if counts is None else counts), windows
 
     def _begin(self, window: Window) -> None:
-        """What was so when the window begins."""
+        """Start a window with the current values and states."""
         window.tags = {name: [step] for name, step in self._now[Kind.TAG].items()}
         window.states = {name: [step] for name, step in self._now[Kind.STATE].items()}
 
@@ -215,7 +219,7 @@ class Study:
 
 
 def _thin_exchanges(window: Window) -> None:
-    """Half of what went well goes; if all went wrong, the older half."""
+    """Remove half of the exchanges without a problem; if nearly all have one, remove the older half."""
     held = window.exchanges
     window.thinned |= {e.bus for e in held if e.ok}
     held[:] = [e for number, e in enumerate(held) if e.problem or number % 2]
@@ -225,8 +229,8 @@ def _thin_exchanges(window: Window) -> None:
 
 
 def thin_steps(steps: list[Step]) -> list[Step]:
-    """About half: of every four changes the lowest and the highest, and all that change the quality; if that is most of them,
-    the newer half. What is left has the extremes of what was there."""
+    """Return about half of the steps: of every four changes the lowest and the highest, and all that change the
+    quality; if that is most of them, the newer half. The result keeps the extremes."""
     kept = set()
     for first in range(0, len(steps), 4):
         four = range(first, min(first + 4, len(steps)))
@@ -250,8 +254,8 @@ def _keep(window: Window, line: FrameLine) -> None:
 
 
 def _raw(event: Event, text: str, hiding: Collection[str]) -> str:
-    """The bytes as they are written, a CAN identifier before them; nothing of a frame whose words hide something, nor of a
-    part of one on a bus where something is hidden."""
+    """Return the frame's bytes in hexadecimal, after a CAN identifier if there is one. A frame whose text hides a
+    secret is hidden, and so is a partial frame on a bus with secret tags."""
     data = event.data
     if SECRET in text or (not text and event.where in hiding):
         return SECRET

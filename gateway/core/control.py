@@ -32,8 +32,10 @@ VERSION = 1
 MAX_LINE = 4 * 1024 * 1024
 MAX_CLIENTS = 64
 LINE_WITHIN_S = 10.0
-"""Time limit for a request that has begun to arrive, and for a client that has to send a token. After it, the client is
-dropped. Without this limit, clients that send nothing, or one byte at a time, would take every place.
+"""Time limit in seconds for a request that has begun to arrive, and for a client that has to send a token.
+
+After it, the client is dropped. Without this limit, clients that send nothing, or one byte at a time, would take every
+place.
 """
 
 Verb = Callable[[dict[str, Any]], Awaitable[Any]]

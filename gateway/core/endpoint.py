@@ -1,21 +1,21 @@
-"""Endpoints are URLs: where a wire ends, and what is spoken on it.
+"""Endpoints are URLs that name a port, socket or bus and the protocol used on it.
 
 ==================================================  =====================================================
 ``rtu:/dev/ttyUSB0?baudrate=19200&frame=8E1``       Modbus RTU on a serial port (``rtu:COM5`` on Windows)
 ``ascii:/dev/ttyUSB0?baudrate=9600&frame=7E1``      Modbus ASCII on a serial port
-``tcp://host:502``                                  Modbus TCP; raw bytes where the far end is a serial line
+``tcp://host:502``                                  Modbus TCP; raw bytes if the remote end is a serial line
 ``rtu+tcp://host:4001``                             Modbus RTU frames in a TCP stream
 ``udp://host:502``                                  Modbus TCP's ADUs in datagrams
-``tls://host:802?ca=FILE&cert=FILE&key=FILE``       Modbus/TCP Security; ``name=HOST`` where the certificate has another
+``tls://host:802?ca=FILE&cert=FILE&key=FILE``       Modbus/TCP Security; ``name=HOST`` if the certificate has another name
 ``can:socketcan/can0``                              a kernel CAN interface
 ``can:fieldtwin/127.0.0.1:29536``                   the software CAN bus
 ``can:pcan/PCAN_USBBUS1?bitrate=250000``            an adapter of python-can: pcan, kvaser, slcan, virtual...
 ``pty:line1``                                       (listening side only) a virtual serial port with that link name
 ==================================================  =====================================================
 
-A serial port also takes ``rs485=1``: the driver switches the transceiver's direction. An RTU port takes ``silence_us=1000``:
-the silence before a request, in microseconds. Secrets are named by their file, never written into an endpoint: endpoints are
-shown everywhere.
+A serial port also accepts ``rs485=1``: the driver switches the transceiver's direction. An RTU port accepts
+``silence_us=1000``: the silence before a request, in microseconds. An endpoint names the files that hold secrets and
+never contains the secrets, because endpoints appear in messages, logs and reports.
 
 Pure text handling: this module opens nothing and knows no operating system.
 """
@@ -206,9 +206,7 @@ def _bracketed(host: str) -> str:
 
 
 def _check_params(endpoint: Endpoint) -> None:
-    """Refuse a repeated parameter, an invalid setting, or a misspelt parameter of a port here, not when the port is
-    opened.
-    """
+    """Refuse repeated, invalid and misspelt parameters here, before the port is opened."""
     names = [name for name, _ in endpoint.params]
     for name in names:
         if names.count(name) > 1:

@@ -234,9 +234,7 @@ class WrongDevice(DeviceRefused):
 
 _NUMBER = re.compile(r"\[Errno (\d+)\]")
 _SAYS_LITTLE = (errno.EADDRNOTAVAIL, errno.EAFNOSUPPORT)
-"""The errors of a host without IPv6 for the address ::1, to which ``localhost`` also resolves. They do not explain a
-failure.
-"""
+"""Errors for ::1, to which ``localhost`` also resolves, on a host without IPv6. They do not explain a failure."""
 
 
 def os_reason(error: OSError) -> str:

@@ -70,7 +70,7 @@ class LssMaster:
             ]
             await self._ask(frames, lss.SWITCHED, f"no slave is {address}")
 
-    # -- the slave in configuration ---------------------------------------------------------------------------------
+    # -- slave in configuration -------------------------------------------------------------------------------------
 
     async def configure_node_id(self, node: int) -> None:
         """Give the slave in configuration its node ID (255: none). It takes effect at the next reset or switch to waiting."""
@@ -116,7 +116,7 @@ class LssMaster:
         async with self._turn:
             return (await self._ask([lss.request(lss.INQUIRE_NODE_ID)], lss.INQUIRE_NODE_ID))[1]
 
-    # -- who is there -----------------------------------------------------------------------------------------------
+    # -- finding slaves ---------------------------------------------------------------------------------------------
 
     async def any_unconfigured(self) -> bool:
         """Return whether a slave without a node ID is on the bus (slaves with one do not answer: CO-057)."""
@@ -126,10 +126,10 @@ class LssMaster:
     async def fastscan(self, *, verify: bool = True) -> LssAddress | None:
         """Find one slave without a node ID and leave it in configuration; return None if there is no such slave.
 
-        If there are several, it finds the one with the smallest numbers; the next scan finds the next one, except
-        without `verify`: a slave found before is in configuration and would answer too. A scan takes 133 requests, each
-        as long as a reply may take. Raises `Desync` if the answers contradict each other, or if the slave that was
-        found reports a different identity.
+        If there are several, it finds the one with the smallest numbers, and the next scan finds the next one. While a
+        slave found before is still in configuration, call it without `verify`, because that slave would answer the
+        inquiry too. A scan takes 133 requests, each as long as a reply may take. Raises `Desync` if the answers
+        contradict each other, or if the slave that was found reports a different identity.
         """
         async with self._turn:
             if not await self._anybody(lss.fastscan(0, lss.ANYBODY, 0, 0), lss.SLAVE_FOUND):
@@ -167,7 +167,7 @@ class LssMaster:
                 await self.switch_all(configuration=False)
         return had
 
-    # -- asking -----------------------------------------------------------------------------------------------------
+    # -- requests ---------------------------------------------------------------------------------------------------
 
     async def _ask(self, frames: list[CanFrame], expected: int, why: str = "", wait_s: float = 0.0) -> bytes:
         """Send, and return the reply with that specifier; other replies are skipped and counted."""

@@ -87,7 +87,7 @@ class CanopenMaster:
         self._timer: asyncio.TimerHandle | None = None
         self._timer_due_ns = 0
 
-    # -- what drivers ask -----------------------------------------------------------------------------------------
+    # -- services for drivers -------------------------------------------------------------------------------------
 
     def add_node(
         self,
@@ -298,7 +298,7 @@ class CanopenMaster:
         self.counters.emcys += 1
         self.on_event(NodeEvent(node, "emcy", self._heartbeat.state(node), data, t_ns))
 
-    # -- heartbeats that do not come ------------------------------------------------------------------------------
+    # -- overdue heartbeats ---------------------------------------------------------------------------------------
 
     def _arm(self) -> None:
         """Set the timer so that the next heartbeat deadline is checked when it is due."""

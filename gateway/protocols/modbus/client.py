@@ -88,7 +88,7 @@ class ClientCounters:
     replies + exceptions + timeouts + crc_errors + desyncs + verify_failures + abandoned, plus the one in progress.
     `replies` counts normal replies only; `broadcasts` all requests that are not answered; `abandoned` those that were
     cancelled or lost with the connection. Of the bytes, `late_bytes` belong to late or duplicate replies, and
-    `noise_bytes` to no reply at all.
+    `noise_bytes` are not part of any reply to this client.
     """
 
     requests: int = 0
@@ -447,7 +447,7 @@ class ModbusClient:
         self.counters.broadcasts += 1
         return request.unanswered(transaction.sent_ns)
 
-    # -- the line between exchanges ------------------------------------------------------------------------------
+    # -- silence between exchanges -------------------------------------------------------------------------------
 
     def _is_silent(self) -> bool:
         """Return whether a request may be sent immediately, which is the usual case. Otherwise call `_await_silence`."""
@@ -535,7 +535,7 @@ class ModbusClient:
             return connection.read_pending()
         return await connection.read() if connection.inbound.data_stream else b""
 
-    # -- small things --------------------------------------------------------------------------------------------
+    # -- helpers -------------------------------------------------------------------------------------------------
 
     def _timeout_of(self, unit: int) -> float:
         pace = self._paces.get(unit)

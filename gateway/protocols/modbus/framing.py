@@ -17,7 +17,7 @@ from fieldtwin.gateway.protocols.modbus.request import Request
 class Framer(ABC):
     """The framing of one link. One request at a time: `begin`, then `feed` until it returns, raises, or time is up.
 
-    `late_bytes` counts bytes of earlier exchanges and duplicates, `noise_bytes` those that belong to no frame, and
+    `late_bytes` counts bytes of earlier exchanges and duplicates, `noise_bytes` those of no exchange, and
     `foreign_frames` whole frames of other devices. All three only increase.
     """
 

@@ -1,8 +1,8 @@
 """The serial line between two exchanges: silence before a request, and quarantine after an exchange that ended badly.
 
 On a serial line a reply does not say which request it answers. So after a timeout, or when an exchange was given up, no
-request is sent until nothing has arrived for as long as the slowest reply so far took (case MB-013). Pure: it is told
-what arrived and when, and says until when to wait. Times are monotonic nanoseconds.
+request is sent until nothing has arrived for as long as the slowest reply so far took (case MB-013). Pure: it
+takes what arrived and when, and returns until when to wait. Times are monotonic nanoseconds.
 """
 
 from __future__ import annotations

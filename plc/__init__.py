@@ -1,1 +1,1 @@
-"""The soft PLC. Stands on fieldtwin.gateway.core alone: it never knows a bus, a driver, an emulator or a twin."""
+"""The soft PLC. It depends only on fieldtwin.gateway.core and does not know a bus, a driver, an emulator or a twin."""

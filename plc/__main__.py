@@ -1,4 +1,4 @@
-"""``python -m plc CONFIG.json``: one PLC process. Exit codes as in DESIGN.md; talk on stderr."""
+"""``python -m plc CONFIG.json``: one PLC process. Exit codes as in DESIGN.md; diagnostics go to stderr."""
 
 from __future__ import annotations
 

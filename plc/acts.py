@@ -1,7 +1,7 @@
-"""What people do to a PLC (force, unforce, pause, go, step, restart), on record: one JSON line each in the audit log.
+"""The record of what users do to a PLC (force, unforce, pause, go, step, restart): one JSON line each in the audit log.
 
-The file and the form are those of the gateway's audit log, appended line by line: who, what, the old and the new value. An act
-that cannot be written down is not done. It must never know what an act means.
+The file and the format are those of the gateway's audit log, appended line by line: the user, the action, the old and
+the new value. An action that cannot be recorded is not carried out. This module must not know what an action means.
 """
 
 from __future__ import annotations
@@ -14,11 +14,12 @@ from fieldtwin.gateway.core.errors import Unreachable
 
 
 class Acts:
-    """Appends to the file at `path`, made if need be, which only its owner may read; nowhere with ``""``."""
+    """Appends to the file at `path`, which is created if necessary and which only its owner may read; with ``""``
+    nothing is written."""
 
     def __init__(self, path: str) -> None:
         self.counts: dict[str, int] = {}
-        """How often each was done since the process began."""
+        """How often each action was carried out since the process began."""
         self._path = path
         self._descriptor = -1
         if path:
@@ -28,7 +29,7 @@ class Acts:
                 raise self._failed("open", e) from e
 
     def note(self, action: str, by: str, utc_ns: int, **details: Any) -> None:
-        """One entry. Raises `Unreachable`, and the act must not be done, where it cannot be written."""
+        """Write one entry. Raises `Unreachable` if it cannot be written; the action must not be carried out then."""
         if self._descriptor >= 0:
             self._write(action, by, utc_ns, details)
         self.counts[action] = self.counts.get(action, 0) + 1
@@ -42,7 +43,7 @@ class Acts:
             "result": "asked",
             **details,
         }
-        try:  # in one write, since the gateway appends to the same file
+        try:  # in one write, because the gateway appends to the same file
             os.write(self._descriptor, json.dumps(entry, separators=(",", ":"), default=str).encode() + b"\n")
         except OSError as e:
             raise self._failed("write", e) from e

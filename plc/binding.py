@@ -1,7 +1,7 @@
-"""Putting programs together with a plant: sources, bindings, and the process image that follows from them.
+"""Connects programs with a plant: sources, bindings, and the process image that follows from them.
 
-Everything that can be wrong is found here, before the first scan: a variable that does not exist or is bound to
-nothing, kinds that differ, two programs that write one tag. No memory, no clock, no cycle.
+All configuration errors are found here, before the first scan: a variable that does not exist or is not bound, kinds
+that differ, two programs that write one tag. This module uses no shared memory, clock or cycle.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ _ST_SUFFIXES = (".st", ".xml")
 
 @dataclass(frozen=True, slots=True)
 class InputBinding:
-    """Where an input comes from, and what a program sees while that is BAD: a tag of the plant, or another program's
+    """The source of an input, and what a program sees while it is BAD: a tag of the plant, or another program's
     ``program.variable``.
 
-    `if_bad` is ``"pass"`` (the value as it is, BAD), ``"hold"`` (the last one that was not, UNCERTAIN), a number to put in
-    its place (SUBSTITUTED), or ``"trip"``: a bad one, once it was good, stops the task with its outputs safe.
+    `if_bad` is ``"pass"`` (the value as it is, BAD), ``"hold"`` (the last value that was not BAD, UNCERTAIN), a number
+    that replaces it (SUBSTITUTED), or ``"trip"``: a bad value, once it was good, stops the task with its outputs safe.
     """
 
     tag: str
@@ -43,7 +43,7 @@ class InputBinding:
 class BoundProgram:
     """A program under its name in the system file, with its variables bound to tags of the plant.
 
-    An output or local that is bound to nothing is published as ``<program>.<variable>``.
+    An output or local that is not bound is published as ``<program>.<variable>``.
     """
 
     name: str
@@ -55,19 +55,19 @@ class BoundProgram:
         return [v for v in self.program.variables.values() if v.role is role]
 
     def published(self) -> list[tuple[Variable, str]]:
-        """Outputs and locals with the tag that each is published as."""
+        """Return the outputs and locals, with the tag under which each is published."""
         both = self.variables(Role.OUTPUT) + self.variables(Role.LOCAL)
         return [(v, self.outputs.get(v.name, f"{self.name}.{v.name}")) for v in both]
 
 
 def load_program(source: str, python_path: Sequence[str] = (), together: dict[Any, Any] | None = None) -> Program:
-    """Make the program that `source` names, searching the folders of `python_path` first. Raises `FileInvalid`.
+    """Create the program that `source` names, searching the folders of `python_path` first. Raises `FileInvalid`.
 
-    Programs that run together are made with one `together`, empty at first: programs of one file of Structured Text share
-    its VAR_GLOBAL there.
+    Programs that run together are created with one `together`, empty at first: programs of one file of Structured Text
+    share its VAR_GLOBAL there.
 
-    ``python: module:Class``, or a file of Structured Text (``relay.st``) or a PLCopen export (``plant.xml``), followed by
-    ``:NAME`` where it holds several programs.
+    `source` is ``python: module:Class``, or a file of Structured Text (``relay.st``) or a PLCopen export
+    (``plant.xml``), followed by ``:NAME`` if it holds several programs.
     """
     language, _, rest = source.partition(":")
     made: Callable[[], Program]
@@ -79,7 +79,7 @@ def load_program(source: str, python_path: Sequence[str] = (), together: dict[An
         return made()
     except FieldtwinError:
         raise
-    except Exception as e:  # its constructor is the user's: it can raise anything; translated here, once
+    except Exception as e:  # the constructor is the user's code: it can raise any error, which is translated here, once
         raise FileInvalid(f"program {source!r} cannot be made: {type(e).__name__}: {e}") from e
 
 
@@ -92,7 +92,7 @@ def _python_class(source: str, rest: str, python_path: Sequence[str]) -> type[Pr
             sys.path.insert(0, folder)
     try:
         found = getattr(importlib.import_module(module_name.strip()), class_name.strip(), None)
-    except Exception as e:  # a user's module can raise anything while it is imported; translated here, once
+    except Exception as e:  # a user's module can raise any error while it is imported; it is translated here, once
         raise FileInvalid(f"program {source!r} cannot be imported: {type(e).__name__}: {e}") from e
     if not (isinstance(found, type) and issubclass(found, Program)):
         raise FileInvalid(
@@ -105,7 +105,7 @@ def _text_class(source: str, folders: Sequence[str]) -> type[StProgram]:
     name, _, program = source.strip().partition(":")
     if not name.lower().endswith(_ST_SUFFIXES):
         raise FileInvalid("not the source of a program", expected=_SOURCES, got=source)
-    from fieldtwin.plc.st.program import load_file  # the compiler is only loaded where there is something to compile
+    from fieldtwin.plc.st.program import load_file  # load the compiler only if there is something to compile
 
     places = [Path(folder) / name for folder in folders if not Path(name).is_absolute()] + [Path(name)]
     return load_file(next((p for p in places if p.exists()), places[0]), program.strip())
@@ -114,10 +114,10 @@ def _text_class(source: str, folders: Sequence[str]) -> type[StProgram]:
 def image_for(
     programs: Sequence[BoundProgram], plant: Mapping[str, TagSpec], watched: Iterable[str] = ()
 ) -> ImageLayout:
-    """The process image that `programs` need of a plant whose tags are `plant`. Raises `FileInvalid`.
+    """Return the process image that `programs` need of a plant whose tags are `plant`. Raises `FileInvalid`.
 
-    INPUTS holds every tag that an input is bound to, then the `watched` ones; OUTPUTS every output and local. An input
-    may be bound to another program's variable, too: ``<program>.<variable>``.
+    INPUTS holds every tag to which an input is bound, then the `watched` ones; OUTPUTS holds every output and local. An
+    input may also be bound to another program's variable: ``<program>.<variable>``.
     """
     inputs: dict[str, TagSpec] = {}
     outputs: dict[str, TagSpec] = {}
@@ -183,9 +183,9 @@ def _plant_tag(bound: BoundProgram, variable: Variable, tag: str, plant: Mapping
 
 
 def substitute(spec: TagSpec, if_bad: str | float) -> Scalar | None:
-    """The value that `if_bad` puts in place of a BAD one of tag `spec`, None for a policy that has none.
+    """Return the value that `if_bad` puts in place of a BAD value of tag `spec`; None for a policy without a value.
 
-    Raises `FileInvalid` where it makes no sense.
+    Raises `FileInvalid` for an invalid policy or value.
     """
     if isinstance(if_bad, str):
         if if_bad not in ("hold", "pass", "trip"):

@@ -1,6 +1,6 @@
-"""What a PLC process is told: one JSON document, made by whoever starts it.
+"""The configuration of a PLC process: one JSON document, created by the process that starts it.
 
-Frozen dataclasses to JSON and back. It must never know a system file, a device or a bus.
+This module converts frozen dataclasses to JSON and back. It must not know a system file, a device or a bus.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from fieldtwin.plc.start import StartPolicy
 
 @dataclass(frozen=True, slots=True)
 class ProgramConfig:
-    """A program: its source (`fieldtwin.plc.binding.load_program`), its bindings, variable to tag, its task (the first if
-    empty), and how long it waits for its inputs."""
+    """A program: its source (`fieldtwin.plc.binding.load_program`), its bindings from variable to tag, its task (the
+    first if empty), and how long it waits for its inputs."""
 
     name: str
     source: str
@@ -30,7 +30,7 @@ class ProgramConfig:
     start: StartPolicy = field(default_factory=StartPolicy)
 
     def bind(self, python_path: tuple[str, ...] = (), together: dict[Any, Any] | None = None) -> BoundProgram:
-        """Make the program (`fieldtwin.plc.binding.load_program`). Raises `FileInvalid`."""
+        """Create the program (`fieldtwin.plc.binding.load_program`). Raises `FileInvalid`."""
         return BoundProgram(self.name, load_program(self.source, python_path, together), self.inputs, self.outputs)
 
 
@@ -38,7 +38,7 @@ class ProgramConfig:
 class TaskSpec:
     """A task (IEC 61131-3, 6.8.2): every `interval_ms`, or once at each rising edge of the tag `single`.
 
-    `priority` 0 is the highest. `late_ms`: how late a scan may begin, 0 for that of the PLC.
+    `priority` 0 is the highest. `late_ms`: how late a scan may begin, 0 for the value of the PLC.
     """
 
     name: str
@@ -50,14 +50,15 @@ class TaskSpec:
 
 @dataclass(frozen=True, slots=True)
 class PlcConfig:
-    """A PLC process. `layout` is `ImageLayout.describe()`; `image_path` a file that holds a formatted image of it.
+    """A PLC process. `layout` is `ImageLayout.describe()`; `image_path` is a file that holds a formatted image of it.
 
-    `heartbeat_limit_ms`: age of the gateway's last publication beyond which inputs are BAD. `priority`: of SCHED_FIFO,
-    0 to stay in the normal class. `python_path`: folders that programs are searched in first. Without `tasks` there is one,
-    with `cycle_ms`. A scan of more than `stuck_ms` is ended by force (0: never). After that, or a stop by the watchdog, the
-    programs begin again `restart_after_ms` later, at most `max_restarts` times in a row. `retain_path`: where retained
-    variables are kept, ``""`` nowhere; with `cold` they begin with their initial values. `outputs_first`: outputs are
-    published at the cycle's start. `audit_path`: where it is written down what people do to it, ``""`` nowhere.
+    `heartbeat_limit_ms`: the age of the gateway's last publication beyond which inputs are BAD. `priority`: of
+    SCHED_FIFO, 0 to stay in the normal class. `python_path`: folders that are searched first for programs. Without
+    `tasks` there is one task, with `cycle_ms`. A scan of more than `stuck_ms` is ended by force (0: never). After that,
+    or after a stop by the watchdog, the programs start again `restart_after_ms` later, at most `max_restarts` times in
+    a row. `retain_path`: the file of retained variables, ``""`` for none; with `cold` they begin with their initial
+    values. `outputs_first`: outputs are published at the start of the cycle. `audit_path`: the file that records what
+    users do to the PLC, ``""`` for none.
     """
 
     image_path: str
@@ -83,12 +84,12 @@ class PlcConfig:
         return ImageLayout.from_description(self.layout)
 
     def to_json(self) -> bytes:
-        """The inverse of `from_json`."""
+        """Return the inverse of `from_json`."""
         return msgspec.json.format(msgspec.json.encode(self), indent=2)
 
     @classmethod
     def from_json(cls, text: bytes, path: str = "") -> PlcConfig:
-        """Raises `FileInvalid` for JSON that is no such configuration."""
+        """Read a configuration from JSON. Raises `FileInvalid` for any other content."""
         try:
             return msgspec.json.decode(text, type=cls)
         except msgspec.MsgspecError as e:

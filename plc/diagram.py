@@ -1,7 +1,7 @@
 """A state table as a drawing: SVG, without a network, a font or a layout program.
 
-States stand on an ellipse in the order of their codes, the initial one on top with a dot before it; each transition is an
-arrow with its guard. Transitions from any state are drawn from each. Pure: text in, text out.
+States are placed on an ellipse in the order of their codes, the initial one on top with a dot before it; each
+transition is an arrow with its guard. Transitions from any state are drawn from each state. Pure: text in, text out.
 """
 
 from __future__ import annotations
@@ -14,12 +14,13 @@ from math import atan2, cos, hypot, pi, sin
 from fieldtwin.plc.states import StateTable
 
 _CHAR = 7.2
-"""Width of a character of the 12 px monospace face, in px."""
+"""Width of a character of the 12 px monospace font, in px."""
 _BOX_H = 40.0
 _LINE_H = 16.0
 _MARGIN = 60.0
 _LABEL_AT = (0.36, 0.5, 0.26, 0.62, 0.72, 0.18)
-"""How far along its arrow a label may stand, the best first: nearer to the source, since arrows meet in the middle."""
+"""How far along its arrow a label may be placed, the best first: nearer to the source, because arrows meet in the
+middle."""
 _STYLE = """
   svg { font: 12px ui-monospace, Menlo, Consolas, monospace; fill: none }
   .ground { fill: #fff }
@@ -37,7 +38,7 @@ class _Box:
     width: float
 
     def edge(self, angle: float) -> tuple[float, float]:
-        """Where a ray from the middle at `angle` leaves the box."""
+        """Return where a line from the middle at `angle` leaves the box."""
         dx, dy = cos(angle), sin(angle)
         across = self.width / 2 / abs(dx) if dx else float("inf")
         up = _BOX_H / 2 / abs(dy) if dy else float("inf")
@@ -46,14 +47,15 @@ class _Box:
 
 
 class _Labels:
-    """Puts texts where they hide neither a state nor each other, as far as there is room."""
+    """Places texts where they hide neither a state nor each other, as far as there is room."""
 
     def __init__(self, boxes: Iterable[_Box]) -> None:
         self._taken = [(b.x - b.width / 2, b.y - _BOX_H / 2, b.x + b.width / 2, b.y + _BOX_H / 2) for b in boxes]
         self.drawn: list[str] = []
 
     def place(self, spots: Sequence[tuple[float, float]], lines: Sequence[str]) -> None:
-        """At the first of `spots` (the middle of the text) where it hides nothing; else where it hides least."""
+        """Place `lines` at the first of `spots` (the middle of the text) where they hide nothing, else where they hide
+        least."""
         if not lines:
             return
         width, height = max(len(line) for line in lines) * _CHAR + 8, len(lines) * _LINE_H + 2
@@ -74,7 +76,7 @@ def _overlap(a: tuple[float, ...], b: tuple[float, ...]) -> float:
 
 
 def svg(table: StateTable, title: str = "", current: str = "") -> str:
-    """The drawing; `current` is highlighted."""
+    """Return the drawing; the state `current` is highlighted."""
     arrows = _arrows(table)
     longest = max((len(line) for *_, lines in arrows for line in lines), default=0)
     boxes = _places(table, longest)
@@ -107,7 +109,8 @@ def svg(table: StateTable, title: str = "", current: str = "") -> str:
 
 
 def _arrows(table: StateTable) -> list[tuple[str, str, list[str]]]:
-    """(source, target, labels): several transitions between the same two states share an arrow, a line for each."""
+    """Return (source, target, labels): several transitions between the same two states share an arrow, with a line for
+    each."""
     found: dict[tuple[str, str], list[str]] = {}
     for state in table.states:
         for transition in table.leaving(state):
@@ -143,7 +146,7 @@ def _arrow(
         return f'<path class="arrow" d="M{x1:.1f},{y1:.1f} {bend}"/>{_tip(x2, y2, atan2(y2 - py, x2 - px))}'
     dx, dy = b.x - a.x, b.y - a.y
     length = hypot(dx, dy)
-    sway = 34.0 if both else 0.0  # there and back are two arrows: each bends to its right
+    sway = 34.0 if both else 0.0  # two opposite transitions are two arrows, and each bends to its right
     px, py = (a.x + b.x) / 2 - dy / length * sway * 2, (a.y + b.y) / 2 + dx / length * sway * 2
     x1, y1 = a.edge(atan2(py - a.y, px - a.x))
     x2, y2 = b.edge(atan2(py - b.y, px - b.x))
@@ -153,7 +156,7 @@ def _arrow(
 
 
 def _bezier(start: float, control: float, end: float, at: float) -> float:
-    """A coordinate of a quadratic curve, `at` 0 to 1 of its way."""
+    """Return a coordinate of a quadratic curve at the position `at`, 0 to 1."""
     return (1 - at) ** 2 * start + 2 * at * (1 - at) * control + at**2 * end
 
 

@@ -1,8 +1,8 @@
-"""Forces: values that a person puts in place of what a tag has, until they are taken away.
+"""Forces: values that a user sets in place of a tag's value, until they are removed.
 
-A forced input is what every program sees, SIMULATED; a forced output or local is set before the logic and again after it,
-and is published SIMULATED (SPEC ruling 15). Bounded, and listed in every status. Nothing here asks whether a force is a
-good idea: whoever sets one did.
+A forced input is what every program sees, with quality SIMULATED. A forced output or local is set before the logic and
+again after it, and is published as SIMULATED (SPEC ruling 15). The number of forces is limited, and they are listed in
+every status. This module does not check whether a force is safe: that is the user's decision.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ MAX_FORCES = 256
 
 @dataclass(frozen=True, slots=True)
 class Force:
-    """A forced tag: its value, since when (monotonic ns), and who did it."""
+    """A forced tag: its value, since when (monotonic ns), and the user who forced it."""
 
     value: Scalar
     since_ns: int
@@ -34,19 +34,20 @@ class Forces:
         self.outputs: dict[str, Force] = {}
 
     def force(self, spec: TagSpec, value: Scalar, is_input: bool, now_ns: int, by: str = "") -> None:
-        """Raises `UsageError` for a value that the tag cannot hold, `EndpointBusy` when there are too many."""
+        """Force a tag. Raises `UsageError` for a value that the tag cannot hold, `EndpointBusy` if there are too many
+        forces."""
         table = self.inputs if is_input else self.outputs
         if len(self.inputs) + len(self.outputs) >= MAX_FORCES and spec.name not in table:
             raise EndpointBusy("too many forces", expected=f"at most {MAX_FORCES}")
         table[spec.name] = Force(checked(spec, value), now_ns, by)
 
     def unforce(self, tag: str) -> bool:
-        """Take a force away; False if there was none."""
+        """Remove a force; return False if there was none."""
         found = self.inputs.pop(tag, None) or self.outputs.pop(tag, None)
         return found is not None
 
     def clear(self) -> int:
-        """Take all away; how many there were."""
+        """Remove all forces; return how many there were."""
         count = len(self)
         self.inputs.clear()
         self.outputs.clear()
@@ -56,7 +57,7 @@ class Forces:
         return len(self.inputs) + len(self.outputs)
 
     def describe(self, now_ns: int) -> dict[str, dict[str, Scalar]]:
-        """JSON-able: tag to value, age in ms, and who forced it."""
+        """Return tag to value, age in ms, and the user who forced it, as data for JSON."""
         return {
             tag: {"value": f.value, "age_ms": (now_ns - f.since_ns) / 1e6, "by": f.by}
             for tag, f in sorted((self.inputs | self.outputs).items())
@@ -64,7 +65,7 @@ class Forces:
 
 
 def checked(spec: TagSpec, value: Scalar) -> Scalar:
-    """`value` as one of the tag's kind. Raises `UsageError`."""
+    """Return `value` as one of the tag's kind. Raises `UsageError`."""
     if isinstance(value, int | float) and (isinstance(value, int) or isfinite(value)) and -(2**63) <= value < 2**63:
         if spec.kind is TagKind.REAL:
             return float(value)

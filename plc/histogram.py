@@ -1,7 +1,7 @@
-"""A histogram of durations with bounded memory and bounded error: percentiles of millions of scans.
+"""A histogram of durations with limited memory and limited error: percentiles of millions of scans.
 
-Buckets are 32 to a power of two, so a percentile is at most 1/32 above the truth; minimum and maximum are exact. It
-must never know what is measured.
+There are 32 buckets per power of two, so a percentile is at most 1/32 above the true value; minimum and maximum are
+exact. This module must not know what is measured.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from typing import Any
 
 _SUB_BITS = 5
 _SUB = 1 << _SUB_BITS
-_MAX_BITS = 42  # 4,398 s in ns; anything longer counts as that
+_MAX_BITS = 42  # 4,398 s in ns; a longer duration counts as this one
 _BUCKETS = (_MAX_BITS - _SUB_BITS + 1) * _SUB
 
 
@@ -34,7 +34,7 @@ class Histogram:
         self._counts[ns if ns < _SUB else _bucket(ns)] += 1
 
     def percentile_ns(self, percent: float) -> int:
-        """A duration that at least `percent` of all do not exceed (0 to 100); 0 when there are none."""
+        """Return a duration that at least `percent` (0 to 100) of all do not exceed; 0 if there are none."""
         need = self.count * percent / 100
         seen = 0
         for bucket, count in enumerate(self._counts):
@@ -44,13 +44,13 @@ class Histogram:
         return 0
 
     def share_above(self, ns: int) -> float:
-        """The share of all, 0 to 1, that took longer than `ns` (to the bucket)."""
+        """Return the share of all durations, 0 to 1, that are longer than `ns` (with the accuracy of a bucket)."""
         if not self.count:
             return 0.0
         return sum(self._counts[_bucket(ns) + 1 :]) / self.count
 
     def summary_us(self) -> dict[str, Any]:
-        """JSON-able: count, and min, p50, p99, p99.9, max in microseconds, and the share above 1 ms."""
+        """Return count, and min, p50, p99, p99.9, max in microseconds, and the share above 1 ms, as data for JSON."""
         return {
             "count": self.count,
             "min": self.min_ns / 1e3,
@@ -70,7 +70,7 @@ def _bucket(ns: int) -> int:
 
 
 def _upper_ns(bucket: int) -> int:
-    """The longest duration of a bucket."""
+    """Return the longest duration of a bucket."""
     if bucket < _SUB:
         return bucket
     shift, sub = divmod(bucket, _SUB)

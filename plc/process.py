@@ -107,7 +107,7 @@ class PlcProcess:
     def _on_signal(self, number: int, frame: object) -> None:
         self._stopping = True
 
-    # -- verbs ------------------------------------------------------------------------------------------------------
+    # -- commands ---------------------------------------------------------------------------------------------------
 
     async def _ready(self, args: dict[str, Any]) -> dict[str, Any]:
         return {"ready": True, "state": self._runner.describe()["state"], "pid": os.getpid()}

@@ -1,12 +1,13 @@
-"""Retained variables in a file: written a scan, whole after a kill at any instant, refused when they are of another program.
+"""Retained variables in a file: written after each scan, intact after a kill at any time, refused for a different
+program.
 
     magic, capacity            16 bytes
     hash of the layout         32 bytes: programs, their retained variables and kinds
     two slots                  counter, length, check sum, payload (MessagePack)
 
-A save goes into the slot that is not the newest and is a copy into mapped memory: it waits for no disk. A process that is
-killed in the middle leaves that slot with a wrong check sum and the other one whole. `flush` brings it to the disk, for a
-host that loses power; who calls it does so between scans.
+A save goes into the older slot and is a copy into mapped memory, so it does not wait for the disk. A process that is
+killed during a save leaves that slot with a wrong check sum and the other slot intact. `flush` writes the memory to the
+disk, for a host that may lose power; it must be called between scans.
 """
 
 from __future__ import annotations
@@ -33,7 +34,8 @@ MAX_CAPACITY = 16 * 1024 * 1024
 
 
 def layout_hash(programs: Sequence[BoundProgram]) -> bytes:
-    """Of everything that must be the same for a value to mean the same: programs, variables, kinds, form."""
+    """Return the hash of all that must be unchanged for a value to keep its meaning: programs, variables, kinds,
+    form."""
     described = [
         [
             p.name,
@@ -46,7 +48,7 @@ def layout_hash(programs: Sequence[BoundProgram]) -> bytes:
 
 
 def _form(value: Any) -> Any:
-    """The form of retained data without its values: names, types, and how many."""
+    """Return the form of retained data without its values: names, types, and counts."""
     if isinstance(value, dict):
         return {name: _form(v) for name, v in sorted(value.items())}
     if isinstance(value, list):
@@ -55,7 +57,7 @@ def _form(value: Any) -> Any:
 
 
 class RetainFile:
-    """The file, mapped. Made by `open`; `close` it."""
+    """The mapped file. Created by `open`; call `close` after use."""
 
     def __init__(self, path: Path, mapped: mmap.mmap, capacity: int) -> None:
         self.path = path
@@ -68,10 +70,11 @@ class RetainFile:
 
     @classmethod
     def open(cls, path: Path, layout: bytes, size: int) -> tuple[RetainFile, Any, str]:
-        """The file, what it holds (None: nothing, begin cold), and why it was put aside if it was.
+        """Return the file, its content (None: empty, so start cold), and why an existing file was put aside, if it was.
 
-        `size` is the most that a save takes, in bytes. A file of another layout, or that is damaged, is kept as ``.old``.
-        Raises `Unreachable` when there can be no file, `FileInvalid` for more than one takes.
+        `size` is the largest size of a save, in bytes. A file of a different layout, or a damaged file, is kept as
+        ``.old``. Raises `Unreachable` if the file cannot be created, and `FileInvalid` if `size` is more than a file
+        can hold.
         """
         aside = ""
         if path.exists():
@@ -127,7 +130,7 @@ class RetainFile:
         return _HEAD.size + (counter & 1) * (_SLOT.size + self._capacity)
 
     def _newest(self) -> Any:
-        """The payload with the highest counter whose check sum is right; None when nothing was ever saved."""
+        """Return the payload with the highest counter whose check sum is correct; None if nothing was ever saved."""
         best, data = 0, b""
         for slot in (0, 1):
             at = self._offset(slot)
@@ -146,7 +149,7 @@ class RetainFile:
             raise FileInvalid("retained variables that cannot be read", path=str(self.path)) from e
 
     def save(self, values: Any) -> bool:
-        """Keep `values`; False when they are what was kept last. Raises `RetainFull` when they take too much."""
+        """Save `values`; return False if they equal the last saved ones. Raises `RetainFull` if they are too large."""
         try:
             data = msgspec.msgpack.encode(values)
         except (TypeError, OverflowError, msgspec.MsgspecError) as e:
@@ -161,7 +164,7 @@ class RetainFile:
         counter = self._counter + 1
         at = self._offset(counter)
         start = at + _SLOT.size
-        _SLOT.pack_into(self._memory, at, 0, 0, 0)  # no longer whole, from here until its head is there
+        _SLOT.pack_into(self._memory, at, 0, 0, 0)  # not valid from here until its head is written
         self._memory[start : start + len(data)] = data
         _SLOT.pack_into(self._memory, at, counter, len(data), _check(counter, data))
         self._counter, self._last = counter, data
@@ -169,7 +172,7 @@ class RetainFile:
         return True
 
     def flush(self) -> None:
-        """To the disk. Blocks."""
+        """Write the file to the disk. Blocks."""
         self._mapped.flush()
 
     def close(self) -> None:
@@ -178,7 +181,7 @@ class RetainFile:
 
 
 class RetainFull(FieldtwinError):
-    """Retained variables that their file cannot hold."""
+    """The retained variables do not fit their file."""
 
 
 def _check(counter: int, data: bytes) -> int:
@@ -189,9 +192,9 @@ class Retained:
     """The retained variables of all programs, and their file: restored once, saved after scans."""
 
     def __init__(self, programs: Sequence[BoundProgram], path: Path | None, *, cold: bool = False) -> None:
-        """`path` None, or no program that retains anything: nothing is kept. `cold`: what was kept is not used.
+        """If `path` is None, or if no program retains anything, nothing is saved. `cold`: saved values are not used.
 
-        Raises `Unreachable` when there can be no file.
+        Raises `Unreachable` if the file cannot be created.
         """
         self._programs = [p for p in programs if p.program.retained()]
         self._file: RetainFile | None = None
@@ -211,7 +214,7 @@ class Retained:
         return {p.name: p.program.retained() for p in self._programs}
 
     def save(self) -> None:
-        """After a scan, outside its time. Raises `RetainFull`."""
+        """Save the values, after a scan and outside its time. Raises `RetainFull`."""
         if self._file is not None:
             self._file.save(self._values())
 
@@ -220,19 +223,19 @@ class Retained:
             self._file.flush()
 
     def close(self) -> None:
-        """To the disk, and done."""
+        """Write the file to the disk and close it."""
         if self._file is not None:
             self._file.flush()
             self._file.close()
             self._file = None
 
     def describe(self) -> dict[str, Any]:
-        """JSON-able."""
+        """Return the kind of start and the number of saves, as data for JSON."""
         return {
             "start": self.start,
             "saves": self._file.saves if self._file else 0,
         }
 
     def values(self) -> dict[str, Any]:
-        """What is kept now, by program and variable: plain data."""
+        """Return the present retained values by program and variable, as plain data."""
         return self._values() if self._file else {}

@@ -270,7 +270,7 @@ class Scan:
             raise InputTripped(item.owner, f"an input that must not be bad is: {seen.reason}", variable=item.tag)
         return item.apply(seen).value
 
-    # -- what watchers see --------------------------------------------------------------------------------------
+    # -- data for displays --------------------------------------------------------------------------------------
 
     def _seen_at(self, index: int) -> TagValue:
         value = self._snapshot.value(index)

@@ -1,7 +1,7 @@
-"""The files that a PLC's programs come from, and which of them changed since the PLC read them.
+"""The files of a PLC's programs, and which of them changed since the PLC read them.
 
-Structured Text is read again at each restart of the programs, a module of Python only when the process begins. What a module
-imports is not looked at. It must never know what a program does.
+Structured Text is read again at each restart of the programs; a Python module only when the process starts. Modules
+that a module imports are not checked. This module must not know what a program does.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from fieldtwin.plc.binding import BoundProgram
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """The file of one program as it was when the PLC read it. `digest`: SHA-256 in hex, empty where it cannot be read."""
+    """The file of one program as it was when the PLC read it. `digest`: SHA-256 in hex, empty if it cannot be read."""
 
     program: str
     path: str
@@ -27,13 +27,14 @@ class Source:
     """Whether it is Structured Text, which a restart of the programs reads again."""
 
     def describe(self) -> dict[str, Any]:
-        """JSON-able: the program, its file, and what takes over the file as it is now."""
+        """Return the program, its file, and the command that loads the present file, as data for JSON."""
         cure = "fieldtwin plc restart" if self.compiled else "stop the system and run it again"
         return {"program": self.program, "path": self.path, "cure": cure}
 
 
 def sources(programs: Sequence[BoundProgram], before: Sequence[Source] = ()) -> list[Source]:
-    """The files of `programs`, which were made just now. `before`: those of the programs that they replace."""
+    """Return the files of `programs`, which were just created. `before`: the sources of the programs that they
+    replace."""
     imported = {source.path: source.digest for source in before if not source.compiled}
     found = []
     for bound in programs:
@@ -45,7 +46,7 @@ def sources(programs: Sequence[BoundProgram], before: Sequence[Source] = ()) -> 
 
 
 def changed(known: Sequence[Source]) -> list[Source]:
-    """Those whose file has another content now, or cannot be read any more."""
+    """Return the sources whose file has a different content now, or cannot be read any more."""
     return [source for source in known if source.digest and _digest(source.path) != source.digest]
 
 

@@ -1,4 +1,4 @@
-"""State machines as tables: what can follow what, when, and what is done then. The table is the program.
+"""State machines as tables: which state can follow which, when, and which action runs then. The table is the program.
 
     class Pump(StateMachine):
         start: bool = var_input(TagKind.BOOL)
@@ -10,9 +10,9 @@
             Transition(ANY, "IDLE", when="not start", do="close"),
         )
 
-Each scan takes at most one transition: the first in the table's order that starts in the present state, whose guard holds and
-whose time in the state has passed. `when` is an expression over the program's variables, `do` a method. Diagrams
-(fieldtwin.plc.diagram) and proofs (fieldtwin.plc.prove) read the same table. Pure: time is the scan's.
+Each scan takes at most one transition: the first in the table's order that starts in the present state, whose guard
+holds and whose time in the state has passed. `when` is an expression over the program's variables, `do` a method.
+Diagrams (fieldtwin.plc.diagram) and proofs (fieldtwin.plc.prove) read the same table. Pure: time is the scan's.
 """
 
 from __future__ import annotations
@@ -29,12 +29,13 @@ from fieldtwin.gateway.core.values import Scalar
 from fieldtwin.plc.program import Program, ScanInfo, var_local
 
 ANY = "*"
-"""As a source: every state but the target."""
+"""As a source: every state except the target."""
 
 
 @dataclass(frozen=True, slots=True)
 class Transition:
-    """From `source` to `target` `when` the guard holds (always, if empty) and `after_ms` in the source have passed."""
+    """A transition from `source` to `target`, taken `when` the guard holds (always, if empty) and `after_ms` in the
+    source have passed."""
 
     source: str
     target: str
@@ -44,14 +45,15 @@ class Transition:
 
     @property
     def label(self) -> str:
-        """What a diagram writes on the arrow."""
+        """The text that a diagram writes on the arrow."""
         parts = [self.when, f"after {self.after_ms:g} ms" if self.after_ms else "", f"/ {self.do}" if self.do else ""]
         return ", ".join(p for p in parts[:2] if p) + (f" {parts[2]}" if parts[2] else "")
 
 
 @dataclass(frozen=True)
 class StateTable:
-    """A machine: its transitions in order. The first one's source is the initial state, unless `initial` says another.
+    """A state machine: its transitions in order. The first one's source is the initial state, unless `initial` names
+    another.
 
     Raises `Bug` for a state that cannot be reached, or a name that no transition has.
     """
@@ -59,7 +61,7 @@ class StateTable:
     transitions: tuple[Transition, ...]
     initial: str = ""
     states: tuple[str, ...] = field(default=())
-    """In the order of their codes 0, 1, 2..."""
+    """The states in the order of their codes 0, 1, 2 and so on."""
 
     def __init__(self, *transitions: Transition, initial: str = "", states: tuple[str, ...] = ()) -> None:
         named = [s for t in transitions for s in (t.source, t.target) if s != ANY]
@@ -86,7 +88,7 @@ class StateTable:
             raise Bug("states that cannot be reached", got=", ".join(lost))
 
     def leaving(self, state: str) -> list[Transition]:
-        """The transitions that may be taken in `state`, in order."""
+        """Return the transitions that may be taken in `state`, in order."""
         return [t for t in self.transitions if t.source == state or (t.source == ANY and t.target != state)]
 
     def code(self, state: str) -> int:
@@ -99,9 +101,10 @@ class StateTable:
 
 
 class StateMachine(Program):
-    """Base of programs that are a `StateTable`. `state` is the state's code; ``during_<STATE>`` is called in each scan in it.
+    """Base of programs that are a `StateTable`. `state` is the state's code; ``during_<STATE>`` is called in each scan
+    in that state.
 
-    Guards see the program's variables by name, and ``in_state_ms``.
+    Guards can use the program's variables by name, and ``in_state_ms``.
     """
 
     table: ClassVar[StateTable]
@@ -129,7 +132,7 @@ class StateMachine(Program):
         self.since_ns: int | None = None
         """When the state was entered; None before the first scan."""
         self.in_state_ms = 0.0
-        """How long ago that was, as the last scan knew it."""
+        """How long ago the state was entered, as of the last scan."""
 
     @property
     def state_name(self) -> str:

@@ -1,7 +1,8 @@
-"""The process image as people see it: each tag with value, quality, source time, age, unit, limits, force, and what programs see.
+"""The process image as users see it: each tag with value, quality, source time, age, unit, limits, force, and what
+programs see.
 
-Read between scans, from the image itself, so that what is shown is what the gateway gets. It must never know how it is asked
-for, nor change anything.
+It is read between scans, from the image itself, so that it shows what the gateway gets. This module must not know how
+requests arrive, and must not change anything.
 """
 
 from __future__ import annotations
@@ -18,11 +19,12 @@ from fieldtwin.plc.forces import Force
 from fieldtwin.plc.runner import Runner
 
 MAX_AT_ONCE = 64
-"""Tags in one answer: what is asked between two scans must not make the next one late. Some 1 ms with its encoding."""
+"""How many tags one answer may have: a request between two scans must not delay the next one. It takes some 1 ms,
+including the encoding."""
 
 
 def matches(tag: str, pattern: str) -> bool:
-    """``ctd.pressure``, ``ctd.*``, ``*.state``, or ``ctd`` for all that is its."""
+    """Match ``ctd.pressure``, ``ctd.*``, ``*.state``, or ``ctd`` for all tags of that device or program."""
     return fnmatchcase(tag, pattern) or tag.startswith(f"{pattern}.")
 
 
@@ -35,14 +37,15 @@ class TagView:
         self._specs = {region.name: {tag.name: tag for tag in region.tags} for region in image.layout.regions}
 
     def names(self) -> list[str]:
-        """Every tag once, inputs first."""
+        """Return every tag once, inputs first."""
         return list(self._specs[INPUTS] | self._specs[OUTPUTS])
 
     def describe(self, names: Sequence[str], now_ns: int, utc_ns: int) -> list[dict[str, Any]]:
-        """JSON-able, in the order of `names`; a tag of both regions gives two, the input first. Raises `UsageError` for more
-        than `MAX_AT_ONCE`, or one that there is not.
+        """Return the tags as data for JSON, in the order of `names`; a tag of both regions gives two entries, the input
+        first.
 
-        `now_ns` is monotonic, the tags' clock, and `utc_ns` the same instant.
+        Raises `UsageError` for more than `MAX_AT_ONCE` tags, or for an unknown one. `now_ns` is monotonic, the tags'
+        clock, and `utc_ns` the same instant.
         """
         if len(names) > MAX_AT_ONCE:
             raise UsageError("too many tags at once", expected=f"at most {MAX_AT_ONCE}", got=str(len(names)))

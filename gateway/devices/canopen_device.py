@@ -310,7 +310,7 @@ class CanopenDriver(DeviceDriver):
         assert tag.object is not None
         return (*tag.object, BITS[tag.type])
 
-    # -- what the node sends --------------------------------------------------------------------------------------------
+    # -- received messages ----------------------------------------------------------------------------------------------
 
     def _on_pdo(self, seen: TpdoSeen, data: bytes, t_ns: int) -> None:
         seen.frames += 1
@@ -360,7 +360,7 @@ class CanopenDriver(DeviceDriver):
         if event.kind in ("boot-up", "heartbeat-lost"):
             self._listen([])
 
-    # -- what the node is sent -----------------------------------------------------------------------------------------
+    # -- sent messages -------------------------------------------------------------------------------------------------
 
     def rpdo_of(self, tag_name: str) -> Rpdo | None:
         """Return the RPDO by which this tag is commanded; None if it goes by SDO."""

@@ -174,7 +174,7 @@ class CanopenBus:
             self.config, self._coming = coming.bus, None
             coming.done.set()
 
-    # -- what others see ----------------------------------------------------------------------------------------------
+    # -- status and requests ------------------------------------------------------------------------------------------
 
     @property
     def not_produced(self) -> int:

@@ -133,7 +133,7 @@ class ModbusBus:
         self._past: Counter[str] = Counter()
         self._client: ModbusClient | None = None
 
-    # -- what others see ----------------------------------------------------------------------------------------------
+    # -- status and requests ------------------------------------------------------------------------------------------
 
     def online(self, driver: RegisterDriver) -> bool:
         """Return whether the device answers and is the expected one."""

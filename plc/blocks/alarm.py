@@ -2,9 +2,10 @@
 
     LL  alarm     L  warning          H  warning     HH  alarm
 
-A limit is violated when X is beyond it, and no longer so when X is back by more than HYS. A violation that lasts DELAY
-raises its condition; one that ends earlier was none. A raised condition stays *unacknowledged* until ACK rises, also after
-the value came back; acknowledged and back is gone. A value that is not a number changes nothing.
+A limit is violated when X is beyond it, and no longer violated when X is back by more than HYS. A violation that lasts
+DELAY raises its condition; a shorter violation raises none. A raised condition stays *unacknowledged* until ACK rises,
+also after the value came back. It ends when it is acknowledged and the value is back. A value that is not a number
+changes nothing.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from fieldtwin.plc.blocks.block import FunctionBlock
 
 
 class _Limit:
-    """One limit's state: `sign` +1 for a high one, -1 for a low one."""
+    """One limit's state: `sign` +1 for a high limit, -1 for a low one."""
 
     __slots__ = ("_since_ns", "active", "sign", "unacknowledged", "violated")
 
@@ -23,7 +24,8 @@ class _Limit:
         self.sign = sign
         self.violated = self.active = self.unacknowledged = False
         self._since_ns: int | None = None
-        """Since when it is violated; None also after a restart that kept the rest: then the delay counts anew."""
+        """Since when it is violated. None also after a restart that kept the other state: then the delay starts
+        anew."""
 
     def watch(self, x: float, limit: float, hysteresis: float, delay_ns: int, now_ns: int) -> None:
         beyond = (x - limit) * self.sign
@@ -40,7 +42,8 @@ class _Limit:
 
 
 class ALARM(FunctionBlock):
-    """See the module. QLL, QL, QH, QHH: the condition is there. UNACK: one was not acknowledged. Q: alarm, WARN: warning."""
+    """See the module. QLL, QL, QH, QHH: the condition is raised. UNACK: a condition was not acknowledged. Q: alarm,
+    WARN: warning."""
 
     __slots__ = (
         "ACK", "DELAY", "H", "HH", "HYS", "L", "LL", "Q", "QH", "QHH", "QL", "QLL", "UNACK", "WARN", "X",

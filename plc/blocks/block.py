@@ -1,11 +1,11 @@
-"""What all function blocks share: instances that keep their state between calls, and the declaration that ST reads.
+"""The base of all function blocks: instances that keep their state between calls, and the declaration that ST reads.
 
-A block is called once a scan, with the scan's frozen time, in either of two ways:
+A block is called once per scan, with the scan's frozen time, in one of two ways:
 
     delay(scan.now_ns, IN=level_high, PT=2 * SECOND).Q      from Python, all inputs named and typed
-    delay.IN = ...; delay.execute(now_ns); ... delay.Q       what a compiled ST call does: inputs left out keep their value
+    delay.IN = ...; delay.execute(now_ns); ... delay.Q       as a compiled ST call does: omitted inputs keep their value
 
-Names of inputs and outputs are the standard's (IEC 61131-3). Times are integers in ns. A block must never know a clock, a
+Names of inputs and outputs are the standard's (IEC 61131-3). Times are integers in ns. A block must not know a clock, a
 tag or the program that it is in.
 """
 
@@ -30,10 +30,11 @@ class FunctionBlock(ABC):
 
     @abstractmethod
     def execute(self, now_ns: int) -> None:
-        """One call at `now_ns`: outputs from inputs and from what was before."""
+        """Execute one call at `now_ns`: set the outputs from the inputs and the state."""
 
     def state(self, now_ns: int) -> tuple[Any, ...]:
-        """Return all that the next calls depend on, hashable; moments count from `now_ns`, since only differences matter."""
+        """Return all that the next calls depend on, hashable; times are relative to `now_ns`, because only differences
+        matter."""
         return tuple([_state(name, getattr(self, name), now_ns) for name in _slots(type(self))])
 
 
@@ -47,7 +48,7 @@ def _state(name: str, value: Any, now_ns: int) -> Any:
     if isinstance(value, list):
         return tuple([_state(name, each, now_ns) for each in value])
     if isinstance(value, float):
-        return repr(value)  # so that 0.0, -0.0 and NaN are what they are
+        return repr(value)  # so that 0.0, -0.0 and NaN stay distinct
     if hasattr(value, "__slots__"):
         return tuple([_state(slot, getattr(value, slot), now_ns) for slot in _slots(type(value))])
     return value

@@ -1,6 +1,7 @@
-"""Counters: CTU, CTD, CTUD (IEC 61131-3, 6.6.3.5.4), on INT; the same with suffix for the other types of the standard.
+"""Counters: CTU, CTD, CTUD (IEC 61131-3, 6.6.3.5.4), on INT; the same with a suffix for the other types of the
+standard.
 
-CU and CD count rising edges. A counter stops at the limits of its type, it never wraps.
+CU and CD count rising edges. A counter stops at the limits of its type; it never wraps.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from fieldtwin.plc.blocks.block import FunctionBlock
 
 
 class CTU(FunctionBlock):
-    """Up counter: CV counts rises of CU, R sets it to 0 and wins; Q while CV has reached PV."""
+    """Up counter: CV counts rises of CU; R sets it to 0 and takes precedence; Q while CV has reached PV."""
 
     __slots__ = ("CU", "CV", "PV", "Q", "R", "_before")
     inputs = {"CU": "BOOL", "R": "BOOL", "PV": "INT"}
@@ -37,7 +38,7 @@ class CTU(FunctionBlock):
 
 
 class CTD(FunctionBlock):
-    """Down counter: CV counts rises of CD downwards, LD sets it to PV and wins; Q while CV is 0 or less."""
+    """Down counter: CV counts rises of CD downwards; LD sets it to PV and takes precedence; Q while CV is 0 or less."""
 
     __slots__ = ("CD", "CV", "LD", "PV", "Q", "_before")
     inputs = {"CD": "BOOL", "LD": "BOOL", "PV": "INT"}
@@ -63,7 +64,7 @@ class CTD(FunctionBlock):
 
 
 class CTUD(FunctionBlock):
-    """Both: R wins over LD, LD over counting; rises of CU and CD in one call cancel out."""
+    """Up-down counter: R takes precedence over LD, and LD over counting; rises of CU and CD in one call cancel out."""
 
     __slots__ = ("CD", "CU", "CV", "LD", "PV", "QD", "QU", "R", "_down", "_up")
     inputs = {"CU": "BOOL", "CD": "BOOL", "R": "BOOL", "LD": "BOOL", "PV": "INT"}
@@ -119,4 +120,4 @@ def _of(block: type[FunctionBlock], iec_type: str) -> type[FunctionBlock]:
 VARIANTS: dict[str, type[FunctionBlock]] = {
     f"{block.__name__}_{iec_type}": _of(block, iec_type) for block in (CTU, CTD, CTUD) for iec_type in _OTHER_TYPES
 }
-"""CTU_DINT and so on, by name (the standard's Table 45 lists which there are)."""
+"""CTU_DINT and so on, by name (the standard's Table 45 lists them)."""

@@ -6,7 +6,7 @@ from fieldtwin.plc.blocks.block import FunctionBlock
 
 
 class R_TRIG(FunctionBlock):
-    """Rising edge: Q is true in the one call in which CLK became true, also in the first call of all."""
+    """Rising edge: Q is true in the one call in which CLK became true, also if that is the first call."""
 
     __slots__ = ("CLK", "Q", "_before")
     inputs = {"CLK": "BOOL"}
@@ -26,7 +26,7 @@ class R_TRIG(FunctionBlock):
 
 
 class F_TRIG(FunctionBlock):
-    """Falling edge: Q is true in the one call in which CLK became false, and in the first call if it is false there."""
+    """Falling edge: Q is true in the one call in which CLK became false, and in the first call if CLK is false then."""
 
     __slots__ = ("CLK", "Q", "_before")
     inputs = {"CLK": "BOOL"}

@@ -1,9 +1,9 @@
 """Timers: TON, TOF, TP (IEC 61131-3, 6.6.3.5.5 with its timing diagrams).
 
 Time is the scan's, so an edge counts from the scan that saw it, and an output changes in the first scan at or after its
-time. ET never exceeds PT. What the standard leaves open: a PT that changes while the timer runs counts from the same
-start; one that changes after the timer ran out changes nothing until the next start; a negative PT is 0; a rise of TP's
-IN in the very scan that ends the pulse is none.
+time. ET never exceeds PT. Where the standard does not define the behaviour: a PT that changes while the timer runs
+counts from the same start; a PT that changes after the timer expired has no effect until the next start; a negative PT
+is 0; a rise of TP's IN in the same scan that ends the pulse does not start a new one.
 """
 
 from __future__ import annotations
@@ -22,11 +22,12 @@ class _Timer(FunctionBlock):
     _since_ns: int | None
 
     def _runs(self) -> bool:
-        """Whether the moment at which the timer started still matters."""
+        """Return whether the time at which the timer started still matters."""
         raise NotImplementedError
 
     def state(self, now_ns: int) -> tuple[Any, ...]:
-        """As for every block, without the start of a timer that has run out: two of those behave the same."""
+        """Return the state as for every block, without the start time of an expired timer: two expired timers behave
+        the same."""
         since_ns = self._since_ns if self._runs() else None
         phase_ns = None if since_ns is None else now_ns - since_ns
         return self.IN, self.Q, self.PT, self.ET, phase_ns

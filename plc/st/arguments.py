@@ -1,7 +1,7 @@
-"""The arguments of a call by the parameters that they are for (IEC 61131-3, 6.6.1.4): standard functions, functions, blocks.
+"""Assigns the arguments of a call to parameters (IEC 61131-3, 6.6.1.4), for standard functions, functions and blocks.
 
-Positional arguments come first and take the parameters in their order. Named arguments follow in any order. Each parameter
-is given at most once. Pure.
+Positional arguments come first and take the parameters in their order. Named arguments follow in any order. Each
+parameter is given at most once. Pure.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from fieldtwin.plc.st import tree as t
 from fieldtwin.plc.st.scope import Environment
 
 MAX_REPEATED = 1000
-"""Inputs of an extensible function such as ADD or MUX."""
+"""The most inputs of an extensible function such as ADD or MUX."""
 
 
 @dataclass(frozen=True, slots=True)
 class Formals:
     """The parameter names of a standard function.
 
-    `names` come first, and the last `optional` of them may be left out. An extensible function goes on with `repeats` and
-    a number from `first` on (IN1, IN2, ...): at least `least` of them.
+    `names` come first, and the last `optional` of them may be left out. An extensible function continues with `repeats`
+    and a number from `first` on (IN1, IN2, ...): at least `least` of them.
     """
 
     names: tuple[str, ...] = ()
@@ -32,26 +32,30 @@ class Formals:
     least: int = 0
 
     def all_names(self, count: int) -> list[str]:
-        """The names of a call with `count` arguments."""
+        """Return the names of a call with `count` arguments."""
         repeated = max(self.least, min(count - len(self.names), MAX_REPEATED)) if self.repeats else 0
         return [*self.names, *(f"{self.repeats}{self.first + n}" for n in range(repeated))]
 
     def place(self, argument: t.Argument) -> int:
-        """Which parameter, counted from 1, a named argument of an extensible function asks for; 0 for any other."""
+        """Return the number, from 1, of the parameter that a named argument of an extensible function gives; 0 for any
+        other."""
         digits = argument.name[len(self.repeats) :]
         known = self.repeats and argument.name.upper().startswith(self.repeats) and re.fullmatch("[0-9]{1,4}", digits)
         return len(self.names) + int(digits) - self.first + 1 if known else 0
 
     def describe(self) -> str:
-        """The parameters as a message shows them: ``MN, IN, MX`` or ``IN1, IN2, ...``."""
+        """Return the parameters as a message shows them: ``MN, IN, MX`` or ``IN1, IN2, ...``."""
         more = ", ..." if self.repeats else ""
         return ", ".join(self.all_names(0)) + more or "none"
 
 
 def bind(env: Environment, call: t.Call, names: Sequence[str], of: str) -> dict[str, t.Argument]:
-    """The input arguments of `call` by parameter in lower case. `names` are the parameters in their order, `of` is what is
-    called. Raises `FileInvalid` for an unknown name, a parameter that is given twice, too many arguments, and a positional
-    argument after a named one."""
+    """Return the input arguments of `call` by parameter in lower case. `names` are the parameters in their order, `of`
+    is the name of what is called.
+
+    Raises `FileInvalid` for an unknown name, a parameter that is given twice, too many arguments, and a positional
+    argument after a named one.
+    """
     order = [name.lower() for name in names]
     found: dict[str, t.Argument] = {}
     named = False
@@ -79,7 +83,8 @@ def bind(env: Environment, call: t.Call, names: Sequence[str], of: str) -> dict[
 
 
 def in_order(env: Environment, call: t.Call, formals: Formals) -> list[t.Expr]:
-    """The arguments of a standard function in the order of its parameters. Raises `FileInvalid` also for a missing one."""
+    """Return the arguments of a standard function in the order of its parameters. Also raises `FileInvalid` for a
+    missing one."""
     of = call.ref.name.upper()
     for argument in call.arguments:
         if argument.target is not None:

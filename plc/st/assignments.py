@@ -1,7 +1,7 @@
-"""Which line of a PROGRAM assigned an output last: a pass over the Python that Structured Text was compiled to.
+"""Records which line of a PROGRAM last assigned an output: a pass over the Python that Structured Text was compiled to.
 
-After each assignment of an output (a statement, an output of a block or function, a VAR_IN_OUT) it inserts one that keeps the
-line's number. That costs one constant an assignment, and nothing where no output is assigned.
+After each assignment of an output (a statement, an output of a block or function, a VAR_IN_OUT) it inserts an
+assignment of the line's number. That costs one constant per assignment, and nothing if no output is assigned.
 """
 
 from __future__ import annotations
@@ -12,12 +12,13 @@ _PREFIX = "line_"
 
 
 def line_of(attribute: str) -> str:
-    """The attribute that keeps the line of the last assignment of `attribute`."""
+    """Return the attribute that keeps the line of the last assignment of `attribute`."""
     return f"{_PREFIX}{attribute}"
 
 
 def is_line(attribute: str) -> bool:
-    """Whether an attribute keeps a line. Lines are no state of a program: the next scan does not depend on them."""
+    """Return whether an attribute keeps a line. Lines are not part of a program's state: the next scan does not depend
+    on them."""
     return attribute.startswith(_PREFIX)
 
 

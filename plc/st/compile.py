@@ -1,8 +1,8 @@
-"""A unit of Structured Text to Python, once: classes for structures and function blocks, functions, a class a PROGRAM.
+"""Compiles a unit of Structured Text to Python, once: classes for structures and function blocks, functions, and a
+class for each PROGRAM.
 
-The Python's lines carry the line numbers of the source, so that whatever goes wrong in a scan names the line that an
-engineer wrote. What is compiled is code without state: each `fieldtwin.plc.st.resource.Resource` runs it in a namespace of its
-own.
+The Python code carries the line numbers of the source, so that an error in a scan names the line that the user wrote.
+The compiled code has no state: each `fieldtwin.plc.st.resource.Resource` runs it in a separate namespace.
 """
 
 from __future__ import annotations
@@ -23,13 +23,14 @@ from fieldtwin.plc.st.scope import Environment, Parameter, Signature, Symbol, Wr
 from fieldtwin.plc.st.statements import Statements
 
 MAX_CALLS = 64
-"""POUs that call each other in a row."""
+"""The longest chain of POUs that call each other."""
 _API = frozenset(name for name in vars(Program) if not name.startswith("__")) | {"execute"}
 
 
 @dataclass(frozen=True, slots=True)
 class ProgramVariable:
-    """A variable of a PROGRAM as tags see it. `role`: input, output or local; `kind` its type; `retain`: kept over restarts."""
+    """A variable of a PROGRAM as tags see it. `role`: input, output or local; `kind` its type; `retain`: kept over
+    restarts."""
 
     name: str
     role: str
@@ -45,7 +46,8 @@ class CompiledProgram:
 
 @dataclass(frozen=True, slots=True)
 class CompiledUnit:
-    """`code` defines everything when it is executed with ``_v``, ``_c`` and ``_blocks``; `python` is its text, for reading."""
+    """A compiled unit. `code` defines everything when it is executed with ``_v``, ``_c`` and ``_blocks``; `python` is
+    its text, for reading."""
 
     path: str
     code: CodeType
@@ -54,7 +56,7 @@ class CompiledUnit:
 
 
 def compile_text(text: str, path: str = "") -> CompiledUnit:
-    """Raises `FileInvalid` with line and column for whatever is wrong."""
+    """Compile a text. Raises `FileInvalid` with line and column for any error."""
     return compile_unit(parse(text, path), path)
 
 
@@ -128,7 +130,7 @@ class _Unit:
     # -- variables --------------------------------------------------------------------------------------------------------
 
     def _declare_global_constants(self) -> None:
-        """Those with a value that is known at once: types may name them in their limits."""
+        """Declare the constants whose value is known at once, because types may use them in their limits."""
         for block in self.unit.globals:
             for v in block.variables if "CONSTANT" in block.qualifiers else ():
                 if isinstance(v.type, t.NamedType) and v.type.name.upper() in ty.ELEMENTARY:
@@ -151,7 +153,7 @@ class _Unit:
             self.declarations.bounded(first, (symbol.type for symbol in self.env.globals.values()))
 
     def _write_globals(self) -> None:
-        """Behind everything that they may be made of, and before any program is made."""
+        """Write the global variables after all code that they may need, and before any program is created."""
         self.out.line("class _Globals: pass")
         self.out.line("_G = _Globals()")
         for block in self.unit.globals:
@@ -178,7 +180,7 @@ class _Unit:
         return self.declarations.constant(v, code) or Symbol(v.name, kind, code, writable=False)
 
     def _symbols(self, pou: t.Pou, prefix: str) -> dict[str, Symbol]:
-        """All variables of a POU. `prefix`: where they are kept; VAR_TEMP is always local to a call."""
+        """Return all variables of a POU. `prefix`: where they are kept; VAR_TEMP is always local to a call."""
         symbols: dict[str, Symbol] = {}
         for block in pou.blocks:
             if pou.kind != "PROGRAM":
@@ -308,7 +310,7 @@ class _Unit:
         return CompiledProgram(pou.name, tuple(variables))
 
     def _initialise_program(self, pou: t.Pou, symbols: dict[str, Symbol]) -> None:
-        """Messages are handed in from outside, all else begins with its initial value."""
+        """Initialise all variables with their initial values; messages are passed in from outside."""
         for block in pou.blocks:
             if block.kind in ("VAR", "VAR_INPUT", "VAR_OUTPUT"):
                 for v in block.variables:
@@ -336,7 +338,7 @@ class _Unit:
                 self.env.calls.setdefault(pou.name.lower(), {}).setdefault(kind.name.lower(), v.pos)
 
     def _refuse_recursion(self) -> None:
-        """IEC 61131-3, 6.6.1.5: a POU never calls itself, nor through others."""
+        """Refuse a POU that calls itself, directly or through others (IEC 61131-3, 6.6.1.5)."""
 
         def walk(name: str, path: tuple[str, ...]) -> None:
             if len(path) > MAX_CALLS:

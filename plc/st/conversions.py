@@ -1,8 +1,9 @@
 """Type conversions by name: INT_TO_REAL, TO_DINT, TRUNC, REAL_TRUNC_INT... (IEC 61131-3, 6.6.2.5.2).
 
-Real to integer rounds to the nearest, ties to even; TRUNC cuts, and gives a DINT (REAL_TRUNC_LINT and its like give other
-types). A number that the target cannot hold is an error at run time, but from one integer or bit string type to another only
-the bits that fit are kept, as the standard says. TIME counts ms as a number, LTIME ns.
+A conversion from real to integer rounds to the nearest, ties to even; TRUNC truncates, and gives a DINT
+(REAL_TRUNC_LINT and similar functions give other types). A number that the target cannot hold is an error at run time.
+But from one integer or bit string type to another only the bits that fit are kept, as the standard requires. As a
+number, TIME counts ms, and LTIME ns.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ _DIGITS = {32: 7, 64: 15}
 
 
 def conversion(name: str) -> Write | None:
-    """The conversion of that name (in capitals), None if there is none."""
+    """Return the conversion of that name (in capitals), or None."""
     if name == "TRUNC":
         return lambda x, call, given: _convert(x, call, given[0], None, ty.DINT, cut=True)
     if "BCD_" in name and (found := _BCD.get(name)) is not None:
@@ -117,7 +118,7 @@ def _of_real(code: str, target: ty.Elementary, cut: bool) -> str | None:
 
 
 def _unit(kind: ty.Elementary) -> int:
-    """What a duration counts as a number, in ns."""
+    """Return the unit, in ns, in which a duration is converted to a number."""
     return 1 if kind.name == "LTIME" else 1_000_000
 
 

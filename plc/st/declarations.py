@@ -14,12 +14,12 @@ from fieldtwin.plc.st.expressions import Expressions
 from fieldtwin.plc.st.scope import Environment, Symbol, Writer
 
 MAX_REPEATED = 100
-"""Characters of Python that are written out wherever they are needed."""
+"""The longest Python expression, in characters, that is repeated wherever it is needed."""
 _STANDARD = ty.standard_blocks(BLOCKS)
 
 
 class Declarations:
-    """The types of a unit, each resolved when it is first asked for, in whatever order they are declared."""
+    """The types of a unit, each resolved when it is first needed, in whatever order they are declared."""
 
     def __init__(self, env: Environment, unit: t.Unit, out: Writer) -> None:
         self.env = env
@@ -40,13 +40,13 @@ class Declarations:
                 self._declare_enum(declared)
 
     def resolve(self) -> None:
-        """Work out all types: once the global constants are known, which their limits may name."""
+        """Resolve all types, after the global constants are known, because limits may use them."""
         for declared in self._unit.types:
             self.named(declared.name, declared.pos)
 
     @contextmanager
     def within(self, pou: t.Pou) -> Iterator[None]:
-        """Limits and initial values may name the constants of `pou`."""
+        """Make the constants of `pou` available to limits and initial values."""
         before = self.scope
         self.scope = self._constants.setdefault(pou.name.lower(), {})
         if not self.scope:
@@ -59,7 +59,7 @@ class Declarations:
         self.scope = before
 
     def constant(self, v: t.VarDecl, code: str) -> Symbol | None:
-        """A CONSTANT as what it is worth; None where that is more than an elementary value, or too long to be repeated."""
+        """Return a CONSTANT with its value; None if its value is not elementary, or too long to be repeated."""
         if v.initial is None or isinstance(v.initial, t.InitArray | t.InitStruct):
             return None
         kind = self.type_of(v.type)
@@ -76,7 +76,7 @@ class Declarations:
         return compiler
 
     def shared(self, code: str) -> str:
-        """`code`, or if it is long a call of a function that has it, so that it stands in the program once."""
+        """Return `code`, or, if it is long, a call of a function that contains it, so that it is written only once."""
         if len(code) <= MAX_REPEATED:
             return code
         name = f"_new{len(self.out.lines)}"
@@ -87,7 +87,7 @@ class Declarations:
     # -- types ----------------------------------------------------------------------------------------------------------
 
     def type_of(self, spec: t.TypeSpec, role: str = "") -> ty.Type:
-        """The type that is written; `role` is VAR_INPUT... where MESSAGES may stand."""
+        """Return the type of a type specification; `role` is VAR_INPUT and so on where MESSAGES is allowed."""
         if isinstance(spec, t.NamedType):
             return self.named(spec.name, spec.pos)
         if isinstance(spec, t.ArrayType):
@@ -117,7 +117,8 @@ class Declarations:
         return made
 
     def bounded(self, pos: t.Pos, kinds: Iterable[ty.Type]) -> tuple[int, int]:
-        """What variables of these types take, and how deep they are nested. Raises `FileInvalid` for too much."""
+        """Return the size of variables of these types, and how deep they are nested. Raises `FileInvalid` beyond the
+        limits."""
         found = list(kinds)
         total, nested = sum(map(ty.elements, found)), max(map(ty.nested, found), default=0)
         if total > ty.MAX_ELEMENTS:
@@ -221,7 +222,7 @@ class Declarations:
         with self.within(pou):
             for block in pou.blocks:
                 for v in block.variables if block.kind in (*members, "VAR") else ():
-                    kind = self.type_of(v.type)  # finds a block that holds itself, too
+                    kind = self.type_of(v.type)  # also finds a block that contains itself
                     if block.kind != "VAR_IN_OUT":
                         held.append(kind)
                     if block.kind in members:
@@ -236,7 +237,7 @@ class Declarations:
     # -- initial values -------------------------------------------------------------------------------------------------
 
     def initial(self, kind: ty.Type, init: t.Init | None, spec: t.TypeSpec | None = None) -> str:
-        """Python expression of a new variable's value."""
+        """Return the Python expression of a new variable's value."""
         if init is None:
             named = spec.name.lower() if isinstance(spec, t.NamedType) else ""
             return self.env.type_initials.get(named) or self._default(kind)

@@ -1,4 +1,4 @@
-"""What literals mean: value and type. Raises `Malformed` with the reason; whoever knows the place says where."""
+"""The meaning of literals: value and type. Raises `Malformed` with the reason; the caller adds the position."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _ESCAPES = {"$": "$", "'": "'", '"': '"', "L": "\n", "N": "\n", "P": "\f", "R": 
 
 
 class Malformed(ValueError):
-    """A literal that means nothing."""
+    """A literal without a valid meaning."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +33,7 @@ class Constant:
 
 
 def constant(literal: Literal) -> Constant:
-    """The value and type of any literal but an enumerated one. Raises `Malformed`."""
+    """Return the value and type of any literal except an enumerated one. Raises `Malformed`."""
     try:
         found = _constant(literal.kind, literal.text)
     except Malformed:

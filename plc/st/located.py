@@ -1,7 +1,8 @@
-"""Directly represented variables of a PROGRAM (IEC 61131-3, 6.5.5: ``VAR lamp AT %QX0.0 : BOOL;``) as inputs and outputs.
+"""Directly represented variables of a PROGRAM (IEC 61131-3, 6.5.5: ``VAR lamp AT %QX0.0 : BOOL;``) as inputs and
+outputs.
 
-OpenPLC and others bind a program to its hardware by addresses; here the system file binds it, by name. So what stands at %I is
-an input, at %Q an output, at %M a variable like others, and the rest of the address says nothing.
+OpenPLC and other systems bind a program to its hardware by addresses; here the system file binds it, by name. So a
+variable at %I is an input, at %Q an output, at %M an ordinary variable; the rest of the address is ignored.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ _KINDS = {"I": "VAR_INPUT", "Q": "VAR_OUTPUT", "M": "VAR"}
 
 
 def without_addresses(unit: t.Unit) -> t.Unit:
-    """`unit` with the located variables of its programs in the blocks where they belong, in their order."""
+    """Return `unit` with the located variables of its programs in the blocks where they belong, in their order."""
     return replace(unit, pous=tuple(_program(pou) if pou.kind == "PROGRAM" else pou for pou in unit.pous))
 
 

@@ -1,4 +1,4 @@
-"""Structured Text to tree, by lark (LALR). An error says line, column, and what could have stood there."""
+"""Structured Text to a tree, with lark (LALR). An error has line, column, and the tokens that were expected."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from fieldtwin.plc.st import tree as t
 from fieldtwin.plc.st.source import MAX_NAME, blanked, shortened
 
 MAX_EXPECTED = 8
-"""How many of the tokens that could have stood somewhere an error names."""
+"""How many of the expected tokens an error names."""
 
 _READABLE = {
     "NAME": "a name", "CASE_NAME": "a name", "INTEGER": "a number", "REAL": "a number", "BASED": "a number", "TYPED": "a number",
@@ -31,7 +31,7 @@ _READABLE = {
 
 
 def parse(text: str, path: str = "") -> t.Unit:
-    """The tree of `text`. Raises `FileInvalid` with line and column."""
+    """Return the tree of `text`. Raises `FileInvalid` with line and column."""
     text = blanked(text, path)
     try:
         return _Build().transform(_parser().parse(text))  # type: ignore[no-any-return]
@@ -50,7 +50,7 @@ def _parser() -> Lark:
 
 
 class _Bad(Exception):
-    """A token that is well formed and means nothing."""
+    """A token that is well formed but has no valid meaning."""
 
     def __init__(self, token: Token, message: str) -> None:
         super().__init__(message)
@@ -98,7 +98,8 @@ def _pos(where: Meta | Token) -> t.Pos:
 
 @v_args(meta=True)
 class _Build(Transformer_NonRecursive[Token, Any]):
-    """Bottom up: children are nodes already, tokens still tokens. Not recursive: nothing is nested too deep for it."""
+    """Builds the tree bottom up: children are nodes already, tokens are still tokens. It is not recursive, so it has no
+    limit of nesting."""
 
     def NAME(self, token: Token) -> Token:
         if len(token) > MAX_NAME:
@@ -114,7 +115,7 @@ class _Build(Transformer_NonRecursive[Token, Any]):
         )
 
     def configuration(self, meta: Meta, items: list[Any]) -> tuple[t.VarBlock, ...]:
-        """Its globals, and those of its resources."""
+        """Return the globals of a configuration, and those of its resources."""
         return tuple(b for i in items for b in (i if isinstance(i, tuple) else (i,)) if isinstance(b, t.VarBlock))
 
     resource = configuration
@@ -341,7 +342,8 @@ def _initial(items: list[Any]) -> t.Init | None:
 
 
 def _integer(token: Token) -> int:
-    """The value of an integer literal: underscores, ``16#``, ``8#``, ``2#``, with or without a type before it."""
+    """Return the value of an integer literal: underscores, ``16#``, ``8#``, ``2#``, with or without a type before
+    it."""
     *_, base, digits = ["10", *token.replace("_", "").split("#")]
     try:
         return int(digits, int(base))

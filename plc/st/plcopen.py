@@ -1,8 +1,8 @@
-"""PLCopen XML (TC6, version 2.01, what CODESYS, OpenPLC and Beremiz export) to Structured Text, line for line.
+"""PLCopen XML (TC6, version 2.01, as CODESYS, OpenPLC and Beremiz export it) to Structured Text, line for line.
 
-The text that comes out says on each line what stands on that line of the XML, so that every later error names a line of
-the file that the engineer has. Bodies in other languages than ST are refused by name; drawings, task configurations and
-vendors' additions are left out. Document types are refused, and with them every trick with entities.
+Each line of the resulting text holds the content of the same line of the XML, so that every later error names a line of
+the user's file. Bodies in languages other than ST are refused with their language; drawings, task configurations and
+vendors' additions are ignored. Document types are refused, which excludes all attacks with entities.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _QUALIFIED = re.compile(
     r"""\(\*.*?\*\)|//[^\n]*|'(?:\$.|[^'$])*'|"(?:\$.|[^"$])*"|(?<![\w.\#])(?P<name>[A-Za-z_]\w*)\.(?=[A-Za-z_])""",
     re.DOTALL,
 )
-"""A name before a dot; comments and texts are passed over."""
+"""A name before a dot; comments and strings are skipped."""
 _POUS = {"program": "PROGRAM", "function": "FUNCTION", "functionBlock": "FUNCTION_BLOCK"}
 
 
@@ -34,7 +34,7 @@ class _Element:
     line: int
     children: list[_Element] = field(default_factory=list)
     text: list[tuple[int, str]] = field(default_factory=list)
-    """Pieces of text with the line that each begins on."""
+    """Pieces of text with the line on which each begins."""
     end_line: int = 0
 
     def find(self, tag: str) -> _Element | None:
@@ -52,7 +52,7 @@ def is_plcopen(text: str) -> bool:
 
 
 def to_st(text: str, path: str = "") -> str:
-    """The ST of an export. Raises `FileInvalid`."""
+    """Return the ST of an export. Raises `FileInvalid`."""
     return _Converter(_parsed(text, path), path, text.count("\n") + 1).text()
 
 
@@ -102,8 +102,8 @@ class _Converter:
         self.last = 1
         enums = [d for d in project.every("dataType") if any(b.find("enum") for b in d.children if b.tag == "baseType")]
         self.qualifiers = {d.attributes.get("name", "").lower(): "#" for d in enums}
-        """What may stand before a dot as CODESYS writes it, and what the standard has for that dot: an enumeration's ``#``, and
-        nothing for a list of globals."""
+        """The names that CODESYS writes before a dot, and what the standard has instead of the dot: ``#`` for an
+        enumeration, and nothing for a list of globals."""
         self.qualifiers |= {
             g.attributes["name"].lower(): "" for g in project.every("globalVars") if "name" in g.attributes
         }
@@ -118,7 +118,7 @@ class _Converter:
         return "\n".join(" ".join(pieces) for pieces in self.lines[1:])
 
     def _put(self, line: int, text: str) -> None:
-        """Write `text` on `line`, or on a later one if something that must stand before it is there."""
+        """Write `text` on `line`, or on a later line if earlier text has already reached one."""
         self.last = max(self.last, line)
         self.lines[min(self.last, len(self.lines) - 1)].append(text)
 
@@ -134,7 +134,7 @@ class _Converter:
     # -- declarations -----------------------------------------------------------------------------------------------------
 
     def _data_type(self, element: _Element) -> None:
-        self.last = element.line  # types, POUs and globals may stand in any order: each begins anew
+        self.last = element.line  # types, POUs and globals may be in any order, so each starts anew
         base = element.find("baseType")
         if base is None or not base.children:
             raise self._fail(element, "a data type without a base", expected="<baseType>")
@@ -258,7 +258,8 @@ class _Converter:
                     self._put(line + offset, piece)
 
     def _unqualified(self, text: str, own: set[str]) -> str:
-        """``Mode.Idle`` as ``Mode#Idle``, ``GVL.x`` as ``x``; nothing moves, so that errors name the right column."""
+        """Write ``Mode.Idle`` as ``Mode#Idle``, ``GVL.x`` as ``x``; columns stay the same, so that errors name the
+        right column."""
 
         def standard(found: re.Match[str]) -> str:
             name = found["name"]
@@ -271,7 +272,7 @@ class _Converter:
 
 
 def _texts(element: _Element) -> Iterator[tuple[int, str]]:
-    if element.text:  # the parser hands text over in pieces, an entity or a line a piece
+    if element.text:  # the parser delivers text in pieces, one for each entity or line
         yield element.text[0][0], "".join(piece for _, piece in element.text)
     for child in element.children:
         yield from _texts(child)

@@ -1,8 +1,9 @@
 """A PROGRAM in Structured Text as a `Program` of the soft PLC.
 
-Variables that can be tags (BOOL, numbers, times, enumerations) are declared under the names of the source; what is local
-and no tag (strings, arrays, structures, blocks) stays inside. An input that never had a value keeps its initial one; IS_GOOD
-tells. Times are tags in ns, enumerations their numbers, ULINT and LWORD their two's complement.
+Variables that can be tags (BOOL, numbers, times, enumerations) are declared under the names of the source; locals that
+cannot be tags (strings, arrays, structures, blocks) stay inside. An input that never had a value keeps its initial
+value; IS_GOOD shows this. Times are tags in ns, enumerations are tags with their numbers, and ULINT and LWORD are tags
+with their two's complement.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from fieldtwin.plc.st.plcopen import is_plcopen, to_st
 from fieldtwin.plc.st.resource import Resource, Together, state_of
 
 MAX_SOURCE_BYTES = 8 * 1024 * 1024
-"""A source file that is larger is a mistake."""
+"""A larger source file is assumed to be a mistake."""
 _ROLES = {"input": Role.INPUT, "output": Role.OUTPUT, "local": Role.LOCAL}
 
 
@@ -36,7 +37,7 @@ class StProgram(Program):
     st_declared: CompiledProgram
 
     def __init__(self, together: Together | None = None) -> None:
-        """`together` holds what the programs of one PLC share: those of one file have their global variables in common."""
+        """`together` holds what the programs of one PLC share: those of one file have the same global variables."""
         self.st_resource = Resource.of(self.st_unit, together)
         self.st_body: Any = self.st_resource.space[f"P_{self.st_declared.name.lower()}"]()
         """The instance of the compiled program, its variables as ``v_<name>`` in lower case."""
@@ -61,7 +62,8 @@ class StProgram(Program):
         self.st_show()
 
     def _whole_state(self, now_ns: int) -> Any:
-        """All that the next scans depend on, hashable: variables, blocks with the phase of their timers, global variables."""
+        """Return all that the next scans depend on, hashable: variables, blocks with the phase of their timers, global
+        variables."""
         resource = self.st_resource
         body = {name: value for name, value in vars(self.st_body).items() if not is_line(name)}
         held = [body, vars(resource.globals)]
@@ -84,7 +86,8 @@ class StProgram(Program):
                 setattr(self.st_body, line_of(_attribute(found)), 0)
 
     def place(self, name: str) -> Place | None:
-        """Of an output that still has its initial value: the line of its declaration."""
+        """Return the line that assigned the output; for an output with its initial value, the line of its
+        declaration."""
         found = self.st_variables.get(name)
         line = getattr(self.st_body, line_of(_attribute(found)), 0) if found is not None else 0
         return Place(self.source_path, line) if line else None
@@ -101,10 +104,10 @@ class StProgram(Program):
         except values.LogicError as e:
             raise UsageError(f"{name} cannot be forced to that", expected=e.expected, got=repr(value)) from e
 
-    # -- what is kept over a restart --------------------------------------------------------------------------------------
+    # -- retained variables -----------------------------------------------------------------------------------------------
 
     def retained(self) -> dict[str, Any]:
-        """Every VAR RETAIN by name, as JSON-able data, also what is no tag."""
+        """Return every VAR RETAIN by name, as data for JSON, including those that are not tags."""
         return {v.name: _dump(getattr(self.st_body, _attribute(v))) for v in self.st_declared.variables if v.retain}
 
     def retain_layout(self) -> Any:
@@ -118,7 +121,7 @@ class StProgram(Program):
         )
 
     def restore(self, kept: dict[str, Any]) -> None:
-        """The inverse: variables that are in `kept` take its values."""
+        """Restore what `retained` returned: variables that are in `kept` take its values."""
         for v in self.st_declared.variables:
             if v.retain and v.name in kept:
                 attribute = _attribute(v)
@@ -127,7 +130,7 @@ class StProgram(Program):
 
 
 class _Input:
-    """An input: how what the image holds becomes what the program computes with."""
+    """An input: how the value in the image is converted to the program's value."""
 
     __slots__ = ("attribute", "convert", "name")
 
@@ -137,7 +140,7 @@ class _Input:
         self.convert = _from_tag(variable.kind)
 
     def taken(self, value: Any) -> Any:
-        """`value` as the program computes with it. Raises `LogicError` for what the variable cannot hold."""
+        """Return `value` as the program uses it. Raises `LogicError` for a value that the variable cannot hold."""
         assert self.convert is not None
         try:
             return self.convert(value)
@@ -146,7 +149,7 @@ class _Input:
 
 
 def program_class(unit: CompiledUnit, name: str = "") -> type[StProgram]:
-    """The class of program `name` of a unit; without a name, of its only one. Raises `FileInvalid`."""
+    """Return the class of program `name` of a unit; without a name, of its only program. Raises `FileInvalid`."""
     names = [p.name for p in unit.programs]
     found = next((p for p in unit.programs if p.name.lower() == name.lower()), None) if name else None
     if not name and len(unit.programs) == 1:
@@ -190,7 +193,7 @@ def load_file(path: Path, name: str = "") -> type[StProgram]:
 
 @lru_cache(maxsize=32)
 def _compiled(text: str, path: str) -> CompiledUnit:
-    """A unit is compiled once: a system's file is read more than once, and several systems run the same program."""
+    """Compile a unit once: a system's file is read more than once, and several systems run the same program."""
     return compile_text(text, path)
 
 
@@ -199,7 +202,7 @@ def _attribute(variable: ProgramVariable) -> str:
 
 
 def _tag_kind(kind: ty.Type) -> TagKind | None:
-    """What a variable of this type is as a tag; None where it is none."""
+    """Return the tag kind for a variable of this type; None if it cannot be a tag."""
     if isinstance(kind, ty.MessagesIn | ty.MessagesOut):
         return TagKind.MESSAGE
     if isinstance(kind, ty.Enum):
@@ -211,7 +214,7 @@ def _tag_kind(kind: ty.Type) -> TagKind | None:
 
 
 def _from_tag(kind: ty.Type) -> Callable[[Any], Any] | None:
-    """How what a tag holds becomes what the program computes with, where it is not the same."""
+    """Return the conversion from a tag's value to the program's value; None if they are the same."""
     held = ty.plain(kind)
     if isinstance(kind, ty.Subrange):
         return lambda x: values.inside(x, kind.low, kind.high)
@@ -223,7 +226,7 @@ def _from_tag(kind: ty.Type) -> Callable[[Any], Any] | None:
 
 
 def _described(kind: ty.Type) -> Any:
-    """A type by what its values mean: names and elementary types, JSON-able."""
+    """Describe a type by what its values mean: names and elementary types, as data for JSON."""
     if isinstance(kind, ty.Array):
         return [kind.ranges, _described(kind.of)]
     if isinstance(kind, ty.Struct):
@@ -237,7 +240,7 @@ def _described(kind: ty.Type) -> Any:
 
 
 def _most(kind: ty.Type, now: Any) -> int:
-    """The most bytes of MessagePack that a value takes whose data are `now`."""
+    """Return the largest size in bytes, as MessagePack, of a value whose present data is `now`."""
     if isinstance(kind, ty.String):
         return 5 + 3 * kind.length
     if isinstance(now, list):
@@ -257,7 +260,7 @@ def _to_tag(kind: ty.Type) -> Callable[[Any], Any] | None:
 
 
 def _dump(value: Any) -> Any:
-    """Plain data of a value: objects by their slots (`_own`)."""
+    """Return the plain data of a value: objects by their slots (`_own`)."""
     if isinstance(value, list):
         return [_dump(v) for v in value]
     slots = getattr(value, "__slots__", None)
@@ -267,13 +270,14 @@ def _dump(value: Any) -> Any:
 
 
 def _own(value: Any) -> list[str]:
-    """The slots that are kept: not a timer's moments, which mean nothing after a restart, nor what a VAR_IN_OUT stands for."""
+    """Return the slots to be saved: without a timer's times, which mean nothing after a restart, and without references
+    of VAR_IN_OUTs."""
     others = getattr(value, "in_outs", ())
     return [name for name in value.__slots__ if name not in others and not (name[0] == "_" and name.endswith("_ns"))]
 
 
 def _load(into: Any, kept: Any) -> Any:
-    """`kept` in the form of `into`; raises `FileInvalid` where the forms differ."""
+    """Return `kept` in the form of `into`; raises `FileInvalid` if the forms differ."""
     if isinstance(into, list) and isinstance(kept, list) and len(into) == len(kept):
         return [_load(a, b) for a, b in zip(into, kept, strict=True)]
     slots = getattr(into, "__slots__", None)
@@ -282,7 +286,8 @@ def _load(into: Any, kept: Any) -> Any:
             if name in kept:
                 setattr(into, name, _load(getattr(into, name), kept[name]))
         return into
-    if into is None and isinstance(kept, bool | int | float | str | None):  # a block's own, which had no value at first
+    # an attribute of a block that had no value at first
+    if into is None and isinstance(kept, bool | int | float | str | None):
         return kept
     if type(into) is type(kept) or (isinstance(into, float) and isinstance(kept, int)):
         return float(kept) if isinstance(into, float) else kept

@@ -1,7 +1,7 @@
-"""What a VAR_IN_OUT of an elementary type is while a POU runs: an object that stands for a variable of the caller.
+"""References for VAR_IN_OUTs of elementary types at run time: each object refers to a variable of the caller.
 
-Reading and writing `v` reads and writes that variable at once, so that two VAR_IN_OUT of one variable, or one and a global
-variable, are the same (IEC 61131-3, 6.5.3.1). Arrays, structures and blocks are handed over as they are. Pure.
+Reading and writing `v` reads and writes that variable at once, so two VAR_IN_OUTs of one variable, or one and a global
+variable, always agree (IEC 61131-3, 6.5.3.1). Arrays, structures and blocks are passed directly. Pure.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from typing import Any
 
 
 class Cell:
-    """Stands for a variable of a function's own, for the length of a call."""
+    """Refers to a function's own variable, for the duration of a call."""
 
     __slots__ = ("v",)
 
@@ -19,7 +19,7 @@ class Cell:
 
 
 class Member:
-    """Stands for an attribute: a variable of a program or block, a global variable, a member of a structure."""
+    """Refers to an attribute: a variable of a program or block, a global variable, a member of a structure."""
 
     __slots__ = ("_name", "_owner")
 
@@ -36,7 +36,7 @@ class Member:
 
 
 class Element:
-    """Stands for an element of an array: the one that the index named when the call began."""
+    """Refers to an element of an array: the one that the index selected when the call began."""
 
     __slots__ = ("_at", "_owner")
 
@@ -53,7 +53,7 @@ class Element:
 
 
 class Cut:
-    """Stands for a string that is shorter than the VAR_IN_OUT: what is assigned is cut to `length` characters."""
+    """Refers to a string that is shorter than the VAR_IN_OUT: an assigned value is cut to `length` characters."""
 
     __slots__ = ("_length", "_of")
 

@@ -1,7 +1,8 @@
-"""What the programs of one Structured Text file share while they run together: compiled code, global variables, the scan.
+"""What the programs of one Structured Text file share while they run together: compiled code, global variables, the
+scan.
 
-The standard calls this a resource (IEC 61131-3, 6.8.1). Programs of one file that one PLC runs share one, so that they see the
-same VAR_GLOBAL. A deep copy has global variables of its own and shares the code, which has no state.
+The standard calls this a resource (IEC 61131-3, 6.8.1). Programs of one file that run in one PLC share a resource, so
+that they see the same VAR_GLOBAL. A deep copy has separate global variables and shares the code, which has no state.
 """
 
 from __future__ import annotations
@@ -18,14 +19,14 @@ from fieldtwin.plc.st import values
 from fieldtwin.plc.st.compile import CompiledUnit
 
 MAX_STEPS = 1_000_000
-"""Loop iterations, and calls of functions and function blocks, that a program may make in one scan. The same in real and in
-virtual time, where nothing else ends a loop without an end."""
+"""How many loop iterations, and calls of functions and function blocks, a program may make in one scan. The limit is
+the same in real and in virtual time, where there is no other way to end an endless loop."""
 Together = dict[Any, Any]
 """The resources of one PLC, by file and code."""
 
 
 class Context:
-    """What compiled code knows of the scan that runs."""
+    """What compiled code can use of the running scan."""
 
     __slots__ = ("first_scan", "left", "lookup", "now_ns")
 
@@ -38,7 +39,7 @@ class Context:
 
     @property
     def scan_ns(self) -> int:
-        """The scan's time as SCAN_TIME() gives it: a program that asks for it depends on more than differences."""
+        """The scan's time for SCAN_TIME(): a program that uses it depends on more than time differences."""
         return self.now_ns
 
     def is_good(self, name: str) -> bool:
@@ -66,11 +67,11 @@ class Resource:
         exec(unit.code, self.space)
         self.globals: Any = self.space["_G"]
         self.absolute = ".scan_ns" in unit.python
-        """Whether a program asks for SCAN_TIME, so that its behaviour depends on the time itself."""
+        """Whether a program uses SCAN_TIME, so that its behaviour depends on the time itself."""
 
     @classmethod
     def of(cls, unit: CompiledUnit, together: Together | None) -> Resource:
-        """Return the resource of `unit` in `together`, made there if need be; without `together`, a new one."""
+        """Return the resource of `unit` in `together`, created there if necessary; without `together`, a new one."""
         if together is None:
             return cls(unit)
         key = (unit.path, unit.python)
@@ -95,7 +96,8 @@ class Resource:
 
 
 def state_of(value: Any, now_ns: int) -> Any:
-    """Return what of a variable matters for what comes, as something hashable. Equal states behave the same from now on."""
+    """Return the part of a variable that affects later scans, as a hashable value. Equal states behave the same from
+    now on."""
     if isinstance(value, list):
         return tuple([state_of(v, now_ns) for v in value])
     if isinstance(value, FunctionBlock):
@@ -104,6 +106,6 @@ def state_of(value: Any, now_ns: int) -> Any:
         return value.outstanding, tuple(value.pending)
     names = getattr(value, "__slots__", None)
     if names is None or isinstance(value, bool | int | float | str | Message):
-        return repr(value) if isinstance(value, float) else value  # so that 0.0, -0.0 and NaN are what they are
+        return repr(value) if isinstance(value, float) else value  # so that 0.0, -0.0 and NaN stay distinct
     references = getattr(value, "in_outs", ())
     return tuple([state_of(getattr(value, name), now_ns) for name in names if name not in references])

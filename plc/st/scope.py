@@ -1,4 +1,5 @@
-"""Names and what they stand for while a unit is compiled, the errors that compiling raises, and the code that it writes."""
+"""The names of a unit and their meaning during compilation, the errors that compiling raises, and the code that it
+writes."""
 
 from __future__ import annotations
 
@@ -14,13 +15,14 @@ from fieldtwin.plc.st.source import shortened
 from fieldtwin.plc.st.tree import Expr, Pos
 
 COMPARISONS = {"=": "==", "<>": "!=", "<": "<", ">": ">", "<=": "<=", ">=": ">="}
-"""Operators of Structured Text as Python writes them."""
+"""Operators of Structured Text and their Python form."""
 
 
 @dataclass(frozen=True, slots=True)
 class Symbol:
-    """A variable: its Python expression, and its value if it is a constant. `reference`: the expression of the object that
-    stands for a variable of the caller, where it is a VAR_IN_OUT of an elementary type (`fieldtwin.plc.st.references`)."""
+    """A variable: its Python expression, and its value if it is a constant. `reference`: for a VAR_IN_OUT of an
+    elementary type, the expression of the object that refers to the caller's variable
+    (`fieldtwin.plc.st.references`)."""
 
     name: str
     type: ty.Type
@@ -32,9 +34,9 @@ class Symbol:
 
 @dataclass(frozen=True, slots=True)
 class Value:
-    """A compiled expression. `place`: it is a variable or a part of one; `constant`: its value where that is known.
+    """A compiled expression. `place`: it is a variable or a part of one; `constant`: its value if that is known.
 
-    `reference`: Python expression of an object that stands for the variable; empty for a variable of a function's own.
+    `reference`: Python expression of an object that refers to the variable; empty for a function's own variable.
     """
 
     code: str
@@ -65,13 +67,14 @@ class Signature:
 
 
 def by_reference(kind: ty.Type) -> bool:
-    """Whether a VAR_IN_OUT of this type is handed over as the object itself; others need an object that stands for them."""
+    """Return whether a VAR_IN_OUT of this type is passed as the object itself; other types need an object that refers
+    to them."""
     return isinstance(kind, ty.Array | ty.Struct | ty.Block)
 
 
 @dataclass
 class Environment:
-    """What a whole unit declares, by names in lower case."""
+    """All declarations of a unit, by names in lower case."""
 
     path: str = ""
     types: dict[str, ty.Type] = field(default_factory=dict)
@@ -80,7 +83,7 @@ class Environment:
     globals: dict[str, Symbol] = field(default_factory=dict)
     enum_values: dict[str, list[tuple[ty.Enum, int]]] = field(default_factory=dict)
     calls: dict[str, dict[str, Pos]] = field(default_factory=dict)
-    """POU to the POUs that it calls or holds, with the first place where."""
+    """By POU: the POUs that it calls or contains, with the first position of each."""
 
     def error(self, pos: Pos, message: str, *, expected: str = "", got: str = "", hint: str = "") -> FileInvalid:
         return FileInvalid(
@@ -97,7 +100,7 @@ class Environment:
 
 
 class Compiling(Protocol):
-    """What a standard function is compiled with: the compiler of expressions (`expressions.Expressions`), as it sees it."""
+    """The compiler of expressions (`expressions.Expressions`), as a standard function uses it."""
 
     env: Environment
     symbols: dict[str, Symbol]
@@ -113,7 +116,7 @@ class Compiling(Protocol):
 
 
 def wrapped(code: str, kind: ty.Elementary) -> str:
-    """`code` brought back into the width of `kind`."""
+    """Return `code` reduced to the width of `kind`."""
     if kind.kind == "real":
         return f"_v.real({code})" if kind.bits == 32 else f"({code})"
     if kind.low < 0:
@@ -122,7 +125,7 @@ def wrapped(code: str, kind: ty.Elementary) -> str:
 
 
 class Writer:
-    """Lines of Python with the line of the source that each comes from."""
+    """Lines of Python with the source line of each."""
 
     def __init__(self) -> None:
         self.lines: list[tuple[str, int]] = []
@@ -134,7 +137,7 @@ class Writer:
 
     @contextmanager
     def block(self, head: str, pos: Pos | None = None) -> Iterator[None]:
-        """`head` and an indented body, ``pass`` if nothing is written into it."""
+        """Write `head` and an indented body, ``pass`` if nothing is written into it."""
         self.line(head, pos)
         self._depth += 1
         before = len(self.lines)
@@ -150,17 +153,17 @@ class Writer:
 
     @property
     def depth(self) -> int:
-        """Blocks around what is written next."""
+        """How many blocks enclose what is written next."""
         return self._depth
 
     def since(self, mark: int) -> list[tuple[str, int]]:
-        """Take back the lines written since there were `mark` of them, without their indentation here."""
+        """Remove and return the lines after the first `mark` lines, without their present indentation."""
         taken = [(code[4 * self._depth :], line) for code, line in self.lines[mark:]]
         del self.lines[mark:]
         return taken
 
     def again(self, lines: list[tuple[str, int]]) -> None:
-        """Write lines that were taken back, indented as it is now."""
+        """Write lines that `since` returned, with the present indentation."""
         self.lines += [("    " * self._depth + code, line) for code, line in lines]
 
     def temporary(self) -> str:

@@ -1,6 +1,7 @@
-"""The text of a Structured Text file before it is parsed: comments and pragmas become blanks, line for line, column for column.
+"""The text of a Structured Text file before it is parsed: comments and pragmas become blanks, line for line, column for
+column.
 
-Comments may be nested (IEC 61131-3, 6.1.5). Here is also where what is too long for anybody to have written it ends.
+Comments may be nested (IEC 61131-3, 6.1.5). This module also refuses files and literals that are implausibly long.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import re
 from fieldtwin.gateway.core.errors import FileInvalid
 
 MAX_CHARACTERS = 1_000_000
-"""Of a file: some 30,000 lines."""
+"""The longest file, in characters: some 30,000 lines."""
 MAX_NAME = 255
 MAX_LITERAL = 4 * 65_535
 MAX_SHOWN = 60
@@ -22,12 +23,13 @@ _NOT_A_LINE = re.compile(r"[^\n]")
 
 
 def shortened(text: str) -> str:
-    """`text` as an error shows it."""
+    """Return `text` as an error shows it."""
     return text if len(text) <= MAX_SHOWN else f"{text[:MAX_SHOWN]}... ({len(text)} characters)"
 
 
 def blanked(text: str, path: str = "") -> str:
-    """`text` without a byte order mark, comments and pragmas, its lines ended by line feeds. Raises `FileInvalid`."""
+    """Return `text` without a byte order mark, comments and pragmas, and with line feeds as line ends. Raises
+    `FileInvalid`."""
     if len(text) > MAX_CHARACTERS:
         raise FileInvalid(
             "too long for a program", path=path, line=1, column=1, expected=f"at most {MAX_CHARACTERS} characters"
@@ -43,7 +45,7 @@ def blanked(text: str, path: str = "") -> str:
                 raise _error(text, start, "a literal that is too long", path)
             out.append(text[at:end])
         elif mark in ("*)", "*/"):
-            end = found.end()  # that is for the parser to complain about
+            end = found.end()  # the parser reports this error
             out.append(text[at:end])
         else:
             end = found.end() if mark.startswith("//") else _end_of_comment(text, found, path)
@@ -55,7 +57,8 @@ def blanked(text: str, path: str = "") -> str:
 
 
 def _end_of_literal(text: str, at: int, quote: str) -> int:
-    """Behind the quote that ends it; at the line's end where none does, which the parser finds."""
+    """Return the position after the closing quote, or the end of the line if there is none; the parser reports that
+    error."""
     while found := _ENDS[quote].search(text, at):
         if not found.group().startswith("$"):
             return found.end() if found.group() == quote else found.start()

@@ -1,7 +1,8 @@
-"""The standard functions (IEC 61131-3, 6.6.2.5) by name: each checks its arguments' types and says what Python to write.
+"""The standard functions (IEC 61131-3, 6.6.2.5) by name: each checks its arguments' types and returns the Python to
+write.
 
 Beyond the standard: IS_GOOD(input), FIRST_SCAN(), SCAN_TIME(), and for messages MSG_COUNT, MSG_AT, MSG_TIME, MSG_ROOM,
-MSG_SEND (a message is a STRING with one character a byte).
+MSG_SEND (a message is a STRING with one character per byte).
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ class _Library:
         self._by_name: dict[str, Standard] = {}
 
     def add(self, *names: str, takes: Formals) -> Callable[[Write], Write]:
-        """Declare the functions `names`. `takes`: their parameters, as the standard names them."""
+        """Declare the functions `names`. `takes`: their parameters, with the names of the standard."""
 
         def keep(write: Write) -> Write:
             for name in names:
@@ -52,7 +53,7 @@ class _Library:
         return keep
 
     def find(self, name: str) -> Standard | None:
-        """The function called `name` (in capitals), also a conversion; None if there is none."""
+        """Return the function called `name` (in capitals), including conversions, or None."""
         found = self._by_name.get(name)
         if found is None and (write := conversion(name)) is not None:
             found = Standard(_ONE, write)
@@ -73,7 +74,7 @@ def _number(x: Compiling, expr: t.Expr, *kinds: str) -> Value:
 
 
 def _meeting(x: Compiling, exprs: list[t.Expr]) -> tuple[list[str], ty.Type]:
-    """All arguments in the type in which they meet."""
+    """Return all arguments converted to their common type, and that type."""
     found = [x.value(e) for e in exprs]
     kind = found[0].type
     for value, expr in zip(found[1:], exprs[1:], strict=True):
@@ -81,7 +82,7 @@ def _meeting(x: Compiling, exprs: list[t.Expr]) -> tuple[list[str], ty.Type]:
         if meeting is None:
             x.env.fail(expr.pos, "arguments of types that do not meet", got=f"{kind} and {value.type}")
         kind = meeting
-    if isinstance(kind, ty.AnyInt):  # the narrowest type that holds them all
+    if isinstance(kind, ty.AnyInt):  # the narrowest type that holds all of them
         kind = next(k for k in (ty.INT, ty.DINT, ty.LINT, ty.ULINT) if all(ty.fits(v.type, k) for v in found))
     elif isinstance(kind, ty.AnyReal):
         return [repr(float(v.constant)) if v.constant is not None else v.code for v in found], kind
@@ -292,7 +293,7 @@ def _asc(x: Compiling, call: t.Call, given: list[t.Expr]) -> Value:
     return Value(f"_v.code_of({_string(x, what)[0]}, {at})", ty.ELEMENTARY["BYTE"])
 
 
-# -- the scan, and what it is given -------------------------------------------------------------------------------------
+# -- the scan and its inputs --------------------------------------------------------------------------------------------
 
 
 @FUNCTIONS.add("FIRST_SCAN", takes=Formals())

@@ -1,4 +1,4 @@
-"""Statements to Python."""
+"""Compiles statements to Python."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from fieldtwin.plc.st.expressions import Expressions
 from fieldtwin.plc.st.scope import Environment, Symbol, Value, Writer, wrapped
 
 MAX_DEEP = 60
-"""Statements inside each other."""
+"""How deep statements may be nested."""
 MAX_LOOPS = 18
-"""Loops inside each other: Python has no more than 20."""
+"""How deep loops may be nested: Python's limit is 20."""
 MAX_CONTINUES = 50
-"""CONTINUEs of one REPEAT: each has its condition written out."""
+"""How many CONTINUEs one REPEAT may have: the condition is written out for each."""
 _CHAIN = 48
-"""Branches of a chain of elif: longer ones are cut, since to Python each is inside the one before."""
+"""The longest chain of elif: a longer chain is split, because Python nests each branch in the one before."""
 
 
 class Statements(Expressions):
-    """Compiles a body. `leave` is the Python statement that RETURN becomes."""
+    """Compiles a body. `leave` is the Python statement for RETURN."""
 
     leave = "return"
 
     def __init__(self, env: Environment, symbols: dict[str, Symbol], out: Writer, pou: str = "") -> None:
         super().__init__(env, symbols, out, pou)
-        self._loops: list[t.Expr | None] = []  # those around the statement; a REPEAT's with its condition
+        self._loops: list[t.Expr | None] = []  # the loops around the statement; for a REPEAT its condition
         self._continues: dict[int, int] = {}
         self._inside = 0
 
@@ -59,7 +59,7 @@ class Statements(Expressions):
             self.out.line(self.value(call).code, s.pos)
 
     def _block_call(self, call: t.Call, code: str, block: ty.Block) -> None:
-        if "[" in code:  # the place is worked out once
+        if "[" in code:  # compute the place once
             place = self.out.temporary()
             self.out.line(f"{place} = {code}", call.pos)
             code = place
@@ -113,8 +113,8 @@ class Statements(Expressions):
         more: bool,
         pos: t.Pos,
     ) -> None:
-        """if, elif..., and `otherwise` if there is `more`. A condition that has to be prepared begins a chain of its own,
-        inside the else of the one before."""
+        """Write if, elif and so on, and `otherwise` if there is `more`. A condition that needs lines before it begins a
+        new chain, inside the else of the previous one."""
         with ExitStack() as inside:
             word = "if"
             for condition, body in branches:
@@ -160,7 +160,8 @@ class Statements(Expressions):
         self._cases(name, list(zip(tests, bodies, places, strict=True)), 0, s)
 
     def _cases(self, name: str, rows: list[tuple[str, tuple[t.Statement, ...], t.Pos]], first: int, s: t.Case) -> None:
-        """A chain; for many branches, which then go by their number, halves of them."""
+        """Write a chain of branches. If there are many, they are selected by number, and the chain is split into
+        halves."""
         if len(rows) > _CHAIN:
             half = len(rows) // 2
             with self.out.block(f"if 0 <= {name} < {first + half}:", s.pos):
@@ -194,7 +195,7 @@ class Statements(Expressions):
         return low, high
 
     def _check_labels(self, labels: list[tuple[int, int, t.Pos]]) -> None:
-        """No two overlap; the later one is named."""
+        """Check that no two labels overlap; the error names the later one."""
         before: tuple[int, int, t.Pos] | None = None
         for label in sorted(labels, key=lambda each: each[:2]):
             if before is not None and label[0] <= before[1]:
@@ -216,7 +217,8 @@ class Statements(Expressions):
         self._loops.pop()
 
     def _for(self, s: t.For) -> None:
-        """Limits and step are worked out once. Afterwards the variable is the first value past the limit, as in C."""
+        """Compile FOR. Limits and step are computed once. Afterwards the variable is the first value past the limit, as
+        in C."""
         target = self.writable(s.variable)
         kind = target.type
         if not isinstance(kind, ty.Elementary) or kind.kind != "int":

@@ -7,7 +7,7 @@ from fieldtwin.plc.st.scope import Value, wrapped
 
 
 def with_time(op: str, left: Value, right: Value) -> Value | None:
-    """Return `left` `op` `right` where one side is a duration, date or time of day; None where neither side is one, or where the
+    """Return `left` `op` `right` if one side is a duration, date or time of day; None if neither side is one, or if the
     standard defines no such operation."""
     a, b = ty.plain(left.type), ty.plain(right.type)
     ka, kb = _kind(a), _kind(b)

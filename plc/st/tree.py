@@ -1,4 +1,5 @@
-"""What is written in a Structured Text file, as a tree: frozen nodes with their place. What names mean is not decided here."""
+"""The content of a Structured Text file as a tree: frozen nodes with their position. The meaning of names is not
+resolved here."""
 
 from __future__ import annotations
 
@@ -39,7 +40,7 @@ class StringType:
 
 @dataclass(frozen=True, slots=True)
 class MessagesType:
-    """``MESSAGES[bytes, depth]``: the longest message and how many may be on their way."""
+    """``MESSAGES[bytes, depth]``: the longest message and how many may be under way."""
 
     pos: Pos
     max_bytes: Expr | None
@@ -58,7 +59,7 @@ TypeSpec = NamedType | SubrangeType | StringType | MessagesType | ArrayType
 
 @dataclass(frozen=True, slots=True)
 class InitArray:
-    """`items`: how often, and what (None: the type's own initial value)."""
+    """An initial array. `items`: the count and the value of each item (None: the type's own initial value)."""
 
     pos: Pos
     items: tuple[tuple[int, Init | None], ...]
@@ -90,7 +91,7 @@ class StructDecl:
 
 @dataclass(frozen=True, slots=True)
 class EnumDecl:
-    """`values`: names with the number that was stated, if one was."""
+    """An enumeration. `values`: names with their stated number, if any."""
 
     pos: Pos
     name: str
@@ -111,7 +112,7 @@ TypeDecl = StructDecl | EnumDecl | AliasDecl
 
 @dataclass(frozen=True, slots=True)
 class VarBlock:
-    """`kind` in capitals (VAR, VAR_INPUT, ..., VAR_GLOBAL), `qualifiers` too."""
+    """A block of variables. `kind` in capitals (VAR, VAR_INPUT, ..., VAR_GLOBAL), and also `qualifiers`."""
 
     pos: Pos
     kind: str
@@ -121,7 +122,7 @@ class VarBlock:
 
 @dataclass(frozen=True, slots=True)
 class Pou:
-    """A program organization unit: `kind` is PROGRAM, FUNCTION or FUNCTION_BLOCK; `returns` a function's type."""
+    """A program organization unit: `kind` is PROGRAM, FUNCTION or FUNCTION_BLOCK; `returns` is a function's type."""
 
     pos: Pos
     kind: str
@@ -133,7 +134,7 @@ class Pou:
 
 @dataclass(frozen=True, slots=True)
 class Unit:
-    """All that one file declares."""
+    """All declarations of one file."""
 
     types: tuple[TypeDecl, ...] = ()
     globals: tuple[VarBlock, ...] = ()
@@ -145,7 +146,7 @@ class Unit:
 
 @dataclass(frozen=True, slots=True)
 class Literal:
-    """`kind` is the token's (INTEGER, REAL, BASED, TYPED, DURATION...), `text` as written."""
+    """A literal. `kind` is the token's (INTEGER, REAL, BASED, TYPED, DURATION...), `text` as written."""
 
     pos: Pos
     kind: str
@@ -179,7 +180,8 @@ class Ref:
 
 @dataclass(frozen=True, slots=True)
 class Argument:
-    """Positional (`name` empty), ``name := value``, or ``name => target`` (`target` set, `inverted` by NOT)."""
+    """An argument: positional (`name` empty), ``name := value``, or ``name => target`` (`target` set, `inverted` by
+    NOT)."""
 
     pos: Pos
     name: str
@@ -238,7 +240,7 @@ class If:
 
 @dataclass(frozen=True, slots=True)
 class CaseLabel:
-    """One value, or a range: each a literal or an enumerated value's name."""
+    """One value, or a range: each end is a literal or the name of an enumerated value."""
 
     pos: Pos
     low: Expr

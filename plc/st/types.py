@@ -1,7 +1,7 @@
-"""The data types of Structured Text: what there is, what fits into what without a conversion, and how values are held.
+"""The data types of Structured Text: which exist, which convert implicitly, and how values are represented.
 
-How values are held at run time: BOOL as bool; integers, bit strings, enumerated values as int; REAL as a float rounded to
-32 bits, LREAL as float; TIME and LTIME as int of ns, TIME_OF_DAY ns since midnight, DATE and DATE_AND_TIME ns since
+Representation at run time: BOOL as bool; integers, bit strings, enumerated values as int; REAL as a float rounded to 32
+bits, LREAL as float; TIME and LTIME as int of ns, TIME_OF_DAY ns since midnight, DATE and DATE_AND_TIME ns since
 1970-01-01; strings as str (a STRING's characters are 0 to 255, one byte each); arrays as lists; structures and function
 blocks as objects. Source: IEC 61131-3:2013, 6.4 (types) and 6.6.1.6 (implicit conversions). Pure.
 """
@@ -18,14 +18,15 @@ DEFAULT_STRING = 80
 DAY_NS = 86_400_000_000_000
 MAX_STRING = 65_535
 MAX_ELEMENTS = 1_000_000
-"""Of an array over all its dimensions, and of all that a structure, a block or a program holds."""
+"""The limit for an array over all its dimensions, and for all elements of a structure, a block or a program."""
 MAX_NESTED = 32
-"""Structures, arrays and blocks inside each other."""
+"""How deep structures, arrays and blocks may be nested."""
 
 
 @dataclass(frozen=True, slots=True)
 class Elementary:
-    """`kind` is int, bits, real, bool, duration, date, tod, dt; `low`..`high` for integers and bit strings."""
+    """An elementary type. `kind` is int, bits, real, bool, duration, date, tod, dt; `low`..`high` for integers and bit
+    strings."""
 
     name: str
     kind: str
@@ -66,7 +67,7 @@ INT, DINT, LINT, ULINT = (ELEMENTARY[name] for name in ("INT", "DINT", "LINT", "
 
 @dataclass(frozen=True, slots=True)
 class AnyInt:
-    """An integer constant without a type of its own: it fits wherever its value does."""
+    """An integer constant without a declared type: it fits every type that can hold its value."""
 
     value: int
 
@@ -76,7 +77,7 @@ class AnyInt:
 
 @dataclass(frozen=True, slots=True)
 class AnyReal:
-    """A real constant, or a choice between some, without a type of its own."""
+    """A real constant, or a choice between several, without a declared type."""
 
     value: float
 
@@ -98,7 +99,7 @@ class Subrange:
 
 @dataclass(frozen=True, slots=True)
 class String:
-    """At most `length` characters; what is longer is cut when it is assigned."""
+    """A string of at most `length` characters; a longer string is cut when it is assigned."""
 
     length: int = DEFAULT_STRING
     wide: bool = False
@@ -119,7 +120,7 @@ class Enum:
 
 @dataclass(frozen=True, slots=True)
 class Array:
-    """`ranges`: first and last index of each dimension."""
+    """An array. `ranges`: first and last index of each dimension."""
 
     ranges: tuple[tuple[int, int], ...]
     of: Type
@@ -130,7 +131,7 @@ class Array:
 
 @dataclass(frozen=True, slots=True)
 class Struct:
-    """`fields`: name as declared and type, by the name in lower case."""
+    """A structure. `fields`: name as declared and type, by the name in lower case."""
 
     name: str
     fields: Mapping[str, tuple[str, Type]] = field(hash=False)
@@ -143,7 +144,8 @@ class Struct:
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """A function block: the standard's (`standard` set) or the user's. Members by name in lower case: name, type."""
+    """A function block: one of the standard (`standard` set) or the user's. Members by name in lower case: name,
+    type."""
 
     name: str
     inputs: Mapping[str, tuple[str, Type]] = field(hash=False)
@@ -159,7 +161,7 @@ class Block:
 
 @dataclass(frozen=True, slots=True)
 class MessagesIn:
-    """A program's input of messages (VAR_INPUT name : MESSAGES): those that are new in this scan."""
+    """A program's input of messages (VAR_INPUT name : MESSAGES): the messages that are new in this scan."""
 
     def __str__(self) -> str:
         return "MESSAGES"
@@ -182,12 +184,12 @@ Type = (
 
 
 def plain(kind: Type) -> Type:
-    """The type that a value has once it is read: a subrange's is its base."""
+    """Return the type that a value has once it is read: a subrange's is its base."""
     return kind.base if isinstance(kind, Subrange) else kind
 
 
 def elements(kind: Type) -> int:
-    """How much a variable of this type takes: 1 for a number, and for each 64 characters of a string."""
+    """Return the size of a variable of this type: 1 for a number, plus 1 for each 64 characters of a string."""
     if isinstance(kind, Array):
         return prod(high - low + 1 for low, high in kind.ranges) * elements(kind.of)
     if isinstance(kind, String):
@@ -196,14 +198,14 @@ def elements(kind: Type) -> int:
 
 
 def nested(kind: Type) -> int:
-    """How many structures, arrays and blocks are inside each other."""
+    """Return how deep structures, arrays and blocks are nested."""
     if isinstance(kind, Array):
         return len(kind.ranges) + nested(kind.of)
     return kind.nested if isinstance(kind, Struct | Block) else 0
 
 
 def is_kind(kind: Type, *names: str) -> bool:
-    """Whether it is elementary of one of these kinds; constants without a type count as int or real."""
+    """Return whether it is elementary of one of these kinds; constants without a type count as int or real."""
     kind = plain(kind)
     if isinstance(kind, AnyInt):
         return "int" in names
@@ -213,7 +215,7 @@ def is_kind(kind: Type, *names: str) -> bool:
 
 
 def fits(source: Type, target: Type) -> bool:
-    """Whether a value of `source` may be assigned to `target` without naming a conversion."""
+    """Return whether a value of `source` may be assigned to `target` without a named conversion."""
     source, sink = plain(source), plain(target)
     if isinstance(source, AnyInt):
         if isinstance(target, Subrange):
@@ -241,7 +243,7 @@ def _widens(source: Elementary, target: Elementary) -> bool:
 
 
 def common(a: Type, b: Type) -> Type | None:
-    """The type in which two operands meet, None if there is none."""
+    """Return the common type of two operands, or None."""
     a, b = plain(a), plain(b)
     if isinstance(a, AnyInt) and isinstance(b, AnyInt):
         return AnyInt(0)
@@ -256,7 +258,7 @@ def common(a: Type, b: Type) -> Type | None:
 
 
 def standard_blocks(blocks: Mapping[str, type[FunctionBlock]]) -> dict[str, Block]:
-    """The function blocks of the standard library as types, by their name in lower case."""
+    """Return the function blocks of the standard library as types, by their name in lower case."""
 
     def members(declared: Mapping[str, str]) -> dict[str, tuple[str, Type]]:
         return {name.lower(): (name, ELEMENTARY[kind]) for name, kind in declared.items()}

@@ -134,9 +134,7 @@ class DeviceCoverage:
 
 
 def devices_covered(system: System, counts: Counts) -> list[DeviceCoverage]:
-    """Return the coverage of every device of the system. A longer read that includes a tag's registers counts for the
-    tag.
-    """
+    """Return the coverage of every device of the system. A longer read that includes a tag's registers counts for the tag."""
     return [_device(config, counts) for config in system.devices.values()]
 
 
@@ -159,8 +157,9 @@ _Key = tuple[str, str, str, int, int, int]
 
 
 def _things(config: DeviceConfig) -> Iterator[tuple[str, RegisterRange | tuple[int, int], bool, bool]]:
-    """Yield what a device has by name: tags, and mailboxes by their head. Each as name, place, whether readable,
-    whether writable.
+    """Yield what a device has by name: tags, and mailboxes by their head.
+
+    Each as name, place, whether readable, whether writable.
     """
     profile = config.profile
     for tag in profile.tags.values():

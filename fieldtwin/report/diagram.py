@@ -113,8 +113,9 @@ def _fault_lane(axis: Axis, bar: FaultBar) -> tuple[float, list[Markup]]:
 
 
 def _wire_lane(axis: Axis, window: Window, bus: str, system: System | None) -> tuple[float, list[Markup]]:
-    """Return the lane of a bus. A request is a box as long as the wait for its answer, a message is a tick; text is
-    added where there is room.
+    """Return the lane of a bus.
+
+    A request is a box as long as the wait for its answer, a message is a tick; text is added where there is room.
     """
     config = system.buses.get(bus) if system else None
     timeout_ns = round((config.timeout_s if config else 1.0) * NS_PER_S)

@@ -169,8 +169,10 @@ def _cut(said: str, most: int) -> str:
 
 
 def _study(report: Report) -> tuple[list[tuple[Report, Counts]], list[Markup]]:
-    """Read every trace once. Return the counts by system, each with the report for that system, and the sections of the
-    failures."""
+    """Read every trace once.
+
+    Return the counts by system, each with the report for that system, and the sections of the failures.
+    """
     parts: dict[SystemKey | None, tuple[Report, Counts]] = {}
     sections, drawn, used, plain = [], 0, 0, []
     if not report.scenarios or report.system is not None:

@@ -44,8 +44,9 @@ def join(children: Child) -> Markup:
 
 
 def el(name: str, /, *children: Child, **attributes: object) -> Markup:
-    """Return an element. ``cls`` is the class, and ``_`` in a name means ``-``. None leaves an attribute out; True
-    writes it without a value.
+    """Return an element.
+
+    ``cls`` is the class, and ``_`` in a name means ``-``. None leaves an attribute out; True writes it without a value.
     """
     parts = [name]
     for key, value in attributes.items():

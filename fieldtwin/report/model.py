@@ -187,8 +187,11 @@ def key_of(system: System) -> SystemKey:
 
 @dataclass(frozen=True)
 class Report:
-    """A run of one or many scenarios. `requirements` are those to be covered, id to text; ids that only scenarios name
-    are added. `versions` is other useful information: fieldtwin, Python, platform. `started` is ISO 8601."""
+    """A run of one or many scenarios.
+
+    `requirements` are those to be covered, id to text; ids that only scenarios name are added. `versions` is other
+    useful information: fieldtwin, Python, platform. `started` is ISO 8601.
+    """
 
     title: str
     scenarios: Sequence[ScenarioResult]

@@ -22,9 +22,7 @@ _FEW = 3
 def value_lane(
     axis: Axis, window: Window, name: str, steps: list[Step], unit: str = "", words: Mapping[Any, str] | None = None
 ) -> tuple[float, list[Markup]]:
-    """Return height and marks of a lane. `words` are the names of values; a state with more values is drawn as a
-    number.
-    """
+    """Return height and marks of a lane. `words` are the names of values; a state with more values is drawn as a number."""
     drawn = _thinned(steps)
     numbers = [s.value for s in drawn if _is_number(s.value)]
     is_state = not any(s.quality for s in drawn)

@@ -42,8 +42,9 @@ class _Signal:
 
 
 class _Signals:
-    """All variables by scope and name, created when they are first seen. A first pass declares them, and a second one
-    writes them.
+    """All variables by scope and name, created when they are first seen.
+
+    A first pass declares them, and a second one writes them.
     """
 
     def __init__(self) -> None:

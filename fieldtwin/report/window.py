@@ -60,8 +60,9 @@ class FrameLine:
 
 @dataclass
 class Window:
-    """The window around `check`, from `start_ns` to `end_ns`. `cut` is the number of frames that were left out. `lost`:
-    the trace begins later.
+    """The window around `check`, from `start_ns` to `end_ns`.
+
+    `cut` is the number of frames that were left out. `lost`: the trace begins later.
     """
 
     check: CheckResult
@@ -122,8 +123,9 @@ class Study:
         self._off: list[FaultBar] = []
 
     def run(self, checks: Sequence[CheckResult]) -> tuple[Counts, list[Window]]:
-        """Read the scenario's trace and return its counts and windows. If a listener has already counted, its counts
-        are returned.
+        """Read the scenario's trace and return its counts and windows.
+
+        If a listener has already counted, its counts are returned.
         """
         trace = self._scenario.trace
         end_ns = trace[-1].t_ns if trace else 0
@@ -254,8 +256,10 @@ def _keep(window: Window, line: FrameLine) -> None:
 
 
 def _raw(event: Event, text: str, hiding: Collection[str]) -> str:
-    """Return the frame's bytes in hexadecimal, after a CAN identifier if there is one. A frame whose text hides a
-    secret is hidden, and so is a partial frame on a bus with secret tags."""
+    """Return the frame's bytes in hexadecimal, after a CAN identifier if there is one.
+
+    A frame whose text hides a secret is hidden, and so is a partial frame on a bus with secret tags.
+    """
     data = event.data
     if SECRET in text or (not text and event.where in hiding):
         return SECRET

@@ -41,9 +41,11 @@ Part = Literal["plc", "gateway", "field"]
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """The current value of a tag or of a program's variable. `quality` is good, uncertain, bad, substituted or
-    simulated; `age_s` is the value's age, and `updates` how often it was published since the start; both are 0 for a
-    variable."""
+    """The current value of a tag or of a program's variable.
+
+    `quality` is good, uncertain, bad, substituted or simulated; `age_s` is the value's age, and `updates` how often it
+    was published since the start; both are 0 for a variable.
+    """
 
     value: Any
     quality: str
@@ -110,8 +112,9 @@ class Bench(Protocol):
         ...
 
     def reading(self, name: str) -> Reading | None:
-        """Return the reading as of the last return of `sleep_until_s`. None: never published. Raises `UsageError` for
-        an unknown name.
+        """Return the reading as of the last return of `sleep_until_s`.
+
+        None: never published. Raises `UsageError` for an unknown name.
         """
         ...
 

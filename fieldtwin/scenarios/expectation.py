@@ -1,5 +1,6 @@
-"""Checks one expectation now: of a tag, or of the requests seen on a device's bus. Returns (expected, got), or None if
-it holds.
+"""Checks one expectation now: of a tag, or of the requests seen on a device's bus.
+
+Returns (expected, got), or None if it holds.
 """
 
 from __future__ import annotations
@@ -23,8 +24,10 @@ LIKE_S = 0.5
 
 @dataclass
 class Watched:
-    """The data that an expectation can use: the bench, the start of the check, and the exchanges seen. `stimulus_s` is
-    the time of the last stimulus to the system; exchanges count from then."""
+    """The data that an expectation can use: the bench, the start of the check, and the exchanges seen.
+
+    `stimulus_s` is the time of the last stimulus to the system; exchanges count from then.
+    """
 
     bench: Bench
     system: System
@@ -135,8 +138,10 @@ def judge_wire(expect: Expect, watched: Watched) -> Said:
 
 
 def wire_matches(form: Expect | WireForm, exchange: Exchange) -> bool:
-    """Return whether an exchange has the form's function, access, register and value, as far as the form names them. A
-    stray frame is not a request, so it never matches."""
+    """Return whether an exchange has the form's function, access, register and value, as far as the form names them.
+
+    A stray frame is not a request, so it never matches.
+    """
     if exchange.is_stray:
         return False
     if form.function is not None and exchange.function != form.function:

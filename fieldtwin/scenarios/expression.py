@@ -27,9 +27,7 @@ WORDS = {"quality": QUALITIES, "reason": tuple(str(reason).replace(" ", "_") for
 """The possible results of these functions."""
 NO_WORDS: Mapping[str, Collection[str]] = {}
 _OWN = ("plc.late", "command_pending")
-"""``plc.late``: the seconds by which the last scan was late; ``command pending``: the remote client commanded within 5
-s.
-"""
+"""``plc.late``: the seconds by which the last scan was late; ``command pending``: the remote client commanded within 5 s."""
 LONGEST = 1000
 DEEPEST = 50
 _UNIT_S = {"ms": 0.001, "s": 1.0, "min": 60.0, "h": 3600.0}
@@ -51,8 +49,9 @@ _ARITHMETIC: dict[type[ast.operator], Callable[[Any, Any], Any]] = {
 
 
 class NotUnderstood(UsageError):
-    """The text is not an expression, or contains an unknown name. `at_column` is the position of the error: characters
-    after the start of the text.
+    """The text is not an expression, or contains an unknown name.
+
+    `at_column` is the position of the error: characters after the start of the text.
     """
 
     at_column = 0

@@ -1,6 +1,4 @@
-"""Reads a scenario file and checks it against its system: every error has file, line, column and the nearest known
-word.
-"""
+"""Reads a scenario file and checks it against its system: every error has file, line, column and the nearest known word."""
 
 from __future__ import annotations
 

@@ -16,8 +16,9 @@ from fieldtwin.twin.site.system import System
 
 @dataclass(frozen=True)
 class Stated:
-    """An expression that must be true always (`wanted` True) or never (False). `number` is its name in reports, `where`
-    FILE:LINE.
+    """An expression that must be true always (`wanted` True) or never (False).
+
+    `number` is its name in reports, `where` FILE:LINE.
     """
 
     number: str

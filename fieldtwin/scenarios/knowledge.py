@@ -22,8 +22,9 @@ PENDING_S = 5.0
 
 
 class Knowledge:
-    """The known values of one running system. `known` are the names that expressions may contain. `hear` takes each
-    event of the trace.
+    """The known values of one running system.
+
+    `known` are the names that expressions may contain. `hear` takes each event of the trace.
     """
 
     def __init__(self, system: System, known: Collection[str], bench: Bench) -> None:

@@ -1,6 +1,4 @@
-"""The last exchanges on the bus before a check failed, as lines for people: the evidence of a verdict that is not
-PASSED.
-"""
+"""The last exchanges on the bus before a check failed, as lines for people: the evidence of a verdict that is not PASSED."""
 
 from __future__ import annotations
 

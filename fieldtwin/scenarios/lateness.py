@@ -25,8 +25,10 @@ LOOK_S = 0.03
 @dataclass(frozen=True)
 class Allowance:
     """The allowance for one deadline, in seconds: `own_s` is subtracted, and the runner waits until `any_s`.
+
     `exhausted`: the host was later than the budget. `applies`: whether lateness can be subtracted from this check at
-    all."""
+    all.
+    """
 
     limit_s: float = 0.0
     own_s: float = 0.0

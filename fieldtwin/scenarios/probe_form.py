@@ -26,8 +26,10 @@ _VARIABLE = re.compile(r"\$\{([A-Za-z_][A-Za-z0-9_]*)\}")
 
 
 class ProbeForm(BaseModel):
-    """A probe. `endpoint` may contain ``${NAME}`` for an environment variable. `serve` is used instead of it to read
-    what the system's own gateway serves under that name."""
+    """A probe. `endpoint` may contain ``${NAME}`` for an environment variable.
+
+    `serve` is used instead of it to read what the system's own gateway serves under that name.
+    """
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
@@ -57,9 +59,7 @@ class Probe:
     """The endpoint as written, if it contains environment variables; `at` resolves it."""
 
     def at(self, environ: Mapping[str, str]) -> Probe:
-        """Return the probe with its endpoint resolved. Raises `UsageError` for an unset variable or an invalid
-        endpoint.
-        """
+        """Return the probe with its endpoint resolved. Raises `UsageError` for an unset variable or an invalid endpoint."""
         if not self.written:
             return self
         where = f"the probe {self.name!r}"
@@ -78,9 +78,7 @@ class Probe:
 
 
 def read_probe(file: YamlFile, name: str, form: ProbeForm, served: list[str]) -> Probe:
-    """Check a probe. Raises `FileInvalid` with the place of the error. `served` are the names of what the system
-    serves.
-    """
+    """Check a probe. Raises `FileInvalid` with the place of the error. `served` are the names of what the system serves."""
     loc: tuple[Key, ...] = ("probes", name)
     if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
         raise file.error(loc, "a probe's name", expected="small letters, digits and _", got=name)

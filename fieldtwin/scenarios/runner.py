@@ -52,8 +52,11 @@ LATE_SHARE = 0.1
 
 @dataclass
 class _Broken(Exception):
-    """A check that does not hold: the verdict, the expected and the actual value. `bound_s` is the time that it is
-    about, 0 for none; `since_s` is the time from which the host's lateness counts, if that is not the step's start."""
+    """A check that does not hold: the verdict, the expected and the actual value.
+
+    `bound_s` is the time that it is about, 0 for none; `since_s` is the time from which the host's lateness counts, if
+    that is not the step's start.
+    """
 
     verdict: Verdict
     expected: str
@@ -75,9 +78,7 @@ def _wanted(what: str, within_s: float) -> str:
 
 
 def _too_late(expected: str, got: str, bound_s: float, allowed: Allowance) -> _Broken:
-    """Return the failure of a missed deadline. If the host's lateness has already been waited for, the system has
-    failed.
-    """
+    """Return the failure of a missed deadline. If the host's lateness has already been waited for, the system has failed."""
     if allowed.exhausted:
         return _Broken(
             Verdict.INCONCLUSIVE, expected, f"{got}; this host was late by itself for more than {allowed.any_s:.3f} s"
@@ -111,9 +112,11 @@ def fault_id(n: int, step: Step) -> str:
 
 @dataclass(frozen=True)
 class ByChance:
-    """Random faults of a campaign, injected before the first step. The steps then only drive the system: their
-    expectations, rates and cycles are not judged. All other rules are judged at least until `until_s`, in seconds of
-    the run."""
+    """Random faults of a campaign, injected before the first step.
+
+    The steps then only drive the system: their expectations, rates and cycles are not judged. All other rules are
+    judged at least until `until_s`, in seconds of the run.
+    """
 
     faults: tuple[dict[str, Any], ...]
     until_s: float
@@ -291,8 +294,9 @@ class Runner:
         return (step.expect.wire or step.expect.tag or "",)
 
     def _judged_on_time(self, broken: _Broken, since_s: float) -> tuple[Verdict, str, str]:
-        """Return the verdict on a broken check. If the host was late by a large part of the time that it is about, it
-        is INCONCLUSIVE.
+        """Return the verdict on a broken check.
+
+        If the host was late by a large part of the time that it is about, it is INCONCLUSIVE.
         """
         late_s = self.bench.host_late_s(since_s if broken.since_s is None else broken.since_s)
         if broken.verdict is Verdict.FAILED and broken.bound_s and late_s > LATE_SHARE * broken.bound_s:
@@ -340,9 +344,7 @@ class Runner:
             self._met(_wanted(expression.text, within_s), since_s, within_s, [expression])
 
     def _met(self, expected: str, since_s: float, within_s: float, expressions: Iterable[Expression] = ()) -> None:
-        """Accept a check that was met. If it took longer than its own time, the lateness of this host must be the
-        reason.
-        """
+        """Accept a check that was met. If it took longer than its own time, the lateness of this host must be the reason."""
         took_s = self.bench.now_s() - since_s
         if not within_s or took_s <= within_s:
             return

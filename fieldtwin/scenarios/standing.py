@@ -25,8 +25,9 @@ from fieldtwin.scenarios.words import WireForm
 
 
 class Standing:
-    """The standing rules of one scenario. `look` returns the first that is broken now; `results` is called once, at the
-    end.
+    """The standing rules of one scenario.
+
+    `look` returns the first that is broken now; `results` is called once, at the end.
     """
 
     def __init__(self, scenario: Scenario, bench: Bench, knowledge: Knowledge, invariants: Invariants) -> None:

@@ -145,8 +145,9 @@ REFUSAL_KEYS = ("value", "cause", "reason", "by", "program", "place", "fault")
 
 
 def refusal_data(described: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the data of a REFUSED event from a journal entry as plain data. Its value is that of the entry's first
-    refusal.
+    """Return the data of a REFUSED event from a journal entry as plain data.
+
+    Its value is that of the entry's first refusal.
     """
     return {key: described["first" if key == "value" else key] for key in REFUSAL_KEYS}
 

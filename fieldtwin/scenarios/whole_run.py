@@ -30,9 +30,7 @@ SAMPLES = 500
 
 
 class WholeRun:
-    """All these rules of one scenario. `look` returns the first that is broken now; `results` is called once, at the
-    end.
-    """
+    """All these rules of one scenario. `look` returns the first that is broken now; `results` is called once, at the end."""
 
     def __init__(
         self, scenario: Scenario, bench: Bench, knowledge: Knowledge, invariants: Invariants, *, by_chance: bool = False

@@ -17,14 +17,14 @@ class _Form(BaseModel):
 
 
 class Send(_Form):
-    """Send: the remote client commands a period."""
+    """The step `send`: the remote client commands a period."""
 
     from_: str = Field(default="shore", alias="from")
     period_s: int
 
 
 class Set(_Form):
-    """Set: a device holds a value for DEVICE.TAG; null ends that."""
+    """The step `set`: a device holds a value for DEVICE.TAG; null ends that."""
 
     tag: str
     value: Number | bool | str | None

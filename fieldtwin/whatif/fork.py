@@ -37,15 +37,17 @@ from fieldtwin.whatif.state import KnownState
 LOOK_S = 1.0
 """Interval in seconds at which requirements are evaluated, in addition to each change of a program's variables."""
 BEGUN_S = 2.0
-"""Time in seconds until which a plan without commands has not moved a program from its initial state."""
+"""A plan without a command in this time (seconds) has not moved a program from its initial state."""
 MAX_TRANSITIONS = 10_000
 MAX_HORIZON_S = 30 * 86_400.0
 
 
 @dataclass(frozen=True)
 class Fork:
-    """A fork of `system` (name or path), from `state`, for `horizon_s` seconds. Requirements count from `settle_s` on,
-    because before that the gateway has not read everything yet."""
+    """A fork of `system` (name or path), from `state`, for `horizon_s` seconds.
+
+    Requirements count from `settle_s` on, because before that the gateway has not read everything yet.
+    """
 
     system: str
     state: KnownState
@@ -57,8 +59,11 @@ class Fork:
 
 
 def answer(fork: Fork, plan: Plan) -> Outcome:
-    """Run `plan` in a fork. A failure inside it is in the outcome's `error`. Raises `FileInvalid` or `UsageError` if
-    the fork cannot be started at all."""
+    """Run `plan` in a fork.
+
+    A failure inside it is in the outcome's `error`. Raises `FileInvalid` or `UsageError` if the fork cannot be started
+    at all.
+    """
     _check_horizon(fork)
     run = _ForkRun(fork, plan)
     clock = WallClock()
@@ -69,8 +74,9 @@ def answer(fork: Fork, plan: Plan) -> Outcome:
 
 
 def check(fork: Fork, plan: Plan) -> None:
-    """Check that a fork can be started and that the plan's requirements can be evaluated; nothing is run. Raises like
-    `answer`.
+    """Check that a fork can be started and that the plan's requirements can be evaluated; nothing is run.
+
+    Raises like `answer`.
     """
     _check_horizon(fork)
     _ForkRun(fork, plan)

@@ -19,8 +19,10 @@ BLOCK = 5_000
 
 
 async def known_state(place: str, system: System, origin: str = "") -> KnownState:
-    """Return the last known state of an origin in a knowledge store. Without a name, there must be only one origin with
-    tags or states. Raises `FileInvalid` or `UsageError`. If the last value of a tag was bad, no older one is used.
+    """Return the last known state of an origin in a knowledge store.
+
+    Without a name, there must be only one origin with tags or states. Raises `FileInvalid` or `UsageError`. If the last
+    value of a tag was bad, no older one is used.
     """
     store = await open_knowledge(place)
     try:

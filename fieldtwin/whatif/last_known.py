@@ -18,8 +18,9 @@ from fieldtwin.whatif.state import KnownState, Number
 
 
 class LastKnown:
-    """Keeps the newest value of each name from `take`, which accepts events of one or several logs, each in order. A
-    value that turned bad is not known.
+    """Keeps the newest value of each name from `take`, which accepts events of one or several logs, each in order.
+
+    A value that turned bad is not known.
     """
 
     def __init__(self, system: System) -> None:
@@ -51,9 +52,7 @@ class LastKnown:
 
     @property
     def unknown(self) -> str:
-        """What a fork should not start without and is still unknown: the state of a program, or every tag. Empty if
-        nothing is.
-        """
+        """The values that a fork needs and that are still unknown: the state of a program, or every tag. Empty if none."""
         silent = sorted(self._programs - self._when_ms.keys())
         if silent:
             return f"the state of {', '.join(silent)}"

@@ -13,8 +13,10 @@ from fieldtwin.gateway.core.values import Quality, TagValue
 
 @dataclass(slots=True)
 class VariableOutcome:
-    """A tag or a program's variable: its number of updates, and statistics of its good values. The mean is weighted by
-    time, so that a different sampling period, which plans are about, does not change it."""
+    """A tag or a program's variable: its number of updates, and statistics of its good values.
+
+    The mean is weighted by time, so that a different sampling period, which plans are about, does not change it.
+    """
 
     updates: int = 0
     good: int = 0
@@ -69,8 +71,9 @@ class VariableOutcome:
 
 @dataclass(slots=True)
 class Requirement:
-    """A requirement. `kind` is ``require`` or ``finally``. `broken_s` is the time at which it first did not hold, None
-    while it holds; `seen` are the values at that time.
+    """A requirement. `kind` is ``require`` or ``finally``.
+
+    `broken_s` is the time at which it first did not hold, None while it holds; `seen` are the values at that time.
     """
 
     kind: str
@@ -90,8 +93,10 @@ class Requirement:
 
 @dataclass
 class Outcome:
-    """The outcome of one plan. `error` says why there is none. `not_taken` names devices and programs that could not
-    start from their known state."""
+    """The outcome of one plan.
+
+    `error` says why there is none. `not_taken` names devices and programs that could not start from their known state.
+    """
 
     plan: str
     horizon_s: float = 0.0

@@ -1,6 +1,4 @@
-"""Plans: the commands and faults in a fork, and the requirements on it. One from the command line, or several in a
-file.
-"""
+"""Plans: the commands and faults in a fork, and the requirements on it. One from the command line, or several in a file."""
 
 from __future__ import annotations
 
@@ -53,8 +51,9 @@ class PlansForm(_Strict):
 
 @dataclass(frozen=True)
 class Plan:
-    """A plan. `require` are expressions that must hold all the time, `finally_` at the end. `faults` are as in a fault
-    file.
+    """A plan. `require` are expressions that must hold all the time, `finally_` at the end.
+
+    `faults` are as in a fault file.
     """
 
     name: str

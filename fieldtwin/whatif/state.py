@@ -86,8 +86,10 @@ def read_state(path: Path, system: System) -> KnownState:
 
 
 async def of_instance(run_dir: Path, system: System) -> KnownState:
-    """Return the state of a running instance of `system`, from its control channels. Raises `Unreachable`, and
-    `UsageError` if the instance runs a different system."""
+    """Return the state of a running instance of `system`, from its control channels.
+
+    Raises `Unreachable`, and `UsageError` if the instance runs a different system.
+    """
     gateway, plc = await _asked(run_dir / "gateway.sock"), await _asked(run_dir / "plc.sock")
     if (runs := gateway["config"]["system"]) != system.name:
         raise UsageError(f"the instance {run_dir.name!r} is one of another system", expected=system.name, got=runs)

@@ -82,8 +82,9 @@ class KnowledgeWriter:
         self._queue.append(event)
 
     async def run(self) -> None:
-        """Write queued events until cancelled. A store that refuses is tried again; an event that the store has taken
-        is never written twice.
+        """Write queued events until cancelled.
+
+        A store that refuses is tried again; an event that the store has taken is never written twice.
         """
         while True:
             wait_ms = EVERY_MS if await self.try_to_flush() else RETRY_MS
@@ -99,8 +100,9 @@ class KnowledgeWriter:
         return True
 
     async def flush(self) -> int:
-        """Write every queued event and return how many were written. Raises `Unreachable`, and keeps the events not
-        written.
+        """Write every queued event and return how many were written.
+
+        Raises `Unreachable`, and keeps the events not written.
         """
         done = 0
         while self._queue or self._lost:

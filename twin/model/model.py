@@ -36,7 +36,8 @@ class DigitalModel:
         return self.state_machine.period_s
 
     def process_event(self, command: COMMAND) -> STATE:
-        """Apply a command and return the new state. Raises `Desync` if it cannot be decoded; the model then stays
-        unchanged.
+        """Apply a command and return the new state.
+
+        Raises `Desync` if it cannot be decoded; the model then stays unchanged.
         """
         return self.state_machine.process_event(command)

@@ -70,22 +70,25 @@ class PTDigitalThreadProcess(DigitalThreadProcess):
         self.share(Kind.VALUE, name, value)
 
     def respond(self, program: str, response: RESPONSE) -> None:
-        """Share what the control logic sent to its transmitter: a STATUS, or a measurement whose payload stays
-        unchanged.
-        """
+        """Share what the control logic sent to its transmitter: a STATUS, or a measurement whose payload stays unchanged."""
         self.share(Kind.STATE if isinstance(response, STATUS) else Kind.PAYLOAD, program, response)
 
 
 class DTDigitalThreadProcess(DigitalThreadProcess):
-    """A process of the digital twin: Monitor, Analyze, Plan, Execute or a database. It cannot command; the process that
-    can is `fieldtwin.twin.thread.thread.Operator`."""
+    """A process of the digital twin: Monitor, Analyze, Plan, Execute or a database.
+
+    It cannot command; the process that can is `fieldtwin.twin.thread.thread.Operator`.
+    """
 
     side = "digital"
 
 
 class ReceivingEnd(EventHandler):
-    """A bounded queue of what arrives over a thread (ruling 2). This is all that a shadow holds of a connection (ruling
-    16): the transmitter that polls, acknowledges and requests missing events is assembled elsewhere."""
+    """A bounded queue of what arrives over a thread (ruling 2).
+
+    This is all that a shadow holds of a connection (ruling 16): the transmitter that polls, acknowledges and requests
+    missing events is assembled elsewhere.
+    """
 
     def __init__(self, event: str, capacity: int = KNOWLEDGE) -> None:
         super().__init__(event)

@@ -1,6 +1,4 @@
-"""Assigns the faults of a network: to the acoustic channel, or to one of its systems under that system's own names.
-Pure.
-"""
+"""Assigns the faults of a network: to the acoustic channel, or to one of its systems under that system's own names. Pure."""
 
 from __future__ import annotations
 
@@ -22,8 +20,9 @@ def check_network_fault(network: Network, spec: FaultSpec) -> None:
 
 
 def placed(network: Network, fault: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
-    """Return the system of a fault, or `WATER`, and the fault with that system's own names. Raises `UsageError` for an
-    unknown system.
+    """Return the system of a fault, or `WATER`, and the fault with that system's own names.
+
+    Raises `UsageError` for an unknown system.
     """
     if fault.get("bus") == WATER:
         return WATER, dict(fault)

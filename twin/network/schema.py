@@ -1,5 +1,6 @@
-"""The pydantic models of a network file: systems, and the acoustic channel between their modems. Only the prototype
-uses it; no plant opens it.
+"""The pydantic models of a network file: systems, and the acoustic channel between their modems.
+
+Only the prototype uses it; no plant opens it.
 """
 
 from __future__ import annotations

@@ -18,8 +18,9 @@ MOST_CLIENTS = 4
 
 
 class Ship:
-    """Serves the modem at the endpoint that ``await ship.open(ports)`` returns. The modem is of the same kind as that
-    of the first system.
+    """Serves the modem at the endpoint that ``await ship.open(ports)`` returns.
+
+    The modem is of the same kind as that of the first system.
     """
 
     def __init__(self, network: Network, medium: AcousticMedium, clock: Clock) -> None:

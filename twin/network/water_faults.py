@@ -1,5 +1,6 @@
-"""The faults of a network's acoustic channel: packets that are sent and do not arrive. Aimed by the network file, and
-written like those of a bus.
+"""The faults of a network's acoustic channel: packets that are sent and do not arrive.
+
+Aimed by the network file, and written like those of a bus.
 """
 
 from __future__ import annotations

@@ -49,7 +49,9 @@ def end_with_parent(parent: int, linger_s: float = 0.0) -> None:
 
 def allow_open_files() -> None:
     """Raise this process's limit of open files to its maximum, at most `MOST_FILES`: 1,000 devices need 2,000 sockets.
-    The usual limit of 1,024 exists for programs that use select(2), which this project does not."""
+
+    The usual limit of 1,024 exists for programs that use select(2), which this project does not.
+    """
     try:
         import resource
     except ImportError:  # Windows, which has no such limit

@@ -23,12 +23,14 @@ local clock, because its age would never count.
 
 class CommandGate(PTDigitalThreadProcess):
     """Decides on commands: `admit` takes an event of the twin's log and returns the command, or None if it was refused.
+
     The outcome of each command is shared.
     """
 
     def __init__(self, *, remote: bool, bounds: Bounds, clock: Clock, old_ms: int = OLD_MS, since_ms: int = 0) -> None:
-        """`since_ms` is when the plant's own log began (UTC). An earlier command may already have been obeyed, so it is
-        refused.
+        """`since_ms` is when the plant's own log began (UTC).
+
+        An earlier command may already have been obeyed, so it is refused.
         """
         super().__init__("command gate", clock)
         self.taken = self.refused = 0

@@ -53,8 +53,9 @@ PUBLISHED_AT_ONCE = 20_000
 
 
 class ControllerConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The configuration of the process. `mapping` is None on a plant; `capture` is a file for the recorded bus traffic,
-    or empty.
+    """The configuration of the process.
+
+    `mapping` is None on a plant; `capture` is a file for the recorded bus traffic, or empty.
     """
 
     system: str
@@ -267,8 +268,9 @@ class GatewayProcess:
             }
 
     async def _request_stop(self, args: dict[str, Any]) -> dict[str, Any]:
-        """Set outputs to safe values, then stop. The answer says whether the devices confirmed them, and holds the
-        final counters.
+        """Set outputs to safe values, then stop.
+
+        The answer says whether the devices confirmed them, and holds the final counters.
         """
         safe = await self._gateway.shut_down()
         await self._places.settle()

@@ -48,8 +48,9 @@ def runtime_root() -> Path:
 
 
 def _refuse_a_strangers(folder: Path) -> None:
-    """Refuse a folder that another user owns or may write to. Any user may create a file in /tmp, and the folder's
-    owner could replace its contents, sockets included.
+    """Refuse a folder that another user owns or may write to.
+
+    Any user may create a file in /tmp, and the folder's owner could replace its contents, sockets included.
     """
     try:
         found = folder.lstat()
@@ -66,9 +67,7 @@ def _refuse_a_strangers(folder: Path) -> None:
 
 
 class Instance:
-    """``with Instance("observatory") as instance``: locks the directory until the end of the block. Raises
-    `EndpointBusy`.
-    """
+    """``with Instance("observatory") as instance``: locks the directory until the end of the block. Raises `EndpointBusy`."""
 
     def __init__(self, name: str, root: Path | None = None) -> None:
         if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,39}", name):

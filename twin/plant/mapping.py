@@ -13,8 +13,9 @@ from fieldtwin.gateway.core.errors import Unreachable, UsageError
 
 
 class MappedConnector:
-    """Opens `mapping[plant endpoint]` instead of the plant endpoint. An endpoint that is not mapped is refused, never
-    opened.
+    """Opens `mapping[plant endpoint]` instead of the plant endpoint.
+
+    An endpoint that is not mapped is refused, never opened.
     """
 
     def __init__(self, inner: Connector, mapping: dict[Endpoint, Endpoint]) -> None:
@@ -62,8 +63,10 @@ def _refuse_stale_link(target: Endpoint) -> None:
 
 
 def mapped_endpoint(plant: Endpoint, listening: Endpoint) -> Endpoint:
-    """Return what the controller opens for `plant` when its emulator listens on `listening`. A pty is opened as the
-    serial port that it replaces, with the plant's baud rate and character format."""
+    """Return what the controller opens for `plant` when its emulator listens on `listening`.
+
+    A pty is opened as the serial port that it replaces, with the plant's baud rate and character format.
+    """
     if listening.scheme == "pty":
         return plant.with_path(listening.path)
     if plant.is_serial:

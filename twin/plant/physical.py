@@ -105,9 +105,7 @@ def _start_policy(form: StartForm) -> StartPolicy:
 
 
 def image_layout(system: System) -> ImageLayout:
-    """Return the process image of a system: the tags to which its programs are bound, and every other number for
-    watchers.
-    """
+    """Return the process image of a system: the tags to which its programs are bound, and every other number for watchers."""
     _check_tasks(system)
     folder = str(system.path.parent)
     plant = plant_tags(system)
@@ -169,10 +167,12 @@ def gateway_config(
     true_silences: bool | None = None,
     lent: Sequence[str] = (),
 ) -> GatewayConfig:
-    """Return the gateway's configuration. With `free_ports` it serves and bridges on free ports, so that several
-    gateways can run on one host. Without `true_silences` no line checks the pauses in RTU frames, because those of
-    virtual ports carry no information; `free_ports` implies this by default. The mailboxes of the transmitters in
-    `lent` are left to a digital thread."""
+    """Return the gateway's configuration.
+
+    With `free_ports` it serves and bridges on free ports, so that several gateways can run on one host. Without
+    `true_silences` no line checks the pauses in RTU frames, because those of virtual ports carry no information;
+    `free_ports` implies this by default. The mailboxes of the transmitters in `lent` are left to a digital thread.
+    """
     true_silences = not free_ports if true_silences is None else true_silences
     serving = system.serving.for_run(allow_writes=allow_writes, free_ports=free_ports)
     outputs = {tag for form in system.plc.programs.values() for tag in form.outputs.values()}
@@ -280,9 +280,11 @@ class EmbeddedControlSystem:
         lent: Sequence[str] = (),
         taken: TakenFile | None = None,
     ) -> Gateway:
-        """Return the gateway with its drivers. The gateway does not know which connections `connector` opens, or where
-        `listen` accepts clients. `taken` records which commands need not be handed on again after a restart; None if
-        there will be no restart."""
+        """Return the gateway with its drivers.
+
+        The gateway does not know which connections `connector` opens, or where `listen` accepts clients. `taken`
+        records which commands need not be handed on again after a restart; None if there will be no restart.
+        """
         config = gateway_config(
             self.system, allow_writes=allow_writes, free_ports=free_ports, true_silences=true_silences, lent=lent
         )
@@ -293,8 +295,9 @@ class EmbeddedControlSystem:
         return {name: d.command_list for name, d in make_drivers(self.system, TagTable(clock), clock).items()}
 
     def prepare(self, run_dir: Path, *, cold: bool = False) -> PlcConfig:
-        """Create the process image in `run_dir` and return the PLC process's configuration. `cold`: discard retained
-        values.
+        """Create the process image in `run_dir` and return the PLC process's configuration.
+
+        `cold`: discard retained values.
         """
         make_image(self.layout, run_dir / "image")
         return plc_config(self.system, run_dir, cold=cold)

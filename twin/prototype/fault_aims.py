@@ -30,8 +30,10 @@ class Target:
 
 
 def target(system: System, spec: FaultSpec) -> Target:
-    """Resolve the aim of `spec`. Raises `WrongAim` for a name that the system does not have, with the nearest one, and
-    for a fault that does not apply to this kind of bus.
+    """Resolve the aim of `spec`.
+
+    Raises `WrongAim` for a name that the system does not have, with the nearest one, and for a fault that does not
+    apply to this kind of bus.
     """
     aim, kind = spec.aim, spec.kind.kind
     bus = _bus(system, spec)

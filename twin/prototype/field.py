@@ -240,9 +240,7 @@ class FieldSide:
         return self._clients.setdefault(bus, ClientCounts())
 
     def _behind(self, bus: str, serve: Callable[[ByteConnection, str], Awaitable[None]]) -> OnClient:
-        """Wrap `serve` so that clients connect through the faults of their bus. `serve` also gets each client's
-        address.
-        """
+        """Wrap `serve` so that clients connect through the faults of their bus. `serve` also gets each client's address."""
 
         async def client(connection: ByteConnection) -> None:
             if self.faults.refuses(bus):
@@ -439,8 +437,9 @@ class FieldSide:
         )
 
     def _clients_by_bus(self) -> dict[str, dict[str, dict[str, int]]]:
-        """Return, by bus and client, the requests that reached a device and their replies. Kernel CAN buses and ptys
-        are not included.
+        """Return, by bus and client, the requests that reached a device and their replies.
+
+        Kernel CAN buses and ptys are not included.
         """
         for line in self._lines:
             line.settle()

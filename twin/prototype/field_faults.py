@@ -36,8 +36,10 @@ MOST = 1_000
 
 
 class FieldFaults:
-    """The active faults on the buses of a system and in its devices. `start_ns` is when the run began; `from` and
-    `until` count from then."""
+    """The active faults on the buses of a system and in its devices.
+
+    `start_ns` is when the run began; `from` and `until` count from then.
+    """
 
     def __init__(self, system: System, seed: int, clock: Clock) -> None:
         self.start_ns = clock.monotonic_ns()
@@ -88,8 +90,11 @@ class FieldFaults:
     # -- putting in and taking away -------------------------------------------------------------------------------------
 
     def inject(self, said: Mapping[str, Any], start_ns: int | None = None) -> str:
-        """Inject a fault and return its id. Its times count from `start_ns`, by default from the run's start. Raises
-        `UsageError` for an invalid fault, or an id that is already active."""
+        """Inject a fault and return its id.
+
+        Its times count from `start_ns`, by default from the run's start. Raises `UsageError` for an invalid fault, or
+        an id that is already active.
+        """
         start_ns = self.start_ns if start_ns is None else start_ns
         spec = parse_fault(dict(said), number=len(self._active) + 1)
         if spec.id in self._active:

@@ -45,9 +45,11 @@ HELD_AT_ONCE = 5_000
 
 
 class FieldConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The configuration of the process. `recordings` maps a device to a file, and `listen` a bus to an endpoint; both
-    override the prototype file. `seed` None means the prototype file's. `control` is ``HOST:PORT`` for a TCP control
-    channel, or empty."""
+    """The configuration of the process.
+
+    `recordings` maps a device to a file, and `listen` a bus to an endpoint; both override the prototype file. `seed`
+    None means the prototype file's. `control` is ``HOST:PORT`` for a TCP control channel, or empty.
+    """
 
     system: str
     run_dir: str
@@ -224,8 +226,10 @@ class FieldProcess:
         return {name: held[:HELD_AT_ONCE] for name, held in self._field.held_since(since).items()}
 
     async def _fault(self, args: dict[str, Any]) -> dict[str, Any]:
-        """Inject ``{"fault": {"name": ..., "device": ...}}``; its times count from ``"start_ns"`` (monotonic), if
-        given. With ``"lease"`` it is removed when that lease ends."""
+        """Inject ``{"fault": {"name": ..., "device": ...}}``; its times count from ``"start_ns"`` (monotonic), if given.
+
+        With ``"lease"`` it is removed when that lease ends.
+        """
         start_ns = args["start_ns"] if isinstance(args.get("start_ns"), int) else None
         said = args.get("fault")
         if not isinstance(said, dict):
@@ -270,8 +274,9 @@ class FieldProcess:
         }
 
     async def _fresh(self, args: dict[str, Any]) -> dict[str, Any]:
-        """Make all devices anew, and return when the new devices listen. Raises `LeaseEnded` or `UsageError`, and
-        changes nothing then.
+        """Make all devices anew, and return when the new devices listen.
+
+        Raises `LeaseEnded` or `UsageError`, and changes nothing then.
         """
         self._leases.of(str(args.get("lease", "")), self._clock.monotonic_ns())
         if self._config.water:

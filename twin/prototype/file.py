@@ -1,5 +1,7 @@
-"""The prototype file: which devices are emulated, from which data source, and at which endpoint. The process of the
-simulated field devices and its starter read it; the plant, gateway and PLC never do."""
+"""The prototype file: which devices are emulated, from which data source, and at which endpoint.
+
+The process of the simulated field devices and its starter read it; the plant, gateway and PLC never do.
+"""
 
 from __future__ import annotations
 
@@ -60,8 +62,9 @@ class Prototype:
     form: PrototypeForm
 
     def with_listen(self, system: System, bus: str, listen: Endpoint) -> Prototype:
-        """Return a copy in which the emulators of `bus` of `system` listen elsewhere. Raises `UsageError` if another
-        bus is there.
+        """Return a copy in which the emulators of `bus` of `system` listen elsewhere.
+
+        Raises `UsageError` if another bus is there.
         """
         buses = {**self.buses, bus: replace(self.buses[bus], listen=listen)}
         if (clash := _clash(system, buses)) is not None:
@@ -173,9 +176,11 @@ class _Clash(NamedTuple):
 
 
 def _clash(system: System, buses: Mapping[str, EmulatedBus]) -> _Clash | None:
-    """Return the first clash between buses, if any. Several CAN buses may share one software bus if all their nodes
-    have different ids; a duplicate id is a fault, to be injected as such (`duplicate-node`). A port or a socket belongs
-    to one bus."""
+    """Return the first clash between buses, if any.
+
+    Several CAN buses may share one software bus if all their nodes have different ids; a duplicate id is a fault, to be
+    injected as such (`duplicate-node`). A port or a socket belongs to one bus.
+    """
     wires: dict[Endpoint, str] = {}
     nodes: dict[tuple[Endpoint, int], str] = {}
     for name, bus in buses.items():

@@ -47,7 +47,9 @@ class DigitalTwinPrototype:
     def field(
         self, run_dir: Path, ports: Ports | None = None, water: Mapping[str, ModemEnd] | None = None
     ) -> FieldSide:
-        """Return the emulators on their connections, not opened yet. The connections are the operating system's unless
-        other `ports` are given. Virtual serial ports get their links in `run_dir`. `water`: the acoustic ends of
-        transmitters that are in a network."""
+        """Return the emulators on their connections, not opened yet.
+
+        The connections are the operating system's unless other `ports` are given. Virtual serial ports get their links
+        in `run_dir`. `water`: the acoustic ends of transmitters that are in a network.
+        """
         return FieldSide(self.ecs.system, self.prototype, run_dir, self._clock, ports, water)

@@ -23,8 +23,9 @@ from fieldtwin.twin.site.system import System
 
 
 def check_simulations(file: YamlFile, form: PrototypeForm, system: System) -> None:
-    """Check everything that can be known about a prototype's simulations without running its Python code. Raises
-    `FileInvalid`.
+    """Check everything that can be known about a prototype's simulations without running its Python code.
+
+    Raises `FileInvalid`.
     """
     for name, simulation in form.simulations.items():
         loc = ("simulations", name)
@@ -99,9 +100,7 @@ def _python(file: YamlFile, text: str) -> tuple[Path, str]:
 
 
 class Simulations:
-    """The simulations of one prototype, which all begin at `start_ns`. Raises `FileInvalid` for a Python model that
-    fails.
-    """
+    """The simulations of one prototype, which all begin at `start_ns`. Raises `FileInvalid` for a Python model that fails."""
 
     def __init__(self, file: YamlFile, form: PrototypeForm, system: System, start_ns: int) -> None:
         self._file, self._form, self._system = file, form, system

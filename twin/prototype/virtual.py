@@ -38,9 +38,7 @@ from fieldtwin.twin.site.system import System
 
 FLUSH_EVERY_NS = 60 * NS_PER_S
 STARTING_NS = NS_PER_S // 20
-"""Delay between the simulated devices and the control system: devices are ready before the first request, as in real
-time.
-"""
+"""Delay between the simulated devices and the control system: devices are ready before the first request, as in real time."""
 _IN_MEMORY = Path(":memory:")
 
 

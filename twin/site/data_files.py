@@ -33,9 +33,7 @@ TEMPLATE = "template.json"
 
 
 def template_of(file: Path | None) -> list[Path]:
-    """Return the folder of the template that contains `file`, as a list of one; an empty list if no template contains
-    it.
-    """
+    """Return the folder of the template that contains `file`, as a list of one; an empty list if no template contains it."""
     above = list(file.parents)[1:2] if file is not None else []
     return [folder for folder in above if (folder / TEMPLATE).is_file()]
 
@@ -99,9 +97,7 @@ def network_file(name: str, profiles: Iterable[Path] = ()) -> Path | None:
 
 
 def find_recording(name: str, beside: Path | None = None) -> Path:
-    """Return a recording by path: in the folder of the file that names it, in its template, in ./recordings, or
-    shipped.
-    """
+    """Return a recording by path: in the folder of the file that names it, in its template, in ./recordings, or shipped."""
     folders = [beside.parent] if beside else []
     folders += [folder / "recordings" for folder in template_of(beside)]
     folders += [Path(), Path("recordings"), data_root() / "recordings"]

@@ -53,8 +53,9 @@ class BusForm(Strict):
 
 
 class PollForm(Strict):
-    """How often a poll group is read, and its phase within the period. By default groups with the same period are
-    spread over it.
+    """How often a poll group is read, and its phase within the period.
+
+    By default groups with the same period are spread over it.
     """
 
     every_ms: Milliseconds
@@ -62,8 +63,9 @@ class PollForm(Strict):
 
 
 class HeartbeatForm(Strict):
-    """CANopen heartbeat times (CiA 301: 1017h in the node, 1016h in the master). Without `producer_ms` the node keeps
-    its own time.
+    """CANopen heartbeat times (CiA 301: 1017h in the node, 1016h in the master).
+
+    Without `producer_ms` the node keeps its own time.
     """
 
     producer_ms: Milliseconds | None = None
@@ -172,8 +174,9 @@ class ProgramForm(Strict):
 
 
 class TaskForm(Strict):
-    """A task (IEC 61131-3): runs every `interval_ms`, or once at each rising edge of the tag `single`. Priority 0 is
-    the highest.
+    """A task (IEC 61131-3): runs every `interval_ms`, or once at each rising edge of the tag `single`.
+
+    Priority 0 is the highest.
     """
 
     interval_ms: Milliseconds | None = None
@@ -202,8 +205,9 @@ class PlcForm(Strict):
 
 
 class ServedTagForm(Strict):
-    """Where a tag is served: exactly one of the four tables, at a PDU address. `type` is the type of the served value.
-    A quality register holds 0 for good quality.
+    """Where a tag is served: exactly one of the four tables, at a PDU address.
+
+    `type` is the type of the served value. A quality register holds 0 for good quality.
     """
 
     input: Address | None = None
@@ -315,8 +319,9 @@ class BusMappingForm(Strict):
 
 
 class FarLinkForm(Strict):
-    """The acoustic link between the two modems. The modems recover from losses by `loss`; nothing recovers from `lost`,
-    `repeated` and `overtakes`.
+    """The acoustic link between the two modems.
+
+    The modems recover from losses by `loss`; nothing recovers from `lost`, `repeated` and `overtakes`.
     """
 
     bytes_per_s: float = Field(default=80.0, gt=0)
@@ -330,9 +335,7 @@ class FarLinkForm(Strict):
 
 
 class BusyForm(Strict):
-    """After every `every` accepted requests, a Modbus device answers with exception 06 (busy) for `for_ms`
-    milliseconds.
-    """
+    """After every `every` accepted requests, a Modbus device answers with exception 06 (busy) for `for_ms` milliseconds."""
 
     every: int = Field(ge=1)
     for_ms: Milliseconds

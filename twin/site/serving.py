@@ -36,8 +36,11 @@ class Serving:
     bridges: tuple[BridgeConfig, ...] = ()
 
     def for_run(self, *, allow_writes: bool, free_ports: bool) -> Serving:
-        """Return the sections as a gateway runs them. With `free_ports` (a prototype) sockets take a free port of the
-        same host. A serial line is also opened elsewhere then, by the connector."""
+        """Return the sections as a gateway runs them.
+
+        With `free_ports` (a prototype) sockets take a free port of the same host. A serial line is also opened
+        elsewhere then, by the connector.
+        """
         bridges = [replace(b, policy=replace(b.policy, allow_writes=allow_writes)) for b in self.bridges]
         if not free_ports:
             return Serving(self.serve, tuple(bridges))

@@ -32,8 +32,11 @@ SCHEMES = ("rtu", "ascii", "tcp", "rtu+tcp", "udp", "tls", "can")
 
 @dataclass(frozen=True)
 class System:
-    """A resolved system. Dictionaries keep the file's order. `hash` identifies a version of the file. `warnings` are for
-    the file's author, each with its place in the file."""
+    """A resolved system.
+
+    Dictionaries keep the file's order. `hash` identifies a version of the file. `warnings` are for the file's author,
+    each with its place in the file.
+    """
 
     name: str
     path: Path
@@ -173,9 +176,7 @@ def _check_device(file: YamlFile, loc: tuple[Key, ...], d: DeviceForm, config: D
 def _safe_outputs(
     file: YamlFile, loc: tuple[Key, ...], d: DeviceForm, profile: DeviceProfile
 ) -> dict[str, int | float]:
-    """Check `writable` and `safe`. Return the safe value of each tag as a number; the file may give the name of a
-    value.
-    """
+    """Check `writable` and `safe`. Return the safe value of each tag as a number; the file may give the name of a value."""
     mailbox = {"outbox", "inbox_ack"} if profile.inbox else set()
     for i, tag in enumerate(d.writable):
         if tag not in mailbox:
@@ -269,7 +270,7 @@ def _check_programs(system: System) -> None:
 
 
 def _check_write_groups(system: System) -> None:
-    """Members are outputs of programs, and in one group only: nothing else may write a member alone."""
+    """Check that members of groups are outputs of programs, each in one group only, so that none is written alone."""
     written = set(_outputs(system.plc))
     for name, device in system.devices.items():
         seen: dict[str, str] = {}

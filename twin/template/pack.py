@@ -166,8 +166,9 @@ def _program(got: Collected, system: Path, source: str) -> None:
 
 
 def _python(got: Collected, folder: Path, module: str) -> bool:
-    """Add a module from the system file's folder, and the modules of that folder that it imports. Return False if it is
-    not there. Nothing is run.
+    """Add a module from the system file's folder, and the modules of that folder that it imports.
+
+    Return False if it is not there. Nothing is run.
     """
     top = module.partition(".")[0]
     package, single = folder / top, folder / f"{top}.py"

@@ -307,8 +307,9 @@ def _bounded(text: bytes, where: str) -> bytes:
 
 
 def _check_directory(path: Path) -> None:
-    """Refuse a zip directory that would need more memory than a template can. It is located in the same way as zipfile
-    does.
+    """Refuse a zip directory that would need more memory than a template can.
+
+    It is located in the same way as zipfile does.
     """
     size = path.stat().st_size
     if size > MAX_TOTAL_BYTES + MAX_DIRECTORY_BYTES:

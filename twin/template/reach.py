@@ -58,8 +58,9 @@ def _listening(at: Endpoint, what: str) -> Iterator[str]:
 
 
 def _is_loopback(host: str) -> bool:
-    """Return whether `host` is a loopback address. No name except localhost counts as one, because names are resolved
-    elsewhere.
+    """Return whether `host` is a loopback address.
+
+    No name except localhost counts as one, because names are resolved elsewhere.
     """
     bare = host.strip("[]")
     return bare in ("localhost", "::1") or (

@@ -19,9 +19,7 @@ from fieldtwin.gateway.core.errors import FileInvalid
 
 PACKAGE = "fieldtwin"
 HERE = Path(__file__).absolute().parents[3]
-"""The folder that holds the package. Not resolved: in a checkout fieldtwin/twin is a link to a folder outside the
-package.
-"""
+"""The folder that holds the package. Not resolved: in a checkout fieldtwin/twin is a link to a folder outside the package."""
 MAX_MODULE_BYTES = 16 << 20
 MAX_MODULES = 10_000
 MAX_WHEEL_BYTES = 16 << 20
@@ -47,9 +45,7 @@ def _modules_below(folder: Path) -> Iterator[tuple[str, bytes]]:
 
 
 def wheel_hash(wheel: Path) -> tuple[str, str]:
-    """Return the version of a fieldtwin wheel, and the hash over the modules that it would install. Raises
-    `FileInvalid`.
-    """
+    """Return the version of a fieldtwin wheel, and the hash over the modules that it would install. Raises `FileInvalid`."""
     match = re.fullmatch(r"fieldtwin-([0-9A-Za-z.!+_]+)-[^-]+-[^-]+-[^-]+\.whl", wheel.name)
     if match is None:
         raise FileInvalid("no wheel of fieldtwin", path=str(wheel), expected="fieldtwin-VERSION-py3-none-any.whl")
@@ -63,8 +59,10 @@ def wheel_hash(wheel: Path) -> tuple[str, str]:
 
 
 def _modules_in(archive: zipfile.ZipFile, about: str) -> Iterator[tuple[str, bytes]]:
-    """Yield everything that the wheel would install, except for shipped data and its metadata (`about`). A module of
-    another package is included, because a fieldtwin wheel has none."""
+    """Yield everything that the wheel would install, except for shipped data and its metadata (`about`).
+
+    A module of another package is included, because a fieldtwin wheel has none.
+    """
     entries = archive.infolist()
     if len(entries) > MAX_MODULES:
         raise FileInvalid("too many files for a wheel of ours", path=str(archive.filename), expected=f"{MAX_MODULES}")

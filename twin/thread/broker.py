@@ -35,8 +35,10 @@ def is_broker(place: str) -> bool:
 
 
 def broker_carrier(place: str, clock: Clock, plant: System | None) -> Carrier:
-    """Return the carrier of an edge node for `plant`, or of the host application if `plant` is None. Raises
-    `UsageError` for an invalid URL, and `Unreachable` for unusable certificate files."""
+    """Return the carrier of an edge node for `plant`, or of the host application if `plant` is None.
+
+    Raises `UsageError` for an invalid URL, and `Unreachable` for unusable certificate files.
+    """
     try:
         from fieldtwin.twin.thread.mqtt import Broker, MqttCarrier  # an extra
     except ModuleNotFoundError as e:

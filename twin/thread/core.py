@@ -70,8 +70,9 @@ class _Rto:
 
 
 class Outgoing:
-    """One log that is being sent. `first` and `last` are the span of the store. When `wanted` asks for events, the
-    caller passes them to `load`.
+    """One log that is being sent.
+
+    `first` and `last` are the span of the store. When `wanted` asks for events, the caller passes them to `load`.
     """
 
     def __init__(self, origin: str, schema: bytes, first: int, last: int, *, prototype: bool, fit: Fit) -> None:
@@ -82,9 +83,7 @@ class Outgoing:
         self.through = 0
         """Every event up to this number is in the other side's log."""
         self.refused = False
-        """The other side does not have this side's schema. HELLO is repeated now and then, because it may get the
-        schema.
-        """
+        """The other side does not have this side's schema. HELLO is repeated now and then, because it may get the schema."""
         self.resent = 0
         self.linger_ns = 0
         """How long events wait for more events that fill the frame. The carrier sets it."""
@@ -129,9 +128,7 @@ class Outgoing:
         return first, min(room, self.last - first + 1)
 
     def load(self, first: int, events: Sequence[Event]) -> None:
-        """Take the events that the store has from number `first` on. Numbers that it no longer has are reported as
-        lost.
-        """
+        """Take the events that the store has from number `first` on. Numbers that it no longer has are reported as lost."""
         expected = first
         for event in events:
             if event.sequence > expected:
@@ -154,9 +151,7 @@ class Outgoing:
     # -- what comes -------------------------------------------------------------------------------------------------------
 
     def connected(self, now_ns: int) -> None:
-        """Start over on a link, which may be new: frames in flight may be lost, and the other side may be a different
-        one.
-        """
+        """Start over on a link, which may be new: frames in flight may be lost, and the other side may be a different one."""
         self._known = False
         self._hello_ns = now_ns
         self._doubt_ns = self._asked_ns = None
@@ -206,9 +201,11 @@ class Outgoing:
             self._rto.calm()
 
     def _is_less(self, through: int, now_ns: int) -> bool:
-        """Handle an ACK for less than was confirmed before: it is late, or the other side is a different one. HELLO
-        asks, and its answer is believed, because the earlier confirmations were another side's. Return whether to use
-        this ACK."""
+        """Handle an ACK for less than was confirmed before: it is late, or the other side is a different one.
+
+        HELLO asks, and its answer is believed, because the earlier confirmations were another side's. Return whether to
+        use this ACK.
+        """
         asked_ns = self._asked_ns
         if self._known and (asked_ns is None or now_ns - asked_ns < self._rto.smoothed_ns // 2):
             self._doubt_ns = now_ns if self._doubt_ns is None else self._doubt_ns
@@ -408,8 +405,9 @@ class _Stream:
 
 
 class Incoming:
-    """Receives logs of other sides. `knows` tells whether a schema can be decoded. ACKs are delayed by `ack_delay_ns`,
-    so that one serves many frames.
+    """Receives logs of other sides.
+
+    `knows` tells whether a schema can be decoded. ACKs are delayed by `ack_delay_ns`, so that one serves many frames.
     """
 
     def __init__(self, knows: Callable[[bytes], bool], ack_delay_ns: int) -> None:

@@ -68,7 +68,7 @@ class ThreadEnd:
         self._on_events = on_events
         self._insists = insists
         self.silent = "there was no link"
-        """What it means that nothing has ever been received; empty once something has."""
+        """Explanation if nothing has ever been received; empty once something has."""
         self._link: Link | None = None
         self._news = asyncio.Event()
         self._told: dict[str, int] = {}
@@ -91,8 +91,9 @@ class ThreadEnd:
             self._news.set()
 
     async def make_room(self) -> int:
-        """Forget the older half of what the other side has confirmed, when this side's store is full. Return the number
-        of events.
+        """Forget the older half of what the other side has confirmed, when this side's store is full.
+
+        Return the number of events.
         """
         if self.out is None:
             return 0

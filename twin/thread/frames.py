@@ -52,8 +52,10 @@ class Schema:
 
     @property
     def id(self) -> bytes:
-        """The first bytes of a SHA-256 over the version of this encoding, the system and the names. Two plants of the
-        same design therefore have different schemas."""
+        """The first bytes of a SHA-256 over the version of this encoding, the system and the names.
+
+        Two plants of the same design therefore have different schemas.
+        """
         whole = "\n".join((str(VERSION), self.system, *self.names))
         return hashlib.sha256(whole.encode()).digest()[:SCHEMA_BYTES]
 
@@ -81,9 +83,7 @@ class Data:
 
 @dataclass(frozen=True, slots=True)
 class Ack:
-    """Everything up to `through` is stored. `runs` follow it: pairs of a number of missing and a number of stored
-    events.
-    """
+    """Everything up to `through` is stored. `runs` follow it: pairs of a number of missing and a number of stored events."""
 
     tag: bytes
     through: int
@@ -243,8 +243,9 @@ def _decode_event(reader: Reader, sequence: int, before_ms: int, schema: Schema)
 
 
 class FrameCodec:
-    """Converts frames to datagrams of at most `mtu` bytes, and back. Each link needs its own, because it remembers tags
-    and pieces.
+    """Converts frames to datagrams of at most `mtu` bytes, and back.
+
+    Each link needs its own, because it remembers tags and pieces.
     """
 
     def __init__(self, schemas: Iterable[Schema], mtu: int) -> None:

@@ -32,8 +32,9 @@ NOT_ASKED = DeviceState.error
 
 
 class ModemLink(DatagramLink):
-    """A link through a transmitter's mailboxes. It persists while the modem is offline, and sends what it holds when
-    the modem is back.
+    """A link through a transmitter's mailboxes.
+
+    It persists while the modem is offline, and sends what it holds when the modem is back.
     """
 
     ack_delay_ns = ACK_DELAY_NS

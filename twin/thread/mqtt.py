@@ -55,9 +55,7 @@ class _Heard(logging.Handler):
 
 
 def _refusal(e: aiomqtt.MqttError, heard: str, where: str) -> Unreachable:
-    """Return why there is no session. A broker that is not reachable may be later; one that refuses will go on
-    refusing.
-    """
+    """Return why there is no session. A broker that is not reachable may be later; one that refuses will go on refusing."""
     cause = e.__context__  # aiomqtt keeps the exception that paho raised
     if isinstance(cause, ssl.SSLCertVerificationError):
         hint = "ca= names who is trusted; the certificate is for the host in the URL"
@@ -167,8 +165,11 @@ class MqttLink(Link):
 
 
 class MqttCarrier(Carrier):
-    """Connects to the broker. `make_side` is called for each session with its number, because births and deaths are
-    counted, and with its start time (UTC, ms)."""
+    """Connects to the broker.
+
+    `make_side` is called for each session with its number, because births and deaths are counted, and with its start
+    time (UTC, ms).
+    """
 
     def __init__(self, broker: Broker, make_side: Callable[[int, int], Side], clock: Clock) -> None:
         self.name = f"thread over {broker}"

@@ -48,8 +48,10 @@ def _transmitter(name: str, system: System) -> str:
 async def plant_carrier(
     place: str, system: System, clock: Clock, connector: Connector | None = None
 ) -> tuple[Carrier, str]:
-    """Return the carrier of the plant's side, and its address. Port 0 in the URL chooses a free port. `connector` opens
-    the bus of a modem. Raises `UsageError`."""
+    """Return the carrier of the plant's side, and its address.
+
+    Port 0 in the URL chooses a free port. `connector` opens the bus of a modem. Raises `UsageError`.
+    """
     if device := lent_transmitter(place, system):
         bus = system.buses[system.devices[device].bus]
         return _modem(system, device, bus.endpoint, connector or OsConnector(), clock), place

@@ -54,9 +54,11 @@ NAMES = list(STATES)
 
 
 class PlantThreadConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The configuration of the process. `place` is the address of the thread (`fieldtwin.twin.thread.place`), `store` a
-    file or a database. `mapping` is None on a plant. `every_ms` is the shortest interval between two shared values of a
-    tag."""
+    """The configuration of the process.
+
+    `place` is the address of the thread (`fieldtwin.twin.thread.place`), `store` a file or a database. `mapping` is
+    None on a plant. `every_ms` is the shortest interval between two shared values of a tag.
+    """
 
     system: str
     run_dir: str
@@ -227,9 +229,7 @@ class PlantThread:
         return self._clock.utc_ns() // NS_PER_MS
 
     async def _commanded(self, origin: str, events: Sequence[Event]) -> None:
-        """Pass each command from the digital twin's log to the gateway, if the gate admits it. Each number arrives
-        once.
-        """
+        """Pass each command from the digital twin's log to the gateway, if the gate admits it. Each number arrives once."""
         for event in events:
             if event.kind != Kind.COMMAND:
                 continue
@@ -243,9 +243,7 @@ class PlantThread:
                 self._gate.share(Kind.REFUSAL, "gateway", f"number {event.sequence} of {origin}: {e}")
 
     async def _hand_over(self, client: ControlClient, origin: str, event: Event) -> None:
-        """Pass a command on. The switch and the limits are read from the gateway, because a reload may have changed
-        them.
-        """
+        """Pass a command on. The switch and the limits are read from the gateway, because a reload may have changed them."""
         now = await client.call("gate")
         least_s, most_s = now["period_s"]
         self._gate.restate(remote=now["remote"], bounds=Bounds(least_s, most_s, now["per_minute"]))

@@ -45,9 +45,7 @@ BD_SEQ = "bdSeq"
 JUDGED = "fieldtwin"
 """Property of a metric: kind, quality and reason of the event, one byte each."""
 HISTORICAL_MS = 10_000
-"""An event that is older than this when it is sent is marked historical: a host stores it and does not show it as
-current.
-"""
+"""An event that is older than this when it is sent is marked historical: a host stores it and does not show it as current."""
 MAX_EVENTS = 250
 MAX_BYTES = 60_000
 
@@ -154,8 +152,11 @@ class _Side:
 
 
 class EdgeNode(_Side):
-    """The physical twin's side. Each link, which began at `began_ms` (UTC), needs a new one; `bd_seq` counts its births
-    and deaths and increases by one each time."""
+    """The physical twin's side.
+
+    Each link, which began at `began_ms` (UTC), needs a new one; `bd_seq` counts its births and deaths and increases by
+    one each time.
+    """
 
     def __init__(
         self,
@@ -189,9 +190,7 @@ class EdgeNode(_Side):
         return Message(topic(self._group, "NDEATH", self._node), encode_payload(Payload(self._began_ms, (bd,))), qos=1)
 
     def hello(self) -> list[Message]:
-        """Return what to publish when the link is established: nothing, because the birth is sent with the thread's
-        HELLO.
-        """
+        """Return what to publish when the link is established: nothing, because the birth is sent with the thread's HELLO."""
         return []
 
     def messages(self, frame: Frame, now_ms: int) -> list[Message]:
@@ -240,8 +239,11 @@ class EdgeNode(_Side):
 
 
 class HostApplication(_Side):
-    """The digital twin's side: host `host` of one edge node. Each link, which began at `began_ms` (UTC), needs a new
-    one. Both birth and death of a session carry that time (Sparkplug 3.0.0, 6.4.27)."""
+    """The digital twin's side: host `host` of one edge node.
+
+    Each link, which began at `began_ms` (UTC), needs a new one. Both birth and death of a session carry that time
+    (Sparkplug 3.0.0, 6.4.27).
+    """
 
     def __init__(self, group: str, node: str, host: str, began_ms: int = 0) -> None:
         super().__init__()

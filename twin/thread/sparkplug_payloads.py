@@ -35,8 +35,9 @@ _SIGNED = {DataType.INT8: 32, DataType.INT16: 32, DataType.INT32: 32, DataType.I
 
 @dataclass(frozen=True, slots=True)
 class Metric:
-    """A metric. In data it has a name or an alias; `datatype` 0 means the type of the birth. `properties` are integers
-    by name.
+    """A metric. In data it has a name or an alias; `datatype` 0 means the type of the birth.
+
+    `properties` are integers by name.
     """
 
     name: str = ""

@@ -62,8 +62,9 @@ class StreamLink(DatagramLink):
                 return frame
 
     async def _word(self, data: bytes) -> bool:
-        """Process a control message and return whether `data` was one. Raises `Unwelcome` if the other side refuses
-        this one.
+        """Process a control message and return whether `data` was one.
+
+        Raises `Unwelcome` if the other side refuses this one.
         """
         if data.startswith(TAKEN):
             raise Unwelcome(

@@ -56,8 +56,9 @@ class Analyze(DTDigitalThreadProcess):
         self._first_ms = self._last_ms = self._reports = 0
 
     def recall(self) -> None:
-        """Restore what was known before a restart. A finding that held then is emitted again as soon as the plant
-        confirms it.
+        """Restore what was known before a restart.
+
+        A finding that held then is emitted again as soon as the plant confirms it.
         """
         for message in self.consumer.drain():
             if isinstance(message, SeenMeasurement) and message.event.kind == Kind.VALUE:
@@ -66,8 +67,9 @@ class Analyze(DTDigitalThreadProcess):
                 self._history |= {(name, wrong) for wrong in self._wrong[name]}
 
     def check_statuses(self, status: SeenStatus) -> bool | None:
-        """CheckStatuses: return whether the reported state and period equal the model's. None if the status cannot be
-        decoded.
+        """CheckStatuses: return whether the reported state and period equal the model's.
+
+        None if the status cannot be decoded.
         """
         try:
             state, period_s = decode_status(status.data)

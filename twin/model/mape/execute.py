@@ -33,8 +33,10 @@ class Bounds:
 
 
 class CommandCheck:
-    """Checks that a command can be decoded, is inside its bounds and does not exceed the rate. Plant and twin each have
-    their own check: the plant does not rely on the twin that commands it."""
+    """Checks that a command can be decoded, is inside its bounds and does not exceed the rate.
+
+    Plant and twin each have their own check: the plant does not rely on the twin that commands it.
+    """
 
     def __init__(self, bounds: Bounds, clock: Clock) -> None:
         self.bounds = bounds
@@ -97,9 +99,7 @@ class Execute(DTDigitalThreadProcess):
         return self._pending is not None
 
     def change_state(self, command: COMMAND) -> str:
-        """ChangeState: apply the command to the model. If it is refused, return the reason and leave the model
-        unchanged.
-        """
+        """ChangeState: apply the command to the model. If it is refused, return the reason and leave the model unchanged."""
         objection = self._check.objection(command)
         if not objection:
             self.digital_model.process_event(command)
@@ -122,9 +122,7 @@ class Execute(DTDigitalThreadProcess):
             self._settle(command, why)
 
     def _next(self) -> tuple[COMMAND, str | None]:
-        """Return the first command and the objection to it before the model takes it. None: the answer is still
-        pending.
-        """
+        """Return the first command and the objection to it before the model takes it. None: the answer is still pending."""
         if self._pending is None:
             command = self.plans.consume()
             question = command.question if isinstance(command, PlannedCommand) else self._question

@@ -33,8 +33,9 @@ class SeenMeasurement(MEASUREMENT):
 
     @property
     def reason(self) -> Reason:
-        """Reason for a quality that is not good. A reason that is unknown to this version, from a newer plant, is read
-        as NONE.
+        """Reason for a quality that is not good.
+
+        A reason that is unknown to this version, from a newer plant, is read as NONE.
         """
         return Reason(self.event.reason) if self.event.reason in _REASONS else Reason.NONE
 

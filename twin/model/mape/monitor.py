@@ -21,7 +21,7 @@ CAPACITY = 10_000
 
 
 class Monitor(DTDigitalThreadProcess):
-    """SPEC row Monitor. `statuses` and `measurements` are its consumers, `emitter` its producer; the model is the twin's."""
+    """SPEC row Monitor. `statuses` and `measurements` are its consumers, `emitter` its producer; it updates the twin's model."""
 
     def __init__(self, model: DigitalModel, clock: Clock) -> None:
         super().__init__("monitor", clock)
@@ -41,8 +41,9 @@ class Monitor(DTDigitalThreadProcess):
             self.measurements.observe(SeenMeasurement(data, event, arrived_ms))
 
     def handle_state(self) -> None:
-        """handleState: per STATUS consume ; digitalModel.ProcessEvent ; emit. A status that cannot be decoded is
-        counted and leaves the model unchanged.
+        """handleState: per STATUS consume ; digitalModel.ProcessEvent ; emit.
+
+        A status that cannot be decoded is counted and leaves the model unchanged.
         """
         for status in self.statuses.drain():
             try:

@@ -36,8 +36,9 @@ _ABOUT = {
 
 
 class Planner(Protocol):
-    """Planning: from DATA to COMMAND, or None if no command is needed. A `FieldtwinError` that it raises is kept as a
-    refusal.
+    """Planning: from DATA to COMMAND, or None if no command is needed.
+
+    A `FieldtwinError` that it raises is kept as a refusal.
     """
 
     def plan(self, data: DATA, model: DigitalModel) -> COMMAND | None: ...

@@ -40,7 +40,5 @@ class WhatIf(Protocol):
         ...
 
     def answer(self) -> str | None:
-        """Return None if there is no answer yet, an empty text if nothing speaks against the command, else the
-        objection.
-        """
+        """Return None if there is no answer yet, an empty text if nothing speaks against the command, else the objection."""
         ...

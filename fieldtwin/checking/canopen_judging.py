@@ -1,4 +1,4 @@
-"""What many CANopen cases ask: was it aborted with that code, is all well again; and objects that have what a case needs."""
+"""Checks that many CANopen cases share: an expected abort, the recovery afterwards, and suitable objects."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from fieldtwin.gateway.protocols.canopen.abort_codes import UNKNOWN_SPECIFIER
 
 
 def aborted(reply: Reply, *codes: int) -> str:
-    """Empty if `reply` is an abort with one of `codes`, else what is wrong."""
+    """Return an empty string if `reply` is an abort with one of `codes`, else a description of the difference."""
     if reply.abort and reply.abort in codes:
         return ""
     return f"{reply} instead of abort {' or '.join(f'{code:08X}' for code in codes)}"
 
 
 async def verdict(wire: CanopenWire, wrong: str, good: str = "") -> Finding:
-    """FAILED with what is wrong, or because the node does not go on afterwards; else passed."""
+    """Return FAILED for an error in `wrong`, or if the node does not recover afterwards; else PASSED."""
     if wrong:
         return failed(wrong)
     after = await wire.still_good()
@@ -24,7 +24,7 @@ async def verdict(wire: CanopenWire, wrong: str, good: str = "") -> Finding:
 
 
 async def must_abort(wire: CanopenWire, request: bytes, *codes: int) -> Finding:
-    """An SDO request that has to be aborted with one of `codes`; then the node goes on."""
+    """Send an SDO request that has to be aborted with one of `codes`; then the node must continue to answer."""
     reply = await wire.ask(request)
     if reply.data and not reply.abort:
         await wire.abandon((0x1000, 0))
@@ -39,7 +39,7 @@ async def long_object(wire: CanopenWire) -> Key:
 
 
 async def begin_upload(wire: CanopenWire, key: Key) -> None:
-    """An upload that will take segments. Raises `NotHere` where it does not come to that."""
+    """Begin an upload in segments. Raises `NotHere` if the node answers otherwise."""
     reply = await wire.ask(b"\x40" + mux(*key))
     if reply.specifier != 2 or reply.data[0] & 2:
         raise NotHere(f"{shown(key)} is not uploaded in segments: {reply}")

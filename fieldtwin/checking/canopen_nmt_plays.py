@@ -32,7 +32,7 @@ NAMES = {OPERATIONAL: "OPERATIONAL", STOPPED: "STOPPED", PRE_OPERATIONAL: "PRE-O
 
 @asynccontextmanager
 async def _restored(wire: CanopenWire) -> AsyncIterator[None]:
-    """The node's state afterwards is what it was; PRE-OPERATIONAL where it never told."""
+    """Restore the node's NMT state afterwards; PRE-OPERATIONAL if it was never reported."""
     before = wire.state
     try:
         yield

@@ -1,4 +1,4 @@
-"""Cases of SDO uploads, ordinary and by blocks: nothing is written. Clauses are CiA 301's."""
+"""Cases of SDO uploads, ordinary and in blocks: nothing is written. Clauses are CiA 301's."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ UNLIKELY = (0x5FFE, 0x5F0D, 0x2FFD, 0x1FFE)
 """Indices that very few devices have."""
 MOST_BLOCKS = 200
 COUNTED = (0x1018, 0x1010, 0x1016, 0x1029)
-"""Records and arrays whose sub 00 says how many subindices there are."""
+"""Records and arrays whose sub 00 states their number of subindices."""
 
 
 async def toggle_repeated(wire: CanopenWire) -> Finding:
@@ -62,10 +62,10 @@ async def unknown_specifier(wire: CanopenWire) -> Finding:
 
 
 async def begun_anew(wire: CanopenWire) -> Finding:
-    """CO-005: another upload starts in the middle of one.
+    """CO-005: begin a second upload in the middle of one.
 
     The server may serve the new upload at once, or abort it and serve the next one: CiA 301 describes neither, and the
-    transfer that was interrupted is over in both cases.
+    interrupted transfer is over in both cases.
     """
     await begin_upload(wire, await long_object(wire))
     await wire.ask(b"\x60")
@@ -79,7 +79,7 @@ async def begun_anew(wire: CanopenWire) -> Finding:
 
 
 async def write_only(wire: CanopenWire) -> Finding:
-    """CO-007: an upload of an object that the EDS says is write-only."""
+    """CO-007: upload an object that is write-only according to the EDS."""
     entries = [e for e in wire.dictionary or () if not e.readable]
     if not entries:
         raise NotHere("the EDS has no write-only object")
@@ -105,7 +105,7 @@ async def subindex_of_a_var(wire: CanopenWire) -> Finding:
 
 
 async def subindex_beyond(wire: CanopenWire) -> Finding:
-    """CO-008: one subindex more than sub 00 says."""
+    """CO-008: upload one subindex beyond the number in sub 00."""
     for index in COUNTED:
         count = await wire.upload((index, 0))
         if isinstance(count, bytes) and len(count) == 1 and count[0] < 0xFE:
@@ -124,7 +124,7 @@ async def empty_history(wire: CanopenWire) -> Finding:
 
 
 async def short_request(wire: CanopenWire) -> Finding:
-    """CO-026: an upload request of 4 bytes: ignored, or taken by option."""
+    """CO-026: send an upload request of 4 bytes, which is ignored or optionally accepted."""
     wire.forget()
     await wire.tell(b"\x40" + mux(0x1000))
     reply = await wire.reply()
@@ -165,7 +165,7 @@ async def _any_object(wire: CanopenWire) -> Key:
 
 
 async def no_switch_unasked(wire: CanopenWire) -> Finding:
-    """CO-021: a block upload whose client does not allow the switch to an ordinary one: blocks, or an abort."""
+    """CO-021: request a block upload without permission to switch to an ordinary one: blocks, or an abort."""
     key = await _any_object(wire)
     reply = await _begin_block(wire, key, 127, switch=0)
     if not reply.data:
@@ -195,7 +195,7 @@ async def block_size_128(wire: CanopenWire) -> Finding:
 
 
 async def _block(wire: CanopenWire, size: int) -> list[bytes] | str:
-    """The segments of one sub-block, or what came instead."""
+    """Return the segments of one sub-block, or a description of the differing reply."""
     segments: list[bytes] = []
     while len(segments) < size:
         reply = await wire.reply()
@@ -208,9 +208,10 @@ async def _block(wire: CanopenWire, size: int) -> list[bytes] | str:
 
 
 async def _block_upload(wire: CanopenWire, key: Key, size: int, *, lose: bool) -> tuple[bytes, str]:
-    """A whole block upload, acknowledged to the last but one segment of the first sub-block if `lose`; value and what is wrong.
+    """Make a whole block upload; return the value and any error.
 
-    The end is left open: the server's last frame has been heard, the client's is still to be sent.
+    With `lose`, the first sub-block is acknowledged only up to its last but one segment. The end is left open: the
+    server's last frame has been received, the client's has not been sent.
     """
     begun = await _begin_block(wire, key, size)
     if begun.specifier != 6:

@@ -1,4 +1,4 @@
-"""A check of a CANopen node from beginning to end: listen, learn, ask who it is, play the cases."""
+"""A complete check of a CANopen node: listen, learn, read its identity, run the cases."""
 
 from __future__ import annotations
 
@@ -23,15 +23,17 @@ from fieldtwin.gateway.wallclock import WallClock
 NAMES = {(0x1008, 0): "name", (0x1009, 0): "hardware", (0x100A, 0): "software"}
 NUMBERS = {1: "vendor id", 2: "product code", 3: "revision", 4: "serial number"}
 LISTEN_S = 0.5
-"""Before anything is sent: a heartbeat tells the node's state."""
+"""Time in seconds of listening before anything is sent: a heartbeat states the node's state."""
 MOST_LONG = 20
 """Objects of the EDS that are tried for more than one segment."""
 
 
 @dataclass(frozen=True, slots=True)
 class CanopenOptions:
-    """How to check: `may_write` are objects that are lent for writing; `go_on` as in `ModbusOptions`. Nothing is sent
-    where another master speaks SDO with the node, unless `share_bus`: its transfers would be broken."""
+    """The options of a check: `may_write` are objects that may be written temporarily; `go_on` as in `ModbusOptions`.
+
+    Nothing is sent if another master exchanges SDOs with the node, unless `share_bus`: its transfers would be broken.
+    """
 
     endpoint: str
     node: int
@@ -50,7 +52,7 @@ class CanopenOptions:
 
 
 class _OfTheNode(Transcript):
-    """What concerns the node: a bus has others."""
+    """The frames of the node: a bus has others."""
 
     def __init__(self, clock: Clock, node: int) -> None:
         super().__init__(clock)
@@ -66,7 +68,10 @@ async def check_canopen(
     say: Callable[[str], None] = lambda text: None,
     tell: Callable[[DeviceResult], None] = lambda result: None,
 ) -> Checked:
-    """The whole check. Raises `Unreachable` where the node does not answer, `NotAllowed` where another master speaks with it."""
+    """Run the whole check.
+
+    Raises `Unreachable` without an answer, `NotAllowed` if another master exchanges SDOs with the node.
+    """
     dictionary = load_dictionary(options.eds, options.node) if options.eds is not None else None
     clock = options.clock or WallClock()
     began_ns = clock.monotonic_ns()
@@ -94,7 +99,7 @@ async def check_canopen(
 async def learn(wire: CanopenWire) -> dict[str, str]:
     """Read the device type and identity, and find an object of several segments. Raises `Unreachable` without an answer."""
     found: bytes | Reply = Reply()
-    for _ in range(2):  # once may be a lost frame
+    for _ in range(2):  # a single loss may be a lost frame
         found = await wire.upload((0x1000, 0))
         if isinstance(found, bytes):
             break

@@ -1,7 +1,7 @@
-"""A CAN bus as a checker of one node holds it: any frame out, every frame of the node in, and SDO by hand.
+"""The connection of a check to a CAN bus: any frame out, every frame of the node in, and SDO by hand.
 
-It must never know what a case is about. What may be sent is kept to what the case's danger allows: reading is uploads, however
-odd. Clauses are CiA 301's.
+It must not depend on the purpose of a case. It sends only frames that the case's impact level permits: reading means
+uploads, however unusual. Clauses are CiA 301's.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ NMT, SDO_REPLY, SDO_REQUEST, ERROR_CONTROL, LSS_REPLY, LSS_REQUEST = 0x000, 0x58
 OPERATIONAL, STOPPED, PRE_OPERATIONAL = 0x05, 0x04, 0x7F
 MOST_PENDING = 4096
 MOST_SEGMENTS = 1000
-"""Of an upload: 7,000 bytes are enough to see how it is done."""
+"""Maximum number of segments of an upload: 7,000 bytes are enough for a check."""
 Key = tuple[int, int]
 
 
@@ -100,7 +100,7 @@ class CanopenWire:
     # -- frames ----------------------------------------------------------------------------------------------------
 
     async def send(self, frame: CanFrame, *, at_once: bool = False) -> None:
-        """Send it if the danger allows; the rest between two frames is kept unless `at_once`."""
+        """Send a frame if the impact level permits it; keep the pause between two frames unless `at_once`."""
         self._must_be_allowed(frame)
         if not at_once:
             await self.clock.sleep_until_ns(self._sent_ns + round(self._spacing_s * NS_PER_S))
@@ -117,7 +117,7 @@ class CanopenWire:
         raise Bug(f"a check of danger {self.danger.value} would send {frame}")
 
     async def hear(self, cob_id: int, within_s: float | None = None, *, remote: bool = False) -> CanFrame | None:
-        """The next frame with that identifier; what else comes is kept for `seen`. None when none came in time."""
+        """Return the next frame with that identifier, None if none came in time; other frames are kept for `seen`."""
         try:
             async with asyncio.timeout(self.timeout_s if within_s is None else within_s):
                 while True:
@@ -140,7 +140,7 @@ class CanopenWire:
         return frame
 
     async def listen(self, s: float) -> list[CanFrame]:
-        """All that comes meanwhile."""
+        """Return all frames received within `s` seconds."""
         self._pending.clear()
         try:
             async with asyncio.timeout(s):
@@ -224,7 +224,7 @@ class CanopenWire:
         await self.send(CanFrame(NMT, bytes((command, self.node))))
 
     async def boots(self) -> bool:
-        """Whether a boot-up comes."""
+        """Return whether a boot-up message comes."""
         loop = asyncio.get_running_loop()
         end = loop.time() + self.boot_s
         while (left := end - loop.time()) > 0:
@@ -233,17 +233,17 @@ class CanopenWire:
                 return True
         return False
 
-    # -- when all is well --------------------------------------------------------------------------------------------
+    # -- normal behaviour --------------------------------------------------------------------------------------------
 
     async def still_good(self) -> str:
-        """Empty when 1000h is answered as before, else what came instead."""
+        """Return an empty string when 1000h is answered as before, else a description of the reply."""
         found = await self.upload((0x1000, 0))
         if found == self.device_type:
             return ""
         return str(found) if isinstance(found, Reply) else f"1000h is {found.hex(' ').upper()}"
 
     async def settle(self) -> bool:
-        """End whatever transfer there is, and see that all is well. False: it is not."""
+        """End any open transfer, and return whether the node answers normally."""
         for attempt in range(3):
             try:
                 await self.abandon((0x1000, 0))

@@ -1,4 +1,4 @@
-"""Cases of SDO downloads: to objects that must refuse, and to those that the user gave, which get back what was in them.
+"""Cases of SDO downloads: to objects that must refuse, and to those that the user gave, whose values are restored.
 
 Clauses are CiA 301's.
 """
@@ -77,13 +77,13 @@ async def _text(wire: CanopenWire) -> tuple[Key, bytes]:
 
 
 def _instead(key: Key, value: bytes | Reply) -> str:
-    """Say what a given object is, when a case cannot use it."""
+    """Describe a given object that a case cannot use."""
     if isinstance(value, Reply):
         return f"{shown(key)} could not be read ({value})"
     return f"{shown(key)} holds {len(value)} byte{'s' * (len(value) != 1)}"
 
 
-# -- what must refuse -------------------------------------------------------------------------------------------------
+# -- refusals ---------------------------------------------------------------------------------------------------------
 
 
 async def read_only_expedited(wire: CanopenWire) -> Finding:
@@ -142,11 +142,11 @@ async def _limit(wire: CanopenWire, *, above: bool) -> Finding:
         entry = wire.dictionary.get(*key) if wire.dictionary is not None else None
         bound = None if entry is None else entry.high if above else entry.low
         if not isinstance(bound, int):
-            continue  # no limit, or one of a real type: what lies next beyond it depends on the type's precision
+            continue  # no limit, or one of a real type, where the next value depends on the precision
         async with _borrowed(wire, key) as before:
             value, bits = (bound + 1 if above else bound - 1), 8 * len(before)
             least = -(1 << bits - 1) if entry is not None and entry.type_code in SIGNED else 0
-            if not least <= value < least + (1 << bits):  # beyond it there is nothing
+            if not least <= value < least + (1 << bits):  # no value exists beyond it
                 continue
             reply = await wire.download(key, (value % (1 << bits)).to_bytes(len(before), "little"))
             return await _unchanged(wire, key, before, aborted(reply, TOO_HIGH if above else TOO_LOW))
@@ -216,7 +216,7 @@ async def _begin_block(wire: CanopenWire, key: Key, size: int) -> Reply:
 
 
 def _segments(value: bytes) -> list[bytes]:
-    """All segments of a value that fits into one sub-block."""
+    """Return all segments of a value that fits into one sub-block."""
     pieces = [value[at : at + 7] for at in range(0, len(value), 7)]
     last = len(pieces)
     return [bytes((n | (0x80 if n == last else 0),)) + piece.ljust(7, b"\0") for n, piece in enumerate(pieces, 1)]
@@ -228,7 +228,7 @@ def _end(value: bytes, crc: int) -> bytes:
 
 
 async def crc_mismatch(wire: CanopenWire) -> Finding:
-    """CO-015: a block download that ends in another CRC."""
+    """CO-015: end a block download with a wrong CRC."""
     key, before = await _number(wire)
     async with _borrowed(wire, key):
         begun = await _begin_block(wire, key, len(before))
@@ -276,12 +276,12 @@ async def _whole_block(wire: CanopenWire, *, lose: bool) -> Finding:
 
 
 async def one_reply_a_block(wire: CanopenWire) -> Finding:
-    """CO-020: a sub-block is acknowledged once."""
+    """CO-020: a sub-block is acknowledged exactly once."""
     return await _whole_block(wire, lose=False)
 
 
 async def segment_lost(wire: CanopenWire) -> Finding:
-    """CO-017: a segment of the last sub-block is lost, and sent again with what follows, numbered from 1."""
+    """CO-017: lose a segment of the last sub-block; repeat it and the following ones, numbered from 1."""
     return await _whole_block(wire, lose=True)
 
 
@@ -292,7 +292,7 @@ BEATS = 4
 
 
 async def heartbeat_changed(wire: CanopenWire) -> Finding:
-    """CO-041: 1017h is changed: the new period counts at once."""
+    """CO-041: change 1017h: the new period applies at once."""
     key = (0x1017, 0)
     if key not in wire.may_write:
         raise NotHere("changes the heartbeat: --write 1017:00")

@@ -22,5 +22,5 @@ class Checked:
 
 
 def shown(raw: bytes) -> str:
-    """A device's text as it can be shown, at most 80 characters; empty where nothing can."""
+    """Return the printable part of a device's text, at most 80 characters."""
     return "".join(chr(b) for b in raw if 32 <= b < 127).strip()[:80]

@@ -15,7 +15,7 @@ from fieldtwin.gateway.core.connection import Direction
 
 W = TypeVar("W")
 Play = Callable[[W], Awaitable[Finding]]
-"""Plays a case on a wire and judges it."""
+"""Runs a case on a connection and returns the finding."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +52,7 @@ class DeviceResult(CaseResult):
 
 
 class NotHere(Exception):
-    """Raised inside a play: the device has nothing that the case is about. The case is skipped with this reason."""
+    """Raised inside a case if the device lacks the tested feature. The case is skipped with this reason."""
 
 
 class Unsaid(Exception):

@@ -37,7 +37,7 @@ def write_master_html(results: Sequence[CaseResult], title: str, argv: Sequence[
 
 
 def render_master_html(results: Sequence[CaseResult], title: str, argv: Sequence[str], started: str) -> str:
-    """The whole page. Each failed or open case comes with its frames and the command that plays it again."""
+    """Return the whole page. Each failed or open case comes with its frames and the command that repeats it."""
     bad = by_weight([r for r in results if r.verdict.bad or r.verdict is Verdict.INCONCLUSIVE])
     heading = el("div", el("h1", f"Conformance of {title}"), el("p", summary(results), cls="small"))
     facts = [("checked", started), ("fieldtwin", __version__)]
@@ -72,7 +72,7 @@ def _finding(result: CaseResult, argv: Sequence[str]) -> Markup:
 
 
 def _frames(wire: Sequence[Line]) -> Markup:
-    """The first lines, with the others folded away: what went wrong is seldom far from the first odd answer."""
+    """Return the first lines, with the others folded away: an error is usually close to the first faulty answer."""
     if not wire:
         return Markup("")
     more = wire[OPEN_LINES:]

@@ -1,7 +1,8 @@
-"""The rows of the Modbus catalogue that can be run on a device from outside.
+"""The Modbus test cases that can be run on a device from outside.
 
-Rows that only concern masters and gateways are not here; nor MB-048 (only a profile knows what a half value is), MB-058 to
-MB-063 (what is behind a gateway is not seen) and MB-066, MB-067 (the operating system's).
+Cases that only concern clients and gateways are not here; nor MB-048 (only a profile defines values of several
+registers), MB-058 to MB-063 (the devices behind a gateway are not visible) and MB-066, MB-067 (they concern the
+operating system).
 """
 
 from __future__ import annotations

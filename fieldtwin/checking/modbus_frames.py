@@ -15,7 +15,7 @@ from fieldtwin.gateway.protocols.modbus.frame_shapes import MAX_FRAME, frame_len
 
 NO_TRANSACTION = -1
 _STEP = [crc16(bytes((index ^ 0xFF,))) ^ 0xFF for index in range(256)]
-"""The check sum byte by byte, taken apart again: garbage is gone through once from each of its bytes."""
+"""Table of the check sum per byte, which allows garbage to be searched once from each of its bytes."""
 _ASCII_FRAME = re.compile(rb":([0-9A-F]{6,512})\r\n")
 
 
@@ -45,7 +45,7 @@ def short(data: bytes, most: int = 16) -> str:
 
 
 def framed(framing: str, unit: int, pdu: bytes, transaction: int = 1) -> bytes:
-    """`pdu` to `unit` as it goes on a wire of `framing`: rtu, ascii, mbap or udp."""
+    """Return the frame of `pdu` to `unit` in `framing`: rtu, ascii, mbap or udp."""
     body = bytes((unit,)) + pdu
     if framing == "rtu":
         return with_crc(body)
@@ -100,7 +100,7 @@ def _rtu_length(data: bytes) -> int:
     fitting, crc = set(), 0xFFFF
     for at, byte in enumerate(data, 1):
         crc = crc >> 8 ^ _STEP[(crc ^ byte) & 0xFF]
-        if not crc and at >= least:  # over a whole frame it is 0
+        if not crc and at >= least:  # the CRC over a whole frame is 0
             fitting.add(at)
     likely = [length for length in frame_lengths(data)[0] if length in fitting]
     return likely[0] if likely else min(fitting, default=0)

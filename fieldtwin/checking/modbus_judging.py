@@ -1,4 +1,4 @@
-"""What many Modbus cases ask: was it refused as it must be, was it met with silence, is all well again."""
+"""Checks that many Modbus cases share: the right refusal, silence, and the recovery afterwards."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def named(code: int) -> str:
 
 
 def refused(pdu: bytes, answer: Answer, *codes: int) -> str:
-    """Empty if `answer` refuses the request `pdu` with one of `codes`, else what is wrong."""
+    """Return an empty string if `answer` refuses the request `pdu` with one of `codes`, else a description."""
     wanted = " or ".join(f"{code:02X}" for code in codes)
     if answer.refusal and answer.pdu[0] != pdu[0] | 0x80:
         return f"refuses function {answer.pdu[0] & 0x7F:02X} instead of {pdu[0]:02X}: {answer.pdu.hex(' ').upper()}"
@@ -30,8 +30,10 @@ def refused(pdu: bytes, answer: Answer, *codes: int) -> str:
 
 
 async def must_refuse(wire: ModbusWire, pdu: bytes, *codes: int, may_lack: bool = True) -> Finding:
-    """Send it; the device has to refuse it with one of `codes`, and go on. `may_lack`: exception 01 means that it has no such
-    function, and the case is skipped."""
+    """Send a request that the device has to refuse with one of `codes`; then it must continue to answer.
+
+    `may_lack`: exception 01 means that the device lacks the function, and the case is skipped.
+    """
     heard = await wire.ask(pdu)
     answer = heard.first
     if answer is None or answer.unit != wire.unit:
@@ -44,7 +46,7 @@ async def must_refuse(wire: ModbusWire, pdu: bytes, *codes: int, may_lack: bool 
 
 
 async def silent_then_good(wire: ModbusWire, heard: Heard) -> Finding:
-    """`heard` has to be nothing, and a request afterwards is answered."""
+    """Require that `heard` is silence, and that a request afterwards is answered."""
     if not heard.nothing:
         return failed(f"{heard} instead of silence")
     after = await wire.still_good()
@@ -59,7 +61,7 @@ def answers_good(wire: ModbusWire, heard: Heard, times: int) -> bool:
 
 
 def first_table(wire: ModbusWire, functions: Sequence[int]) -> tuple[int, int, int]:
-    """(function, address, count) of a read that is answered. Raises `NotHere` where none of `functions` has one."""
+    """Return (function, address, count) of a read that is answered. Raises `NotHere` if none of `functions` has one."""
     for function in functions:
         if function in wire.readable:
             return function, *wire.readable[function]

@@ -13,7 +13,7 @@ from fieldtwin.gateway.core.errors import Unreachable
 FUNCTION = {"coil": 0x01, "discrete": 0x02, "holding": 0x03, "input": 0x04}
 TABLE = {number: name for name, number in FUNCTION.items()}
 STARTS = (0, 1, 100, 1000, 40000)
-"""Where maps usually begin."""
+"""Addresses at which register maps usually begin."""
 ORDER = (0x03, 0x04, 0x01, 0x02)
 """The tables, the most telling first."""
 
@@ -59,9 +59,9 @@ async def learn(wire: ModbusWire, given: dict[str, int], writable: dict[str, int
 async def _table(
     wire: ModbusWire, function: int, given: dict[str, int], writable: dict[str, int]
 ) -> tuple[bytes, bytes] | None:
-    """Look for a cell of one table. A request that was refused, with its reply, where that is all there is."""
+    """Find a readable cell of one table. Return a refused request with its reply if there is no such cell."""
     table, refusal, silent = TABLE[function], None, 0
-    counts = (1, 2) if function in (0x03, 0x04) else (1,)  # some have no odd counts (MB-048)
+    counts = (1, 2) if function in (0x03, 0x04) else (1,)  # some devices do not support odd counts (MB-048)
     also = [writable[table]] if table in writable else []
     for address in [given[table]] if table in given else [*also, *STARTS]:
         for count in counts:
@@ -69,7 +69,7 @@ async def _table(
             answer = (await wire.ask(pdu)).first
             if answer is None or answer.unit != wire.unit or answer.refusal in GATEWAY_SAYS_NO:
                 silent += 1
-                if silent == 2:  # once may be a lost frame
+                if silent == 2:  # a single loss may be a lost frame
                     return refusal
                 continue
             if values_of(answer, function, count) is not None:
@@ -83,7 +83,7 @@ async def _table(
 
 
 async def _widen(wire: ModbusWire) -> None:
-    """How many cells from there on are answered in one read: 2 or 3 are enough to see padding and byte counts."""
+    """Extend the known reads to 2 or 3 cells, which is enough to check padding and byte counts."""
     for function, (address, _) in list(wire.readable.items()):
         count = 3 if function in (0x01, 0x02) else 2
         if address + count <= 0x10000:

@@ -20,7 +20,7 @@ LONG_PAUSE_S = 0.1
 
 
 async def bad_check_sum(wire: ModbusWire) -> Finding:
-    """MB-001: a request whose check sum is wrong."""
+    """MB-001: send a request with a wrong check sum."""
     frame = bytearray(wire.frame(wire.good))
     frame[-1] ^= 0xFF
     frame[-2] ^= 0xFF
@@ -71,11 +71,11 @@ async def _among(wire: ModbusWire, before: bytes, after: bytes) -> Finding:
 
 
 async def _goes_on(wire: ModbusWire, data: bytes, *, may_discard: bool) -> Finding:
-    """Send a good request with noise around it, and a good request 0.1 s after what came.
+    """Send a good request with noise around it, and a good request 0.1 s after the reply.
 
-    `may_discard`: silence for the first one is also right. In RTU the noise and the frame are one frame, because no silence
-    separates them, and its check sum is wrong (SL 2.5.1.1). With zeros after a frame the check sum is right again, and
-    the length is wrong: exception 03.
+    `may_discard`: silence for the first one is also right. In RTU the noise and the frame are one frame, because no
+    silence separates them, and its check sum is wrong (SL 2.5.1.1). With zeros after a frame the check sum is right
+    again, and the length is wrong: exception 03.
     """
     await wire.say(data, wire.good)
     heard = await wire.hear()
@@ -106,7 +106,7 @@ async def leading_ones(wire: ModbusWire) -> Finding:
 
 
 async def trailing_zeros(wire: ModbusWire) -> Finding:
-    """MB-009: 00 00 behind the frame."""
+    """MB-009: send 00 00 after the frame."""
     return await _with_noise(wire, b"", b"\x00\x00")
 
 
@@ -146,7 +146,7 @@ async def other_unit(wire: ModbusWire) -> Finding:
 
 
 async def neighbours_talk(wire: ModbusWire) -> Finding:
-    """MB-030: another unit's request and its response, then ours."""
+    """MB-030: send another unit's request and its response, then a request to this unit."""
     other = await _silent_neighbour(wire)
     request = read_of(0x03, 0, 2)
     response = b"\x03\x04\x11\x22\x33\x44"
@@ -160,7 +160,7 @@ async def neighbours_talk(wire: ModbusWire) -> Finding:
 
 
 async def neighbour_silent(wire: ModbusWire) -> Finding:
-    """MB-031: another unit does not answer, then ours."""
+    """MB-031: send a request that another unit does not answer, then one to this unit."""
     other = await _silent_neighbour(wire)
     request = read_of(0x03, 0, 2)
     await wire.say(wire.frame(request, other), request)
@@ -183,14 +183,14 @@ async def stranger_function(wire: ModbusWire) -> Finding:
 
 
 async def wrong_baud_rate(wire: ModbusWire) -> Finding:
-    """MB-068: what another baud rate makes of a request."""
+    """MB-068: send the bytes that a wrong baud rate makes of a request."""
     await wire.say(bytes.fromhex("80 00 F8 00 78 80 E6 FE 00 80 F8 66 06 FE"), b"\x80")
     await wire.pause(LONG_PAUSE_S)
     return await silent_then_good(wire, await wire.hear())
 
 
 async def two_masters(wire: ModbusWire) -> Finding:
-    """MB-069: two requests at once, as their bits make of each other."""
+    """MB-069: send two overlapping requests, combined bit by bit."""
     one, other = wire.frame(wire.good), framed("rtu", wire.unit, read_of(0x04, 0x1234, 9))
     if wire.framing == "ascii":
         raise NotHere("it is played on RTU")
@@ -210,7 +210,7 @@ async def bad_lrc(wire: ModbusWire) -> Finding:
 
 
 async def second_colon(wire: ModbusWire) -> Finding:
-    """MB-070: half a frame, then a whole one: the colon begins anew."""
+    """MB-070: send half a frame, then a whole one: the colon begins a new frame."""
     frame = wire.frame(wire.good)
     await wire.say(frame[:7] + frame, wire.good)
     heard = await wire.hear()

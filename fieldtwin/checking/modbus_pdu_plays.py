@@ -1,4 +1,4 @@
-"""Cases about requests as such, on any wire: functions, counts, addresses, identification, padding. Nothing is written.
+"""Cases about request PDUs, on any transport: functions, counts, addresses, identification, padding. Nothing is written.
 
 AP is the Modbus Application Protocol V1.1b3.
 """
@@ -82,7 +82,7 @@ async def both_wrong(wire: ModbusWire) -> Finding:
 
 
 async def padding(wire: ModbusWire) -> Finding:
-    """MB-049: the bits behind the last one."""
+    """MB-049: check the bits after the last requested one."""
     function, address, count = first_table(wire, (0x01, 0x02))
     heard = await wire.ask(read_of(function, address, count))
     data = values_of(heard.first, function, count)
@@ -92,7 +92,7 @@ async def padding(wire: ModbusWire) -> Finding:
 
 
 async def queue(wire: ModbusWire) -> Finding:
-    """MB-044: a FIFO queue, wherever there is one: byte count and count agree, at most 31."""
+    """MB-044: read a FIFO queue at any address: byte count and count agree, at most 31."""
     _, address, _ = first_table(wire, (0x03, 0x04))
     pdu = b"\x18" + address.to_bytes(2)
     heard = await wire.ask(pdu)
@@ -115,7 +115,7 @@ async def queue(wire: ModbusWire) -> Finding:
 
 
 async def _objects(wire: ModbusWire, code: int) -> tuple[dict[int, bytes], str]:
-    """All objects of a category, through as many frames as it takes, and what was wrong with them."""
+    """Return all objects of a category, from as many frames as needed, and any error in them."""
     objects: dict[int, bytes] = {}
     at = 0
     for _ in range(MOST_FRAMES):
@@ -196,7 +196,7 @@ def text_of(raw: bytes) -> str:
 
 
 async def counters(wire: ModbusWire) -> Finding:
-    """MB-047: the count of requests goes up by as many as were sent."""
+    """MB-047: the counter of requests increases by the number of requests sent."""
     before = await _counter(wire, 0x0E)
     for _ in range(3):
         if after := await wire.still_good():
@@ -216,14 +216,14 @@ async def _counter(wire: ModbusWire, which: int) -> int:
 
 
 async def listen_only(wire: ModbusWire) -> Finding:
-    """MB-046: listen only, until it is restarted."""
+    """MB-046: switch to listen only mode, until a restart."""
     echo = await wire.ask(b"\x08\x00\x00\x5a\x5a")
     if echo.first is None or echo.first.refusal:
         raise NotHere(f"it has no function 08: {echo}")
     try:
         entered = await wire.ask(b"\x08\x00\x04\x00\x00", due=False)
         meanwhile = await wire.ask(wire.good, due=False)
-    finally:  # whatever happened: it may be in that mode
+    finally:  # in any case: the device may be in that mode
         left = await wire.ask(b"\x08\x00\x01\x00\x00", due=False)
     after = await wire.still_good()
     if entered.first is not None and entered.first.refusal and not after:

@@ -1,4 +1,4 @@
-"""A check of a Modbus device from beginning to end: open, learn, ask who it is, play the cases."""
+"""A complete check of a Modbus device: open, learn, read its identity, run the cases."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class ModbusOptions:
 
 
 def traits_of(endpoint: Endpoint) -> frozenset[str]:
-    """What cases call the wire: ``rtu-line``, ``ascii-line``, ``rtu-stream``, ``mbap-stream``, ``udp``."""
+    """Return the names of the transport in cases: ``rtu-line``, ``ascii-line``, ``rtu-stream``, ``mbap-stream``, ``udp``."""
     framing = framing_of(endpoint)
     if framing == "udp":
         return frozenset({"udp"})

@@ -1,4 +1,4 @@
-"""Cases of Modbus TCP and of streams: headers that are wrong, several ADUs at once, connections that end.
+"""Cases of Modbus TCP and of streams: invalid headers, several ADUs in one segment, connections that end.
 
 TG is the Messaging on TCP/IP Implementation Guide V1.0b. All PDUs in it are reads.
 """
@@ -43,7 +43,7 @@ async def several_at_once(wire: ModbusWire) -> Finding:
 
 
 async def more_than_allowed(wire: ModbusWire) -> Finding:
-    """MB-053: 40 requests at once: each is answered, or refused with 06."""
+    """MB-053: send 40 requests at once: each is answered, or refused with 06."""
     numbers = [wire.next_transaction() for _ in range(40)]
     await wire.say(b"".join(_adu(wire, n) for n in numbers), wire.good)
     heard = await wire.hear(40)
@@ -70,7 +70,7 @@ async def other_protocol(wire: ModbusWire) -> Finding:
 
 
 async def _wrong_length(wire: ModbusWire, adu: bytes) -> Finding:
-    """Send it: it is discarded, or the connection is closed. A new connection has to be served in any case."""
+    """Send an invalid ADU: it is discarded, or the connection is closed. A new connection has to be served in any case."""
     await wire.say(adu, wire.good)
     heard = await wire.hear()
     if heard.answers or heard.rest:
@@ -159,7 +159,7 @@ async def unit_0(wire: ModbusWire) -> Finding:
 
 
 async def half_and_gone(wire: ModbusWire) -> Finding:
-    """MB-064: half a request, and the client is gone; the next client is served."""
+    """MB-064: send half a request and disconnect; the next client is served."""
     frame = wire.frame(wire.good)
     await wire.say(frame[: len(frame) // 2], wire.good)
     await wire.pause(0.05)

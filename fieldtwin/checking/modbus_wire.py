@@ -1,7 +1,7 @@
-"""A Modbus wire as a checker holds it: any bytes out, every byte in, and the device's way of answering when all is well.
+"""The connection of a check to a Modbus device: any bytes out, every byte in, and the device's normal answers.
 
-It must never know what a case is about. It keeps what may be sent to what the case's danger allows, by a list of functions:
-a case that would send more is our bug.
+It must not depend on the purpose of a case. It permits only requests within the case's impact level, by a list of
+functions: a case that would send others is a bug of fieldtwin.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from fieldtwin.gateway.core.connection import ByteConnection
 from fieldtwin.gateway.core.errors import Bug, ConnectionLost, Unreachable
 
 READS = frozenset({0x01, 0x02, 0x03, 0x04, 0x11, 0x18, 0x2B})
-"""Functions that change nothing in any device that keeps to the standard, with whatever parameters."""
+"""Functions that change nothing in any conforming device, whatever their parameters."""
 WRITES = frozenset({0x05, 0x06, 0x0F, 0x10, 0x16, 0x17})
 IDENTIFICATION = b"\x2b\x0e"
-"""What may be asked by function 2B; it carries CANopen's services as well, which may write."""
+"""The permitted subtype of function 2B, which also carries CANopen services that may write."""
 MOST_HEARD = 8192
-"""Bytes that a device may say at once; one that says more babbles."""
+"""Number of bytes that a device may send at once; more than that is babble."""
 CALM_S = 0.8
 """After this silence on a line no receiver waits for the rest of a frame, however slow its timers are (libmodbus: 0.5 s)."""
 PATIENCE = 3
@@ -59,11 +59,11 @@ class Heard:
 
 
 class ModbusWire:
-    """One wire to one unit.
+    """One connection to one unit.
 
-    `framing` is rtu, ascii, mbap or udp; `traits` name the wire for cases (the framing, ``serial`` or ``stream``).
-    `timeout_s` is how long a reply may take, and how long silence is waited for; `spacing_s` rests between two requests;
-    `char_s` is the time of a character on a serial line.
+    `framing` is rtu, ascii, mbap or udp; `traits` describe the transport for cases (the framing, ``serial`` or
+    ``stream``). `timeout_s` is the time for a reply, and for detecting silence; `spacing_s` is the pause between two
+    requests; `char_s` is the time of a character on a serial line.
     """
 
     def __init__(
@@ -85,7 +85,7 @@ class ModbusWire:
         """A silence that ends any frame (SL 2.5.1.1: 3.5 characters, 1.75 ms at least), with something to spare."""
         self.danger = Danger.READ
         self.good = b""
-        """The request by which it is seen that all is well: a read."""
+        """The request that tests normal operation: a read."""
         self.good_reply = b""
         self.readable: dict[int, tuple[int, int]] = {}
         """Function -> (address, count) of a read that is answered with values."""
@@ -130,12 +130,12 @@ class ModbusWire:
         return self._transaction
 
     def frame(self, pdu: bytes, unit: int | None = None, transaction: int | None = None) -> bytes:
-        """`pdu` as it goes on this wire."""
+        """Return the frame of `pdu` on this connection."""
         number = self.next_transaction() if transaction is None else transaction
         return framed(self.framing, self.unit if unit is None else unit, pdu, number)
 
     async def say(self, data: bytes, *carries: bytes, at_once: bool = False) -> None:
-        """Send `data`, in which the PDUs `carries` are; the rest between two requests is kept unless `at_once`."""
+        """Send `data`, which contains the PDUs `carries`; keep the pause between two requests unless `at_once`."""
         for pdu in carries:
             self._must_be_allowed(pdu)
         if self._connection is None or self._closed:
@@ -194,16 +194,16 @@ class ModbusWire:
         return chunk[same:]
 
     async def ask(self, pdu: bytes, unit: int | None = None, *, due: bool = True) -> Heard:
-        """A request in a good frame, and what comes back; where no answer is `due`, silence is believed sooner.
+        """Send a request in a good frame and return the received data; without a `due` answer silence is accepted sooner.
 
-        On a wire with transaction ids only replies to it count.
+        On a connection with transaction IDs only replies to the request count.
         """
         number = self.next_transaction()
         await self.say(self.frame(pdu, unit, number), pdu)
         heard = await self.hear(within_s=self.timeout_s * (PATIENCE if due else 1))
         if self.framing in ("mbap", "udp"):
             late = [a for a in heard.answers if a.transaction != number]
-            if late and len(late) == len(heard.answers):  # of something earlier: ours may follow
+            if late and len(late) == len(heard.answers):  # of an earlier request: the reply may follow
                 more = await self.hear()
                 ours = tuple(a for a in more.answers if a.transaction == number)
                 return Heard(ours or heard.answers, heard.rest + more.rest, more.closed)
@@ -216,10 +216,10 @@ class ModbusWire:
         """Receive the unrequested bytes that have arrived."""
         return await self.hear(0, self.pause_s)
 
-    # -- when all is well -----------------------------------------------------------------------------------------
+    # -- normal behaviour -----------------------------------------------------------------------------------------
 
     def is_good(self, answer: Answer | None) -> bool:
-        """Whether it is an answer of the unit to `good`, of the usual shape; the values may have changed."""
+        """Return whether an answer is the unit's reply to `good`, of the usual shape; the values may have changed."""
         if answer is None or answer.unit != self.unit:
             return False
         usual = self.good_reply
@@ -228,15 +228,17 @@ class ModbusWire:
         return answer.pdu[:2] == usual[:2] and len(answer.pdu) == len(usual)
 
     async def still_good(self, *, at_once: bool = False) -> str:
-        """Empty when `good` is answered as usual, else what came instead. On a line that is asked after a long silence,
-        unless `at_once`."""
+        """Return an empty string when `good` is answered as usual, else a description of the received data.
+
+        On a line the request is sent after a long silence, unless `at_once`.
+        """
         if self.serial and not at_once:
             await self.clock.sleep_until_ns(self._quiet_since_ns + round(CALM_S * NS_PER_S))
         heard = await self.ask(self.good)
         return "" if len(heard.answers) == 1 and self.is_good(heard.first) and not heard.rest else str(heard)
 
     async def settle(self) -> bool:
-        """Bring wire and device back to where all is well: silence, at worst a new connection. False: it is not."""
+        """Restore normal operation: silence, at worst a new connection. Return False if that fails."""
         for attempt in range(3):
             try:
                 if attempt or self._connection is None or self._closed:

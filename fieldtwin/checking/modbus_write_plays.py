@@ -25,7 +25,7 @@ async def _read(wire: ModbusWire, table: str, address: int, count: int = 1) -> b
 
 
 def _write(table: str, address: int, data: bytes) -> bytes:
-    """FC 06 or FC 05 (AP 6.5, 6.6) with what `_read` gave."""
+    """Return a request FC 06 or FC 05 (AP 6.5, 6.6) with the data that `_read` returned."""
     if table == "holding":
         return b"\x06" + address.to_bytes(2) + data[:2]
     return b"\x05" + address.to_bytes(2) + (b"\xff\x00" if data[0] & 1 else b"\0\0")
@@ -130,7 +130,7 @@ async def coils_mismatch(wire: ModbusWire) -> Finding:
 
 
 async def partly_outside(wire: ModbusWire) -> Finding:
-    """MB-041: FC 16 that ends one register behind the map."""
+    """MB-041: send FC 16 that ends one register after the map."""
     if "holding" not in wire.may_write:
         raise NotHere("no cell to write was given: --write holding:ADDRESS+COUNT")
     address, count = wire.may_write["holding"]
@@ -147,7 +147,7 @@ async def partly_outside(wire: ModbusWire) -> Finding:
 
 
 async def write_before_read(wire: ModbusWire) -> Finding:
-    """MB-042: FC 23 that reads what it writes."""
+    """MB-042: send FC 23 that reads the register that it writes."""
     async with _borrowed(wire, "holding") as (address, before):
         at, new = address.to_bytes(2), _other(before)
         heard = await wire.ask(b"\x17" + at + b"\0\x01" + at + b"\0\x01\x02" + new)
@@ -164,7 +164,7 @@ async def write_before_read(wire: ModbusWire) -> Finding:
 
 
 async def refused_as_a_whole(wire: ModbusWire) -> Finding:
-    """MB-042: FC 23 that reads 126 registers: nothing is written."""
+    """MB-042: send FC 23 that reads 126 registers: nothing is written."""
     async with _borrowed(wire, "holding") as (address, before):
         at = address.to_bytes(2)
         pdu = b"\x17" + at + b"\0\x7e" + at + b"\0\x01\x02" + _other(before)

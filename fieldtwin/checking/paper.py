@@ -37,7 +37,7 @@ CELLS = 0x1_0000
 
 
 def modbus_on_paper(options: ModbusOptions) -> Checked:
-    """The check as it goes with a device that has everything that the options name."""
+    """Run the check on a simulated device that has everything that the options name."""
     loop = VirtualLoop()
     with asyncio.Runner(loop_factory=lambda: loop) as runner:
         return runner.run(_modbus(options, loop))
@@ -89,7 +89,7 @@ def _streams(endpoint: Endpoint, units: dict[int, ModbusUnit], clock: VirtualClo
 
 
 def canopen_on_paper(options: CanopenOptions) -> Checked:
-    """The check as it goes with a node as the EDS describes it, or with one that has what the cases ask for."""
+    """Run the check on a simulated node as the EDS describes it, or on one with everything that the cases need."""
     loop = VirtualLoop()
 
     async def main() -> Checked:

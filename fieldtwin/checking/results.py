@@ -60,7 +60,7 @@ def _case(result: DeviceResult) -> dict[str, Any]:
 def as_report(
     subject: Subject, results: Sequence[DeviceResult], reproduce: str, fail_on: frozenset[Basis] = ONLY_REQUIRED
 ) -> Report:
-    """For JUnit: a scenario for each case, with its bytes in the output."""
+    """Return the results as a JUnit report: a scenario for each case, with its bytes in the output."""
     scenarios = []
     for r in results:
         verdict, reason = for_build(r, fail_on)

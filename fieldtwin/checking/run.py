@@ -1,6 +1,6 @@
-"""Plays the cases on a device, one after the other: before each all is well, and the device's way back is looked at.
+"""Run the cases on a device, one after the other: before each the device must answer normally, and its recovery is checked.
 
-It knows no protocol; a wire can be settled, and says how dangerous it may be.
+This module depends on no protocol; a connection can be settled, and states its current impact level.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import Unreachable
 
 MOST_SPOKEN = 400
-"""Chunks or frames that are kept of a case; of more the first ones."""
+"""Maximum number of chunks or frames that are kept of a case; later ones are dropped."""
 MOST_BYTES = 512
 """Of one chunk."""
 MOST_LOST = 3
-"""Cases before which the device could not be brought back; then no more are played."""
+"""Number of cases before which the device could not be recovered; then the run stops."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +40,7 @@ class Plan:
 
 
 class Settling(Protocol):
-    """A wire as a run sees it."""
+    """The interface of a connection for a run."""
 
     danger: Danger
     traits: frozenset[str]
@@ -49,7 +49,7 @@ class Settling(Protocol):
 
 
 class Transcript(Tap):
-    """Everything said since `begin`, bounded."""
+    """All traffic since `begin`, bounded."""
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
@@ -80,7 +80,7 @@ W = TypeVar("W", bound=Settling)
 
 
 def why_not(case: DeviceCase[W], plan: Plan, traits: frozenset[str]) -> str:
-    """Why the case is not played under that plan on that wire; empty when it is."""
+    """Return the reason for which the case is not run with that plan on that transport; empty if it is run."""
     if case.wires and not traits & set(case.wires):
         return OTHER_WIRE
     if case.danger.rank > plan.at_most.rank:
@@ -109,7 +109,7 @@ async def play(
     tell: Callable[[DeviceResult], None] = lambda result: None,
     go_on: Callable[[], str] = lambda: "",
 ) -> list[DeviceResult]:
-    """Results of the chosen cases, in their order. `go_on` says before each why no more may be sent, or nothing."""
+    """Return the results of the chosen cases, in order. Before each, `go_on` returns a reason to stop, or an empty string."""
     results: list[DeviceResult] = []
     started_ns, lost = clock.monotonic_ns(), 0
     for case in (c for c in cases if c.chosen(plan.only)):

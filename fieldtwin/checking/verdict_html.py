@@ -39,7 +39,7 @@ def overall(results: Sequence[CaseResult]) -> Verdict:
 
 
 def colour_of(result: CaseResult) -> Verdict:
-    """The verdict whose colour the result has: a failure of a case that the standard does not require is never red."""
+    """Return the verdict whose colour the result has: a failure of a case that the standard does not require is never red."""
     return Verdict.INCONCLUSIVE if result.verdict is Verdict.FAILED and not result.deviates else result.verdict
 
 
@@ -54,7 +54,7 @@ def verdict_pill(result: CaseResult) -> Markup:
 
 
 def verdict_bar(results: Sequence[CaseResult]) -> Markup:
-    """How many cases have each colour, as a bar."""
+    """Return the number of cases of each colour as a bar."""
     counts = Counter(colour_of(r) for r in results)
     return el("div", [el("i", cls=v.value, style=f"flex:{counts[v]}") for v in ORDER if counts[v]], cls="bar")
 

@@ -43,9 +43,9 @@ def _watch(id: str, title: str, basis: Basis, clause: str, judge: Judge, must: s
 
 
 RESTART_S = 2.0
-"""How long a master may take to see that a node booted, and to start it."""
+"""Time within which a master has to notice that a node booted, and to start it."""
 SILENT = _case("CO-000", "no reply", ROBUST, "", READ, plays.nothing, judges.rejects, "is silent", "")
-"""No case of the catalogue: how the master's timeout is guessed."""
+"""Not a listed case: it measures the master's timeout."""
 BLOCK: Callable[[CanopenCase], CanopenCase] = lambda case: case.on(wants="block upload")  # noqa: E731
 DOWN: Callable[[CanopenCase], CanopenCase] = lambda case: case.on(wants="block download")  # noqa: E731
 
@@ -148,4 +148,4 @@ CASES: tuple[CanopenCase, ...] = (
     _watch("CO-047", "SYNC of the wrong length", REQUIRED, "7.2.5", legal_sync,
           "send SYNC with no byte, or with the counter alone"),
 )  # fmt: skip
-"""In the order in which they are played; observers judge the whole run in the end."""
+"""In the order of execution; observers check the whole run at the end."""

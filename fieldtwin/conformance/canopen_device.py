@@ -1,6 +1,6 @@
-"""The honest CANopen nodes under the hostile one: every object exists and holds one word, every node answers SDO.
+"""The correct CANopen nodes underneath the hostile one: every object exists and holds one word, every node answers SDO.
 
-Pure: frames and `now` in, frames out. A node comes to life when it is first asked or commanded.
+Pure: frames and `now` in, frames out. A node is created by the first request or command to it.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class HonestNode:
         self._server = SdoServer(self.objects, TIMEOUT_NS)
 
     def answer(self, request: bytes, now_ns: int) -> list[bytes]:
-        """The SDO replies, several for a sub-block; none while STOPPED."""
+        """Return the SDO replies, several for a sub-block; none while STOPPED."""
         if self.state == STOPPED:
             return []
         self.objects.long = request[0] >> 5 == 5
@@ -65,7 +65,7 @@ class HonestNode:
         return self._server.in_sub_block
 
     def poisoned(self, request: bytes, poison: int) -> bytes:
-        """An expedited upload response with another word."""
+        """Return an expedited upload response with another word."""
         return (
             bytes((0x43 | (4 - self._size) << 2,))
             + request[1:4]

@@ -1,4 +1,4 @@
-"""Judges of what only CANopen has: aborts, NMT, SYNC. Pure functions of an `Observation`."""
+"""Checks that are specific to CANopen: aborts, NMT, SYNC. Pure functions of an `Observation`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ BLOCK_UPLOAD = 5
 
 
 def aborts_with(code: int, *others: int) -> Judge:
-    """The master ends the transfer by this abort code, or one of `others`, so that the node knows."""
+    """Check that the master ends the transfer by the abort code `code` or one of `others`, which informs the node."""
 
     def aborted(seen: Observation) -> Finding | None:
         codes = [
@@ -47,7 +47,7 @@ completes = owes(_block_ended)
 
 
 def _noticed(seen: Observation) -> Finding | None:
-    """That a node's heartbeat stayed away shows in what is published, or in what is done about it."""
+    """Check that a missing heartbeat has an effect on the published value or causes a command."""
     if any(shown.word is Word.NONE for shown in seen.of(Shown, seen.begun_ns, seen.over_ns)):
         return passed("its value was none meanwhile")
     if any(_id(sent) == NMT for sent in seen.of(Sent, seen.begun_ns)):
@@ -90,7 +90,7 @@ waits_for_each = owes(_waits_for_each)
 
 
 def takes_the_switch(seen: Observation) -> Finding:
-    """As `accepts`, where the client allows the change from a block upload to an ordinary one.
+    """Check as `accepts`, if the client allows the change from a block upload to an ordinary one.
 
     A client that sends a protocol switch threshold of 0 forbids it (7.2.4.3.13). It may refuse each such reply; only a
     wrong value would be a failure.
@@ -104,7 +104,7 @@ def takes_the_switch(seen: Observation) -> Finding:
 
 
 def _one_a_block(seen: Observation) -> Finding | None:
-    """A sub-block has one acknowledgement, and a segment has none."""
+    """Check that a sub-block is acknowledged once, and a segment never."""
     acknowledged = [s for s in seen.of(Sent, seen.begun_ns, seen.over_ns) if s.data[2] & 0xE3 == BLOCK_ACKNOWLEDGED]
     segments = sum(
         1 for t in seen.of(Told, seen.begun_ns, seen.over_ns) if t.data[0] & 0x7F and t.data[0] not in _OTHERS

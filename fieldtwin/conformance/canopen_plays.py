@@ -13,7 +13,7 @@ PRE_OPERATIONAL = 0x7F
 LATE = 1.5
 STORM = range(100, 120)
 SLOW = 0.35
-"""Of a timeout, that each step of a slow transfer takes: none is too long, all of them together are."""
+"""Share of a timeout that each step of a slow transfer takes: no step is too long, but all of them together are."""
 
 
 def nothing(scene: CanScene) -> list[SayFrame]:
@@ -21,7 +21,7 @@ def nothing(scene: CanScene) -> list[SayFrame]:
 
 
 def _segmented(scene: CanScene, segment: Callable[[int], bytes]) -> list[SayFrame]:
-    """A segmented upload of 14 bytes, announced as such; `segment` gives the reply to the n-th request behind that, from 1."""
+    """Reply with a segmented upload of 14 bytes; `segment` gives the reply to the n-th request after the first, from 1."""
     if scene.opens:
         scene.memory["segments"] = 0
         return [scene.reply(b"\x41" + scene.request[1:4] + (14).to_bytes(4, "little"))]
@@ -32,7 +32,7 @@ def _segmented(scene: CanScene, segment: Callable[[int], bytes]) -> list[SayFram
 
 
 def same_toggle(scene: CanScene) -> list[SayFrame]:
-    """A segmented upload whose second segment has the toggle bit of the first."""
+    """Repeat the toggle bit of the first segment in the second segment of an upload."""
     return _segmented(scene, lambda n: bytes((0x01 if n > 1 else 0x00,)) + scene.poison.ljust(7, b"\0"))
 
 
@@ -56,7 +56,7 @@ def no_object(scene: CanScene) -> list[SayFrame]:
 
 
 def wrong_crc(scene: CanScene) -> list[SayFrame]:
-    """Block upload: the check sum of the end frame is another one."""
+    """Block upload: send a wrong check sum in the end frame."""
     if len(scene.true) == 1 and scene.true[0][0] & 0xE3 == 0xC1:
         end = scene.true[0]
         return [scene.reply(end[:1] + bytes((end[1] ^ 0xFF,)) + end[2:])]
@@ -146,7 +146,7 @@ def honest(scene: CanScene) -> list[SayFrame]:
 
 
 def block_size(size: int) -> CanPlay:
-    """Block download: the node says that `size` segments may come at once, 1 to 127 are allowed."""
+    """Block download: announce `size` segments per sub-block; 1 to 127 are allowed."""
 
     def play(scene: CanScene) -> list[SayFrame]:
         if not scene.opens:
@@ -158,7 +158,7 @@ def block_size(size: int) -> CanPlay:
 
 
 def refuses_crc(scene: CanScene) -> list[SayFrame]:
-    """Block download: at its end the node says that the check sum was wrong."""
+    """Block download: report a wrong check sum at the end."""
     if scene.true[0][0] != 0xA1:
         return honest(scene)
     mux = scene.memory["mux"].to_bytes(3, "little")
@@ -171,7 +171,7 @@ def unanswered(scene: CanScene) -> list[SayFrame]:
 
 
 def aborts_amid(scene: CanScene) -> list[SayFrame]:
-    """A segmented upload that the node ends with an abort behind the first segment."""
+    """Abort a segmented upload after the first segment."""
 
     def segment(n: int) -> bytes:
         if n == 1:
@@ -182,7 +182,7 @@ def aborts_amid(scene: CanScene) -> list[SayFrame]:
 
 
 def refuses_write(scene: CanScene) -> list[SayFrame]:
-    """A download of an object that can only be read, refused at once."""
+    """Refuse at once a download to an object that can only be read."""
     if not scene.opens:
         return honest(scene)
     return [scene.reply(b"\x80" + scene.request[1:4] + (0x06010002).to_bytes(4, "little"))]
@@ -221,7 +221,7 @@ def short_pdo(scene: CanScene) -> list[SayFrame]:
 
 
 def pdo_outside(scene: CanScene) -> list[SayFrame]:
-    """The node says that it is PRE-OPERATIONAL, and sends process data all the same."""
+    """Report PRE-OPERATIONAL, and send process data nevertheless."""
     pdo = (scene.poison * 8)[:8]
     return [scene.frame(HEARTBEAT, bytes((PRE_OPERATIONAL,))), scene.frame(TPDO1, pdo), *scene.honest()]
 

@@ -14,7 +14,7 @@ SDO_REPLY = 0x580
 
 @dataclass(frozen=True, slots=True)
 class SayFrame:
-    """Send `frame`, `after_s` seconds behind the request."""
+    """Send `frame`, `after_s` seconds after the request."""
 
     frame: CanFrame
     after_s: float = 0.0
@@ -23,11 +23,11 @@ class SayFrame:
 
 @dataclass(frozen=True, slots=True)
 class CanScene:
-    """One SDO request that is to be misanswered: eight bytes to `node`.
+    """One SDO request that receives a wrong reply: eight bytes to `node`.
 
-    `true` are the honest replies, `false` is an expedited one with the poisoned word. `nth` counts the transfers of the
-    case from 0; `opens` is whether the request begins one. `memory` is the transfer's own, for plays that go on over
-    its segments.
+    `true` are the correct replies, `false` is an expedited one with the poisoned word. `nth` counts the transfers of
+    the case from 0; `opens` is whether the request begins one. `memory` belongs to the transfer, for replies that
+    depend on earlier segments.
     """
 
     node: int
@@ -59,10 +59,13 @@ CanWants = Literal["upload", "download", "block upload", "block download", "guar
 
 @dataclass(frozen=True, slots=True)
 class CanopenCase:
-    """As `scene.ModbusCase`, of SDO transfers. `misses`: the segment of a block download that the node does not hear, 0 for none;
-    `early`: the one behind which it acknowledges the sub-block although more were to come; `mutes`: what of the node stays away
-    for `mute_s` from the first strike on: ``heartbeat``, ``all``, or ``sdo``, since it is STOPPED; `boots`: it boots when that
-    is over; `beat_late_s`: its next heartbeat comes so late."""
+    """A `scene.ModbusCase` for SDO transfers.
+
+    `misses`: the segment of a block download that the node ignores, 0 for none; `early`: the segment after which it
+    acknowledges the sub-block although more follow; `mutes`: the messages that the node omits for `mute_s` from the
+    first strike on: ``heartbeat``, ``all``, or ``sdo``, as if STOPPED; `boots`: it boots afterwards; `beat_late_s`: the
+    delay of its next heartbeat.
+    """
 
     about: Case
     play: CanPlay

@@ -1,4 +1,7 @@
-"""The bus that a CANopen master under test joins: honest nodes, until a play is on. It records everything and judges nothing."""
+"""The bus that a CANopen master under test joins: correct nodes, until a case begins.
+
+It records everything without a verdict.
+"""
 
 from __future__ import annotations
 
@@ -25,8 +28,11 @@ MASTER = 1
 
 
 class CanopenStage:
-    """As `modbus_stage.Stage`. `size` is how many bytes an object has, `heartbeat_s` how often nodes that are known say that they
-    live (0: never), `nodes` are those that boot by themselves."""
+    """The CANopen counterpart of `modbus_stage.Stage`.
+
+    `size` is the number of bytes of an object, `heartbeat_s` the heartbeat period of known nodes (0: none), `nodes` are
+    those that boot by themselves.
+    """
 
     def __init__(
         self,
@@ -57,14 +63,14 @@ class CanopenStage:
         return round(self._loop.time() * NS_PER_S)
 
     def hold(self, word: Word) -> int:
-        """All objects hold that word from now on; returns its number."""
+        """Make all objects hold that word from now on; return its number."""
         self._word = self._words[0] if word is Word.FIRST else self._words[1]
         for node in self._nodes.values():
             node.objects.word = self._word
         return self._word
 
     def begin(self, case: CanopenCase, strikes: int) -> None:
-        """From the next fitting transfer on `case` is played, until `strikes` are used up or `end` is called."""
+        """Run `case` from the next matching transfer on, until `strikes` are used up or `end` is called."""
         self._case, self.strikes, self._memory = case, strikes, None
         self.struck = self.first_ns = self.last_ns = 0
 
@@ -73,7 +79,7 @@ class CanopenStage:
         self._case = None
 
     async def serve(self, connection: CanConnection) -> None:
-        """Until the bus is gone."""
+        """Serve until the bus is gone."""
         self._connection = connection
         async with Nursery() as nursery:
             self._nursery = nursery
@@ -134,7 +140,7 @@ class CanopenStage:
         self._send(case.play(scene), now_ns)
 
     def _missed(self, segment: bytes) -> bool:
-        """Whether the node does not hear this segment of a block download."""
+        """Return whether the node ignores this segment of a block download."""
         case, memory = self._playing, self._memory
         if case is None or memory is None or not (case.misses or case.early):
             return False
@@ -153,13 +159,20 @@ class CanopenStage:
         return server.acknowledge(now_ns)
 
     def _word_for(self, played: bool) -> int:
-        """While odd frames hold the honest word, other transfers keep the one before: it is to come from the odd ones."""
+        """Return the word for a transfer.
+
+        While faulty frames hold the correct word, other transfers keep the previous one, so that only the faulty ones
+        provide it.
+        """
         if self._case is not None and self._case.holds_good and not played:
             return self._words[1] if self._word == self._words[0] else self._words[0]
         return self._word
 
     def _begun(self, node: int, request: bytes, now_ns: int) -> dict[str, int] | None:
-        """A transfer begins. What its play keeps in mind, where it is one for the case; it is played to its end."""
+        """Begin a transfer.
+
+        Return the memory of its replies if it belongs to the case, which continues to the transfer's end.
+        """
         self._playing = case = self._case
         if case is None or self.struck >= self.strikes:
             return None
@@ -192,7 +205,7 @@ class CanopenStage:
         self.pending -= 1
 
     def _send(self, moves: list[SayFrame], now_ns: int) -> None:
-        """Frames keep their order, and honest answers keep behind odd ones that are still to come."""
+        """Send frames in order; correct answers wait until pending faulty ones were sent."""
         if not moves:
             return
         start_ns = now_ns
@@ -266,12 +279,12 @@ class CanopenStage:
             if self._muted in ("heartbeat", "all"):
                 continue
             for number, node in list(self._nodes.items()):
-                if number not in self._guarded:  # one that is guarded says nothing by itself
+                if number not in self._guarded:  # a guarded node sends no heartbeat
                     await self._connection.send(CanFrame(HEARTBEAT + number, bytes((node.state,))))
 
 
 def _opens(request: bytes) -> bool:
-    """Whether a request begins a transfer that a case may want."""
+    """Return whether a request begins a transfer that a case may use."""
     command = request[0] >> 5
     if command == BLOCK_UPLOAD:
         return request[0] & 3 == 0

@@ -21,7 +21,7 @@ class Danger(Enum):
     """Impact level of a case on the equipment behind the master, in rising order."""
 
     OBSERVE = "observe"
-    """Nothing: it only listens."""
+    """No effect: it only listens."""
     READ = "read"
     """Reads are answered oddly."""
     WRITE = "write"
@@ -35,28 +35,30 @@ class Danger(Enum):
 
 
 class Basis(Enum):
-    """Why a case asks what it asks, and so how much a failure of it weighs."""
+    """The reason for a case's expectation, which determines the weight of a failure."""
 
     STANDARD = "standard"
     """The clause of the standard that the case names requires it: a failure is a deviation."""
     ROBUSTNESS = "robustness"
     """No clause requires it. A device or master that fails is less tolerant than it could be, and still conforms."""
     FIELD = "field problem"
-    """Products in the field are known to fail here; the case names the project to which that was reported. A device or master
-    that fails conforms, but may cause the same trouble."""
+    """Known products fail here; the case names the project to which that was reported.
+
+    A device or master that fails conforms, but may cause the same trouble.
+    """
 
 
 OTHER_WIRE = "not on this wire"
-"""Why a case for other wires is skipped."""
+"""The reason for skipping a case for other transports."""
 OWN = "fieldtwin"
-"""The source of a case that rests on no clause and on no report of another project."""
+"""The source of a case that is based neither on a clause nor on a report of another project."""
 
 
 @dataclass(frozen=True, slots=True)
 class Elsewhere:
-    """The basis and the source of a case on one kind of wire, where they differ from those on all other wires.
+    """The basis and the source of a case on one kind of transport, where they differ from those on all others.
 
-    `trait` is the wire's name in the program (see `Stage` and `ModbusWire`), `wire` its name for users.
+    `trait` is the transport's name in the program (see `Stage` and `ModbusWire`), `wire` its name for users.
     """
 
     trait: str
@@ -67,7 +69,7 @@ class Elsewhere:
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """A verdict and the one sentence that says why."""
+    """A verdict and a sentence with its reason."""
 
     verdict: Verdict
     reason: str = ""
@@ -114,17 +116,17 @@ class About:
 
     @property
     def row(self) -> str:
-        """The row of the catalogue."""
+        """The ID of the entry in the test-case list."""
         return self.id.rstrip("abcdefgh")
 
     @property
     def role(self) -> str:
-        """Whom the case judges."""
+        """The tested role."""
         return "master"
 
     @property
     def required_by(self) -> str:
-        """The clauses that require what the case asks, such as ``TG 4.4.1.3, AP 6.3``; empty where none does."""
+        """The clauses that require the behaviour, such as ``TG 4.4.1.3, AP 6.3``; empty if none does."""
         if self.basis is not Basis.STANDARD:
             return ""
         clauses = self.clause.split(";")[0]
@@ -132,30 +134,30 @@ class About:
 
     @property
     def bases(self) -> str:
-        """``standard``, or ``standard; TCP: robustness`` where a failure weighs differently on single kinds of wire."""
+        """``standard``, or ``standard; TCP: robustness`` if a failure weighs differently on some transports."""
         return "; ".join(
             [self.basis.value, *(f"{e.wire}: {e.basis.value}" for e in self.elsewhere if e.basis is not self.basis)]
         )
 
     @property
     def sources(self) -> str:
-        """`clause`, followed by the sources on single kinds of wire: ``SL 2.4.1; TCP: TG 4.4.1.3``."""
+        """`clause`, followed by the sources on other transports: ``SL 2.4.1; TCP: TG 4.4.1.3``."""
         return "; ".join([self.clause, *(f"{e.wire}: {e.clause}" for e in self.elsewhere)])
 
     def on_wire(self, traits: frozenset[str]) -> Self:
-        """Return the case with the basis and the source that it has on a wire with these traits."""
+        """Return the case with its basis and source on a transport with these traits."""
         for each in self.elsewhere:
             if each.trait in traits:
                 return replace(self, basis=each.basis, clause=each.clause, elsewhere=())
         return replace(self, elsewhere=()) if self.elsewhere else self
 
     def chosen(self, only: frozenset[str]) -> bool:
-        """Whether `only` names it, or its row; all are chosen by none."""
+        """Return whether `only` contains its ID or its entry; an empty `only` selects all cases."""
         return not only or self.id in only or self.row in only
 
 
 @dataclass(frozen=True, slots=True)
 class Case(About):
-    """A case for masters, with its judge."""
+    """A case for masters, with its check."""
 
     judge: Judge

@@ -39,7 +39,7 @@ class Line:
 
 
 def lines(events: Iterable[Event], begun_ns: int) -> tuple[Line, ...]:
-    """All events of a case, the oldest first; the middle of more than `MOST_LINES` is left out, which one line says."""
+    """Return all events of a case, the oldest first; beyond `MOST_LINES` the middle is replaced by one line."""
     found = [Line(round((e.t_ns - begun_ns) / NS_PER_MS, 3), *line_of(e)) for e in events]
     if len(found) <= MOST_LINES:
         return tuple(found)
@@ -49,7 +49,7 @@ def lines(events: Iterable[Event], begun_ns: int) -> tuple[Line, ...]:
 
 
 def line_of(event: Event) -> tuple[str, str, str]:
-    """Who did it, the frame, and in words what it is."""
+    """Return the sender, the frame, and a description in words."""
     match event:
         case Asked():
             return "master", event.frame or event.target.hex(" "), _request(event)
@@ -85,7 +85,7 @@ def _request(asked: Asked) -> str:
 
 
 def _abort(data: bytes) -> str:
-    """An SDO abort in words; "" for anything else. Some clients leave the multiplexer 0."""
+    """Return an SDO abort in words; "" for anything else. Some clients leave the multiplexer 0."""
     if len(data) != 8 or data[0] != ABORT:
         return ""
     code = int.from_bytes(data[4:8], "little")

@@ -1,4 +1,4 @@
-"""Judges of what a master does by itself: its requests over the whole run against the standard."""
+"""Checks of a master's own behaviour: its requests over the whole run against the standard."""
 
 from __future__ import annotations
 

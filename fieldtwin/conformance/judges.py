@@ -24,7 +24,7 @@ Rule = Callable[[Observation], Finding | None]
 
 
 def all_of(*rules: Rule) -> Judge:
-    """The first rule that finds no pass decides; else the first that passes with a reason."""
+    """Return the first finding that is not a pass, else the first pass with a reason."""
 
     def judge(seen: Observation) -> Finding:
         good: Finding | None = None
@@ -38,11 +38,11 @@ def all_of(*rules: Rule) -> Judge:
     return judge
 
 
-# -- what every master owes -------------------------------------------------------------------------------------------
+# -- every master -----------------------------------------------------------------------------------------------------
 
 
 def goes_on(seen: Observation) -> Finding | None:
-    """It still runs, and asks again once the device is well."""
+    """Check that the master still runs, and asks again once the device replies correctly."""
     for ended in seen.of(Ended, seen.begun_ns):
         return failed(
             f"the master ended, exit code {ended.status}, {seen.since_s(ended.t_ns):.2f} s after the first odd answer"
@@ -76,7 +76,7 @@ def does_not_flood(seen: Observation) -> Finding | None:
 
 
 def publishes_nothing_bad(seen: Observation) -> Finding | None:
-    """No published value that no honest answer held."""
+    """Check that every published value was in a correct answer."""
     for shown in seen.of(Shown, seen.begun_ns):
         if shown.word is Word.POISON:
             return failed(f"published {shown.text}, the value of the bad frame, {_when(seen, shown.t_ns)}")
@@ -94,7 +94,7 @@ def publishes_good_again(seen: Observation) -> Finding | None:
 
 
 def sees_all_values(seen: Observation) -> Finding | None:
-    """Nothing that may have been a published value was left unjudged. Comes last: a failure outranks it."""
+    """Check that every number that may be a published value was classified. Comes last: a failure outranks it."""
     if not seen.probed:
         return passed(UNSEEN)
     for shown in seen.of(Shown, seen.begun_ns):
@@ -114,21 +114,21 @@ def needs_probe(seen: Observation) -> Finding | None:
 
 
 def owes(*rules: Rule) -> Judge:
-    """What every master owes, then `rules`; passed only where the probe saw all that was published."""
+    """Check the duties of every master, then `rules`; passed only if the probe saw all published values."""
     return all_of(*DUTIES, *rules, sees_all_values)
 
 
 rejects = owes(needs_probe)
 """A bad frame that only the values betray."""
 survives = owes()
-"""An answer that holds no value, so that the wire shows all."""
+"""An answer without values, so that the frames show everything."""
 
 
-# -- what a case is about ---------------------------------------------------------------------------------------------
+# -- single cases -----------------------------------------------------------------------------------------------------
 
 
 def took_odd_answer(seen: Observation) -> Finding | None:
-    """The odd answers held the honest value: it was to be taken from them, before the plain ones came again."""
+    """Check that the master took the value from the faulty answers, before the correct ones came again."""
     if not seen.probed:
         return skipped(NEEDS_PROBE)
     first = next((s for s in seen.of(Shown, seen.begun_ns) if s.word is seen.after), None)
@@ -162,7 +162,7 @@ def keeps_waiting(seen: Observation) -> Finding | None:
 _TAKES: tuple[Rule, ...] = (took_odd_answer, publishes_good_again, sees_all_values)
 accepts = all_of(goes_on, asks_cleanly, publishes_nothing_bad, does_not_flood, *_TAKES)
 accepts_on_line = all_of(goes_on, asks_cleanly, publishes_nothing_bad, does_not_flood, keeps_waiting, *_TAKES)
-"""As `accepts`, where the master has one request at a time."""
+"""As `accepts`, for a master that has one request at a time."""
 either = owes(needs_probe)
 """Taken or discarded, both are right; a wrong value is not."""
 
@@ -195,8 +195,10 @@ def answers_at_once(seen: Observation) -> Finding | None:
 
 
 def _gap_after(seen: Observation, told: Told) -> Iterator[tuple[float, float]]:
-    """How long after its request an odd answer was sent, and how long after it the next request came; nothing where that request
-    came before."""
+    """Yield the delay of a faulty answer after its request, and the time from it to the next request.
+
+    Nothing is yielded if that request came before.
+    """
     if told.good:
         return
     after = next(seen.of(Asked, told.t_ns + 1), None)
@@ -206,7 +208,7 @@ def _gap_after(seen: Observation, told: Told) -> Iterator[tuple[float, float]]:
 
 
 def backs_off(seen: Observation) -> Finding | None:
-    """While the device is busy it is not asked more often than when it is well."""
+    """Check that a busy device is not asked more often than usual."""
     busy = list(seen.of(Asked, seen.begun_ns, seen.over_ns))
     span_s = (seen.over_ns - seen.begun_ns) / NS_PER_S
     if len(busy) < 3 or span_s <= 0:
@@ -228,7 +230,7 @@ def quarantines(seen: Observation) -> Finding | None:
     late = next((t for t in seen.of(Told, seen.begun_ns) if not t.good), None)
     first = next(seen.of(Asked, seen.begun_ns), None)
     if late is None and any(not left.by_us for left in seen.of(Left, seen.begun_ns)):
-        return None  # it gave up the connection: on that nothing comes late
+        return None  # the connection was closed: a late reply cannot come
     if late is None or first is None:
         return inconclusive("the late answer was never sent")
     again = next((a for a in seen.of(Asked, first.t_ns + 1, late.t_ns) if a.target == first.target), None)
@@ -261,7 +263,7 @@ late_other = all_of(another_shape_came, *DUTIES, needs_probe, sees_all_values)
 
 
 def checks_echo_of_write(seen: Observation) -> Finding | None:
-    """A write whose echo differs did not happen as asked: it is repeated, read back, or made known."""
+    """Check that the master notices a differing echo of a write: it repeats it, reads it back, or reports it."""
     first = next(seen.of(Asked, seen.begun_ns), None)
     if first is None:
         return inconclusive("no write was seen")

@@ -10,9 +10,9 @@ from fieldtwin.emulators.modbus.rtu_receiver import with_crc
 SPLIT_S = 0.016
 """The latency timer of a usual USB adapter."""
 OURS_AFTER_S = (0.020, 0.040, 0.010, 0.030)
-"""How long after another unit's reply ours comes."""
+"""Delays in seconds of this unit's reply after that of another unit."""
 LATER = 0.5
-"""Timeouts after the request that the second exception frame of MB-021 comes."""
+"""Delay in timeouts, after the request, of the second exception frame of MB-021."""
 LATE = 1.5
 """Number of timeouts after the request at which a late reply is sent."""
 
@@ -87,7 +87,7 @@ def other_unit(scene: Scene) -> list[Move]:
 
 
 def other_unit_first(scene: Scene) -> list[Move]:
-    """The delay of our reply changes from request to request, so that no pause of the master hides what it does meanwhile."""
+    """Reply after another unit's reply, with a changing delay, so that no pause of the master hides its reaction."""
     after_s = OURS_AFTER_S[scene.nth % len(OURS_AFTER_S)]
     return [Say(scene.from_unit(scene.neighbour, scene.false)), Say(scene.frame(scene.true), after_s)]
 
@@ -128,7 +128,7 @@ def exception(code: int) -> Play:
 
 
 def exception_at_once_and_later(code: int) -> Play:
-    """The first exception frame comes at once, the second one half a timeout after its request."""
+    """Send the first exception frame at once, the second one half a timeout after its request."""
     return lambda scene: [Say(scene.refuse(code), LATER * scene.timeout_s if scene.nth else 0.0)]
 
 
@@ -137,7 +137,7 @@ def hole(scene: Scene) -> list[Move]:
 
 
 def garbage(scene: Scene) -> list[Move]:
-    """Twice the baud rate makes of a byte two, with framing errors: bits doubled, idle bits between them."""
+    """Send the bytes that a receiver sees at twice the baud rate: every bit doubled, with framing errors."""
     frame = scene.frame(scene.false)
     out = bytearray()
     for byte in frame:
@@ -147,7 +147,7 @@ def garbage(scene: Scene) -> list[Move]:
 
 
 def collision(scene: Scene) -> list[Move]:
-    """Two senders at once: where either drives a 0 there is a 0."""
+    """Send the overlap of two senders: a bit is 0 where either of them sends 0."""
     ours, other = scene.frame(scene.false), scene.from_unit(scene.neighbour, scene.true[:1] + scene.true[1:])
     return [Say(bytes(a & b for a, b in zip(ours, other[1:] + other[:1], strict=False)))]
 
@@ -158,7 +158,7 @@ def bad_lrc(scene: Scene) -> list[Move]:
 
 
 def second_colon(scene: Scene) -> list[Move]:
-    """A frame that begins, and then ours."""
+    """Send the beginning of a frame, then the whole reply."""
     return [Say(scene.frame(scene.false)[:7] + scene.frame(scene.true))]
 
 

@@ -58,7 +58,7 @@ def _watch(id: str, title: str, basis: Basis, clause: str, judge: Judge, must: s
 
 
 SILENT = _bad("MB-000", "no reply", ROBUST, "", line_plays.nothing, "is silent")
-"""No case of the catalogue: how the master's timeout is guessed."""
+"""Not a listed case: it measures the master's timeout."""
 
 CASES: tuple[ModbusCase, ...] = (
     _bad("MB-002", "bad CRC in a reply", REQUIRED, "SL 2.4.1", line_plays.bad_crc, "inverts the CRC").on(framings=RTU),
@@ -185,4 +185,4 @@ CASES: tuple[ModbusCase, ...] = (
     _bad("MB-070c", "ASCII: a gap over 1 s", REQUIRED, "SL 2.5.2.1", line_plays.long_gap, "pauses 1.2 s inside a reply",
          "discard it; go on").on(framings=ASCII),
 )  # fmt: skip
-"""In the order in which they are played; observers judge the whole run in the end."""
+"""In the order of execution; observers check the whole run at the end."""

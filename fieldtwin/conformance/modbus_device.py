@@ -20,7 +20,7 @@ MAX_LENGTH = 254
 
 
 class OneWord(RegisterBank):
-    """Every register holds `word`, every bit its parity; `held` are fixed cells, and what a master writes stays as well."""
+    """Registers that all hold `word`, and bits that hold its parity; `held` are fixed cells, and written values are kept."""
 
     def __init__(self, word: int, held: Mapping[tuple[Table, int], int] | None = None) -> None:
         self.word = word
@@ -35,7 +35,7 @@ class OneWord(RegisterBank):
 
 
 class HonestDevice:
-    """Answers for every unit. `word` is what reads give from now on."""
+    """A device that answers every unit ID. Reads return `word`."""
 
     def __init__(self, word: int, held: Mapping[tuple[Table, int], int] | None = None) -> None:
         self._bank = OneWord(word, held)
@@ -64,7 +64,7 @@ class HonestDevice:
 
 
 class RtuWire:
-    """Requests out of what a master of a line sends, and frames for it."""
+    """A splitter of the requests on an RTU line, and a builder of frames for it."""
 
     framing = "rtu"
 
@@ -73,7 +73,7 @@ class RtuWire:
         self._noise = 0
 
     def cut(self, data: bytes, now_ns: int) -> list[tuple[bytes, int]]:
-        """Whole requests: (unit id and PDU, 0)."""
+        """Return whole requests: (unit ID and PDU, 0)."""
         return [(frame[:-2], 0) for frame in self._receiver.feed(data, now_ns)]
 
     def garbage(self) -> int:
@@ -86,7 +86,7 @@ class RtuWire:
 
 
 class AsciiWire:
-    """The same on a line in ASCII."""
+    """The same for an ASCII line."""
 
     framing = "ascii"
 
@@ -95,7 +95,7 @@ class AsciiWire:
         self._noise = 0
 
     def cut(self, data: bytes, now_ns: int) -> list[tuple[bytes, int]]:
-        """Whole requests: (unit id and PDU, 0)."""
+        """Return whole requests: (unit ID and PDU, 0)."""
         return [(frame[:-1], 0) for frame in self._receiver.feed(data, now_ns)]
 
     def garbage(self) -> int:
@@ -113,7 +113,7 @@ def in_ascii(adu: bytes) -> bytes:
 
 
 class MbapWire:
-    """The same on TCP."""
+    """The same for TCP."""
 
     framing = "tcp"
 
@@ -122,7 +122,7 @@ class MbapWire:
         self._garbage = 0
 
     def cut(self, data: bytes, now_ns: int) -> list[tuple[bytes, int]]:
-        """Whole requests: (unit id and PDU, transaction id)."""
+        """Return whole requests: (unit ID and PDU, transaction ID)."""
         self._buffer += data
         found = []
         while len(self._buffer) >= 6:

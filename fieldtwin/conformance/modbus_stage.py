@@ -1,6 +1,6 @@
-"""The endpoint that a Modbus master under test talks to: honest, until a play is on. It records everything and judges nothing.
+"""The endpoint of a Modbus client under test: it replies correctly until a case begins.
 
-Knows connections and time, no case by name.
+It records everything without a verdict. It handles connections and time, and no specific case.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ from fieldtwin.gateway.core.errors import ConnectionLost
 from fieldtwin.gateway.core.nursery import Nursery
 
 BEHIND_S = 0.050
-"""How long after an odd answer the next honest one comes at the soonest."""
+"""Minimum time in seconds between a faulty answer and the next correct one."""
 LINE_GAP_S = 0.060
 """Pause that ends a frame on a line; an incomplete frame is garbage then."""
 
 
 class Stage:
-    """Serves every client of the endpoint. `play` is what is on; None: all are answered well.
+    """A server for every client of the endpoint. `play` is the current case; None: all requests are answered correctly.
 
-    `struck` counts misanswered requests, `first_ns` is the first one's time, `last_ns` when the last odd thing was done;
-    `pending` says how many moves still wait for their time.
+    `struck` counts wrong replies, `first_ns` is the time of the first one, `last_ns` that of the last fault; `pending`
+    is the number of moves that wait for their time.
     """
 
     def __init__(
@@ -63,21 +63,21 @@ class Stage:
         return round(self._loop.time() * NS_PER_S)
 
     def hold(self, word: Word) -> int:
-        """All cells hold that word from now on; returns its number."""
+        """Make all cells hold that word from now on; return its number."""
         self.device.word = self.first_word if word is Word.FIRST else self.second_word
         return self.device.word
 
     def begin(self, case: ModbusCase, strikes: int) -> None:
-        """From the next fitting request on `case` is played, until `strikes` are used up or `end` is called."""
+        """Run `case` from the next matching request on, until `strikes` are used up or `end` is called."""
         self.play, self.strikes, self._first = case, strikes, None
         self.struck = self.first_ns = self.last_ns = 0
 
     def end(self) -> None:
-        """All is answered well from now on; moves under way are made."""
+        """Answer all requests correctly from now on; moves in progress are completed."""
         self.play = None
 
     async def serve(self, connection: ByteConnection, *, plugged_in_again: bool = False) -> None:
-        """Serve one client until it is gone. `plugged_in_again`: the connection is a port that a case had taken away."""
+        """Serve one client until it disconnects. `plugged_in_again`: the connection is a port that a case had removed."""
         self.clients += 1
         number, wire = self.clients, self._make_wire()
         client = _Client(self, connection, wire, number)
@@ -163,7 +163,7 @@ class _Client:
             return b""
 
     def _answer(self, moves: list[Move], now_ns: int) -> None:
-        """Moves keep their order, and honest answers keep behind odd ones: a device does one thing after the other."""
+        """Schedule moves in order; correct answers wait until pending faulty ones were sent, as a real device would."""
         start_ns = now_ns
         if self._free_ns > now_ns and any(isinstance(m, Say) and m.good for m in moves):
             start_ns = self._free_ns + round(BEHIND_S * NS_PER_S)

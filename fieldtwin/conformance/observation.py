@@ -93,9 +93,9 @@ class Word(Enum):
     POISON = "poison"
     OTHER = "other"
     NONE = "none"
-    """No value, or one that stands for none: bad quality, not a number."""
+    """No value, or a value that means none: bad quality, not a number."""
     UNCLEAR = "unclear"
-    """A number that the probe cannot tell from a published value."""
+    """A number that the probe cannot distinguish from a published value."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,12 +26,12 @@ _REGISTER = re.compile(
 _NUMBER = re.compile(r"(?<![\w.])-?\d+(?![\w.]*\w)")
 _ANY_NUMBER = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?(?![\w.]*\w)")
 MAX_LINE = 10_000
-"""Characters of a line that are looked at."""
+"""Maximum number of characters of a line that are examined."""
 MAX_FORMS = 1_000
 """Forms of lines that a probe remembers."""
 SHOWN_CHARACTERS = 80
 PERIOD_S = 0.05
-"""How often a `tcp://` probe reads; docs/conformance.md names it, because a value that lasts for less may be missed."""
+"""Period in seconds of a `tcp://` probe. docs/conformance.md states it, because a shorter-lived value may be missed."""
 TIMEOUT_S = 2.0
 
 
@@ -46,7 +46,7 @@ class Probe(Protocol):
 
 
 class Classifier:
-    """Readings into words. A reading is any text; the honest words are taught, the rest is known by its number."""
+    """A classifier of readings. A reading is any text; the correct words are learnt, the poison is known by its number."""
 
     def __init__(self, poison: int, stands_for_none: frozenset[str] = frozenset()) -> None:
         self._poison = str(poison)
@@ -55,7 +55,7 @@ class Classifier:
         self.latest = ""
 
     def learn(self, word: Word) -> bool:
-        """Raises `UsageError` where both words look the same."""
+        """Learn the latest reading as `word`. Raises `UsageError` if both words look the same."""
         if not self.latest or self.latest in self._none:
             return False
         known = self._known.get(self.latest)
@@ -127,7 +127,7 @@ class RegisterProbe:
 
 
 class _Lines:
-    """Whole lines out of what is printed and logged; the last `MAX_LINE` characters of one that is not whole are kept."""
+    """Whole lines of output and log; of an incomplete line the last `MAX_LINE` characters are kept."""
 
     def __init__(self) -> None:
         self._pending = {False: "", True: ""}

@@ -38,7 +38,7 @@ def _flush(tty: str) -> None:
         descriptor = os.open(tty, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
     except OSError:
         return  # the other end of a real line
-    import termios  # where there are ptys
+    import termios  # imported late: only on systems with pseudo-terminals
 
     try:
         termios.tcflush(descriptor, termios.TCIOFLUSH)
@@ -47,10 +47,10 @@ def _flush(tty: str) -> None:
 
 
 class Program:
-    """``async with Program(argv, endpoint, on_text, on_end)``. Ends it, with all that it started, on leaving.
+    """The program under test: ``async with Program(argv, endpoint, on_text, on_end)``.
 
-    `on_text` hears what it prints, and whether that is its log (standard error); `on_end` its exit code when it ends by itself.
-    `said` are its last lines, of both.
+    It and its children end on leaving. `on_text` receives its output, and whether that is its log (standard error);
+    `on_end` its exit code when it ends by itself. `said` are the last lines of both.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class Program:
         return self
 
     async def restart(self) -> None:
-        """End it, if it still runs, and start it anew."""
+        """End the program, if it still runs, and start it again."""
         await self._end()
         if self._endpoint.is_serial:
             _flush(self._endpoint.path)

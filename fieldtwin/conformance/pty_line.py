@@ -1,4 +1,4 @@
-"""The virtual port that a master under test opens. It can be unplugged, comes back under its name, and may be held then."""
+"""The virtual port that a master under test opens. A case can unplug it, restore it under its name, and hold it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from fieldtwin.gateway.core.connection import ByteConnection
 from fieldtwin.gateway.core.endpoint import Endpoint, SerialSettings
 from fieldtwin.gateway.core.errors import Unreachable
 
-with suppress(ImportError):  # Windows has no ptys: none can be opened
+with suppress(ImportError):  # Windows has no pseudo-terminals
     import fcntl
     import termios
 

@@ -1,4 +1,4 @@
-"""What happened so far, and the habit that it shows. Bounded: the oldest events go first, and are counted."""
+"""The events so far, and the polling behaviour that they show. Bounded: the oldest events are dropped and counted."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Recorder:
         self._events: deque[Event] = deque(maxlen=MOST_EVENTS)
         self.total = 0
         self.tell: Callable[[Event], None] = lambda event: None
-        """Hears each event as it comes."""
+        """Called with each event."""
 
     def add(self, event: Event) -> None:
         self._events.append(event)
@@ -29,7 +29,7 @@ class Recorder:
 
     @property
     def dropped(self) -> int:
-        """Events that are not kept any more."""
+        """The number of dropped events."""
         return self.total - len(self._events)
 
     def since(self, t_ns: int) -> tuple[Event, ...]:
@@ -42,7 +42,7 @@ class Recorder:
         return tuple(reversed(found))
 
     def habit(self, since_ns: int, until_ns: int, silent_gap_s: float = 0.0) -> Habit:
-        """How the master asked between two moments."""
+        """Return the polling behaviour of the master between two moments."""
         asked = [e for e in self._events if isinstance(e, Asked) and since_ns <= e.t_ns <= until_ns]
         gaps = [(b.t_ns - a.t_ns) / NS_PER_S for a, b in itertools.pairwise(asked)]
         times: dict[bytes, list[int]] = {}

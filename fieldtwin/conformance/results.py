@@ -33,7 +33,7 @@ class CaseResult:
 
     @property
     def deviates(self) -> bool:
-        """Whether it failed a case that the standard requires."""
+        """Return whether a case failed that the standard requires."""
         return self.verdict.bad and self.case.basis is Basis.STANDARD
 
     @property
@@ -60,12 +60,12 @@ FOUND = {Basis.STANDARD: "failed", Basis.ROBUSTNESS: "robustness", Basis.FIELD: 
 
 
 def counts_as_failed(result: CaseResult, fail_on: frozenset[Basis] = ONLY_REQUIRED) -> bool:
-    """Whether the result decides the exit code: it failed, and its case's basis is one of `fail_on`."""
+    """Return whether the result affects the exit code: it failed, and its case's basis is one of `fail_on`."""
     return result.verdict is Verdict.ERROR or (result.verdict.bad and result.case.basis in fail_on)
 
 
 def exit_code(results: Sequence[CaseResult], fail_on: frozenset[Basis] = ONLY_REQUIRED) -> int:
-    """1 when a case failed whose basis is one of `fail_on`, or when no case passed."""
+    """Return 1 when a case failed whose basis is one of `fail_on`, or when no case passed; else 0."""
     passed = any(result.verdict is Verdict.PASSED for result in results)
     return 1 if not passed or any(counts_as_failed(result, fail_on) for result in results) else 0
 
@@ -126,7 +126,7 @@ def as_report(
     started: str,
     fail_on: frozenset[Basis] = ONLY_REQUIRED,
 ) -> Report:
-    """For JUnit: a scenario for each case, with its frames."""
+    """Return the results as a JUnit report: a scenario for each case, with its frames."""
     again = shlex.join(["fieldtwin", *argv])
     scenarios = [_scenario(r, title, argv, fail_on) for r in results]
     return Report(f"{title}: {summary(results)}", scenarios, started=started, reproduce=again, target=title)

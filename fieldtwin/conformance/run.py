@@ -24,7 +24,7 @@ POLL_S = 0.01
 STEADY = 3
 """Number of polls that show the master's usual behaviour."""
 MANY = 1_000_000
-"""Strikes of a case that goes on until its value was seen."""
+"""Maximum number of strikes of a case that continues until its value was seen."""
 
 
 class Playable(Protocol):
@@ -53,7 +53,7 @@ C_contra = TypeVar("C_contra", bound=Playable, contravariant=True)
 
 
 class AnyStage(Protocol[C_contra]):
-    """Where cases are played: see `modbus_stage.Stage`. Times are its `now_ns`."""
+    """The test setup of the cases: see `modbus_stage.Stage`. Times are its `now_ns`."""
 
     recorder: Recorder
     timeout_s: float
@@ -90,8 +90,11 @@ class Plan:
 
 @dataclass
 class MasterRun(Generic[C]):
-    """One judgement of a master. `traits` is what the endpoint has, for `framings` of cases; `silent` a case that leaves a
-    request unanswered, by which the master's timeout is guessed. `tell` hears each result as it comes."""
+    """One conformance test of a master.
+
+    `traits` are the features of the endpoint, for `framings` of cases; `silent` is a case that leaves a request
+    unanswered, which measures the master's timeout. `tell` is called with each result.
+    """
 
     stage: AnyStage[C]
     cases: Sequence[C]
@@ -112,7 +115,7 @@ class MasterRun(Generic[C]):
         if self.probe is not None:
             self.probe.on_shown = self._shown
 
-    # -- what others tell -----------------------------------------------------------------------------------------
+    # -- events from outside --------------------------------------------------------------------------------------
 
     def _shown(self, word: Word, text: str) -> None:
         self.stage.recorder.add(Shown(self.stage.now_ns(), word, text))
@@ -124,7 +127,7 @@ class MasterRun(Generic[C]):
 
     @property
     def exit_code(self) -> int | None:
-        """The program's, once it ended by itself."""
+        """The program's exit code, if it ended by itself."""
         return self._ended.status if self._ended is not None else None
 
     # -- the run --------------------------------------------------------------------------------------------------
@@ -217,7 +220,7 @@ class MasterRun(Generic[C]):
         return await self._good_again(since_ns)
 
     async def _well_anew(self) -> bool:
-        """As `_well`, of a program that was started again."""
+        """Restart the program, and check as `_well`."""
         if self.restart is None:
             return False
         self._ended = None
@@ -257,13 +260,13 @@ class MasterRun(Generic[C]):
         await self._until(done, self.plan.patience_s)
         stage.end()
         last = before if case.holds_good else after
-        if case.holds_good:  # at once: an honest answer must not hold the value that only odd ones held
+        if case.holds_good:  # at once: a correct answer must not hold the value that only faulty ones held
             self._say(last)
         await self._until(lambda: stage.pending == 0, self.plan.patience_s)
         self._say(last)
         over_ns = stage.now_ns() if case.holds_good else max(stage.last_ns, stage.first_ns)
         await self._good_again(over_ns)
-        while stage.last_ns > over_ns:  # a transfer under way went on
+        while stage.last_ns > over_ns:  # a transfer in progress continued
             over_ns = stage.last_ns
             await self._good_again(over_ns)
         await asyncio.sleep(case.trail_s)
@@ -301,7 +304,7 @@ class MasterRun(Generic[C]):
         return await self._until(lambda: self.stage.recorder.count(Told, since_ns) >= count, within_s)
 
     async def _until(self, condition: Callable[[], bool], within_s: float) -> bool:
-        """Whether `condition` came to hold; also over when the master has ended."""
+        """Wait for `condition` and return whether it holds; also end when the master has ended."""
         loop = asyncio.get_running_loop()
         deadline = loop.time() + within_s
         while not condition():

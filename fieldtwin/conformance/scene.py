@@ -12,7 +12,7 @@ from fieldtwin.conformance.modbus_device import ModbusWire
 
 @dataclass(frozen=True, slots=True)
 class Say:
-    """Send `data`, `after_s` seconds behind the request."""
+    """Send `data`, `after_s` seconds after the request."""
 
     data: bytes
     after_s: float = 0.0
@@ -21,7 +21,7 @@ class Say:
 
 @dataclass(frozen=True, slots=True)
 class Hang:
-    """End the connection, by a reset where the wire has such a thing."""
+    """Close the connection, by a reset if the transport has one."""
 
     after_s: float = 0.0
     reset: bool = False
@@ -81,12 +81,12 @@ class Scene:
         return self.wire.frame(self.request, self.tag, pdu)
 
     def from_unit(self, unit: int, pdu: bytes) -> bytes:
-        """A frame that another unit sent."""
+        """Return a frame that another unit sent."""
         return self.wire.frame(bytes((unit,)), self.tag, pdu)
 
     @property
     def neighbour(self) -> int:
-        """The id of another unit."""
+        """The ID of another unit."""
         return self.unit % 247 + 1
 
     def refuse(self, code: int, function: int | None = None) -> bytes:

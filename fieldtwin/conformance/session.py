@@ -1,4 +1,4 @@
-"""A judgement on this computer's wires: the endpoint is opened, the program started, the probe attached."""
+"""Run a conformance test on this computer's endpoints: open the endpoint, start the program, attach the probe."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Options:
 
 @dataclass(frozen=True)
 class Listener:
-    """Who hears what happens: `say` one line of talk, `tell` each result, `log` each event on the wire."""
+    """The callbacks of a test: `say` receives a line of console output, `tell` each result, `log` each event."""
 
     say: Callable[[str], None]
     tell: Callable[[CaseResult], None]
@@ -153,7 +153,7 @@ async def _open(listen: Endpoint, stage: Stage, nursery: Nursery, closing: Async
 
 
 def _probe(options: Options, nursery: Nursery) -> tuple[Probe | None, OnText]:
-    """The probe, and who hears what the program prints."""
+    """Return the probe, and the receiver of the program's output."""
     if not options.probe:
         return None, lambda text, log: None
     kind, _, mark = options.probe.partition(":")

@@ -55,5 +55,5 @@ def half_open(scene: Scene) -> list[Move]:
 
 
 def closed_while_unused(scene: Scene) -> list[Move]:
-    """The answer, and then an end: the master has it and asks for nothing."""
+    """Answer, and then close the connection while the master is idle."""
     return [scene.good(), Hang(0.050)]

@@ -23,7 +23,7 @@ from fieldtwin.gateway.core.yaml_file import YamlFile, load, validate
 
 
 class WaiverForm(BaseModel):
-    """One of them, as it is written."""
+    """One waiver, as written in the file."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -42,7 +42,7 @@ class WaiversForm(BaseModel):
 
 @dataclass(frozen=True, slots=True)
 class Waiver:
-    """`id` fails for a `reason` that is known; the day `expires` is the last one on which that is good enough."""
+    """A waiver: failures of `id` are accepted for `reason`, until the end of the day `expires`."""
 
     id: str
     reason: str
@@ -54,7 +54,7 @@ class Waiver:
 
 @dataclass(frozen=True, slots=True)
 class Waivers:
-    """All of a file. `Waivers()` waives nothing."""
+    """The waivers of a file. `Waivers()` waives nothing."""
 
     entries: tuple[Waiver, ...] = ()
 
@@ -73,7 +73,7 @@ def load_waivers(path: Path, known: Collection[str]) -> Waivers:
 
 
 def read_waivers(file: YamlFile, known: Collection[str]) -> Waivers:
-    """As `load_waivers`, of a file that was read."""
+    """Read waivers as `load_waivers`, from a file that is already loaded."""
     entries = validate(file, WaiversForm).waivers
     seen: set[str] = set()
     for at, entry in enumerate(entries):

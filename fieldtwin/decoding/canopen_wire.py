@@ -28,7 +28,7 @@ _PDO_AREA = range(0x180, 0x580)
 
 
 class CanopenWire:
-    """The nodes of one bus and what is open between them and their master."""
+    """The nodes of one bus and the open transfers between them and their master."""
 
     def __init__(self, bus: str, devices: Iterable[DeviceConfig]) -> None:
         self.bus = bus
@@ -193,7 +193,7 @@ class CanopenWire:
         )  # fmt: skip
 
     def _asked(self, node: int, transfer: Transfer) -> str:
-        """The request of a transfer, with the name of the object and what is written at once."""
+        """Return the request of a transfer, with the name of the object and the value of an expedited write."""
         known = self._nodes.get(node)
         name = known.named(transfer.index, transfer.subindex) if known else transfer.name
         text = f"{self._called(node)}: {transfer.service} {name}" + (" in blocks" if transfer.block else "")
@@ -232,7 +232,7 @@ class CanopenWire:
         )  # fmt: skip
 
     def _value(self, node: int, transfer: Transfer, t_ns: int) -> tuple[dict[str, Scalar | None], Scalar | None]:
-        """Tags and value of what a transfer has moved so far; of one that moved nothing, the tags' names."""
+        """Return the tags and the value that a transfer has moved so far; the tags' names alone if it moved no data."""
         data, known = bytes(transfer.data), self._nodes.get(node)
         if known is None:
             return {}, data.hex()

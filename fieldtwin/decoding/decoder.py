@@ -55,7 +55,7 @@ class Decoder:
         return Decoded(text, fields, tuple(done))
 
     def feed(self, event: Event) -> list[Exchange]:
-        """The exchanges that an event ended: an answer, the request after one that had none, a message."""
+        """Return the exchanges that an event ended: by an answer, by the next request, or as a message."""
         return self._frame(event)[1] if event.kind is Kind.FRAME else []
 
     def finish(self) -> list[Exchange]:
@@ -137,7 +137,7 @@ class Decoder:
 
 
 def exchanges(system: System, events: Iterable[Event], served: Collection[str] = ()) -> list[Exchange]:
-    """All exchanges of a trace, in the order of their requests."""
+    """Return all exchanges of a trace, in the order of their requests."""
     decoder = Decoder(system, served)
     found = [exchange for event in events for exchange in decoder.feed(event)]
     return sorted(found + decoder.finish(), key=lambda e: (e.t_ns, e.end_ns))

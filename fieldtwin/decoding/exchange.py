@@ -1,6 +1,6 @@
-"""What decoding gives: a request with its answer, or a message that has none, as frozen values.
+"""The results of decoding: a request with its answer, or a message that has none, as frozen values.
 
-One form for both protocols, so that scenarios and reports count and compare without knowing either.
+One form for both protocols, so that scenarios and reports can count and compare without depending on either.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Span:
     subindex: int = 0
 
     def covers(self, table: str, address: int) -> bool:
-        """Whether a register (or bit) is inside."""
+        """Return whether a register (or bit) is inside the span."""
         return self.table == table and self.address <= address < self.address + self.count
 
     def __str__(self) -> str:
@@ -99,16 +99,16 @@ class Exchange:
 
     @property
     def is_stray(self) -> bool:
-        """Whether this is a frame that answers no request. It is not a request and must never be counted as one."""
+        """Return whether this is a frame that answers no request. It must never be counted as a request."""
         return self.problem == "stray"
 
     @property
     def ok(self) -> bool:
-        """Answered as asked, or a message that wants no answer."""
+        """Return whether the request was answered well, or the message needs no answer."""
         return not self.problem
 
     def reads(self, tag: str = "") -> bool:
-        """Whether it reads, and `tag` (a name without its device) among others."""
+        """Return whether the exchange reads, and if given, whether it reads `tag` (a name without its device)."""
         return any(s.access == "read" for s in self.spans) and (not tag or tag in self.tags)
 
     def describe(self) -> dict[str, Any]:

@@ -24,7 +24,7 @@ _ANSWERED = {
     lss.FASTSCAN: lss.SLAVE_FOUND,
     lss.IDENTIFY_NON_CONFIGURED: lss.NON_CONFIGURED_FOUND,
 }
-"""Requests that are answered, and by what."""
+"""Requests that are answered, and the command of the answer."""
 _MAY_BE_SILENT = (lss.FASTSCAN, lss.IDENTIFY_NON_CONFIGURED, lss.SWITCH_SELECTIVE[3])
 """Services for which silence is an answer: no node matches."""
 
@@ -85,7 +85,7 @@ class LssWatch:
 
 
 def _named(data: bytes) -> tuple[str, str]:
-    """The service of a frame, and what it says."""
+    """Return the service of a frame, and its parameters in words."""
     command, number = data[0], int.from_bytes(data[1:5], "little")
     if command in lss.SWITCH_SELECTIVE:
         return "switch state selective", f" {_PARTS[command - lss.SWITCH_SELECTIVE[0]]} {number:X}h"

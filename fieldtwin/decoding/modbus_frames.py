@@ -36,7 +36,7 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class Expected:
-    """The reply that a serial line waits for: of `unit` to `function`, with `pdu_bytes` (0: the reply tells)."""
+    """The reply that a serial line waits for: from `unit`, to `function`, with `pdu_bytes` (0: stated by the reply)."""
 
     unit: int
     function: int
@@ -48,11 +48,11 @@ _READS = (1, 2, 3, 4, 23)
 
 
 class Splitter(ABC):
-    """One direction. `feed` gives what is complete, `flush` what will never be."""
+    """A splitter of one direction. `feed` returns complete frames, `flush` the incomplete rest."""
 
     def __init__(self) -> None:
         self._buffer = bytearray()
-        self._arrivals: deque[tuple[int, int]] = deque()  # how many bytes had come, and when
+        self._arrivals: deque[tuple[int, int]] = deque()  # number of bytes received so far, and the time
         self._came = self._gone = 0
 
     @property
@@ -61,7 +61,7 @@ class Splitter(ABC):
         return len(self._buffer)
 
     def feed(self, data: bytes, t_ns: int, expected: Expected | None = None) -> list[Frame]:
-        """Take what arrived."""
+        """Add received bytes and return the frames that are complete."""
         self._buffer += data
         if data:
             self._came += len(data)
@@ -77,7 +77,7 @@ class Splitter(ABC):
         """Take frames off the front."""
 
     def _cut(self, size: int) -> tuple[int, bytes]:
-        """The first `size` bytes, and when the last of them came."""
+        """Remove the first `size` bytes; return them and the time of the last one."""
         raw = bytes(self._buffer[:size])
         del self._buffer[:size]
         self._gone += size
@@ -143,7 +143,10 @@ class RtuSplitter(Splitter):
         return (-1, "") if grows and not settled else (0, "")
 
     def _expected_size(self, head: bytearray, expected: Expected | None) -> int:
-        """How long the awaited reply is if this is its beginning, else 0; more than there is where that is not known yet."""
+        """Return the length of the awaited reply if `head` is its beginning, else 0.
+
+        While the length is not known yet, the result is larger than the length of `head`.
+        """
         if expected is None or head[0] != expected.unit:
             return 0
         if len(head) < 2:
@@ -198,7 +201,7 @@ def _ascii_frame(t_ns: int, raw: bytes) -> Frame:
 
 
 class MbapSplitter(Splitter):
-    """Modbus TCP (TG 3.1.3). After a header that cannot be right the rest of what came is noise."""
+    """Modbus TCP (TG 3.1.3). After an invalid header the rest of the received bytes is noise."""
 
     def _split(self, expected: Expected | None, settled: bool) -> list[Frame]:
         found = []
@@ -219,5 +222,5 @@ class MbapSplitter(Splitter):
 
 
 def splitter(framing: str) -> Splitter:
-    """The splitter for one direction of a wire with that framing: rtu, ascii, mbap or udp."""
+    """Return the splitter for one direction of a connection with that framing: rtu, ascii, mbap or udp."""
     return {"rtu": RtuSplitter, "ascii": AsciiSplitter}.get(framing, MbapSplitter)()

@@ -17,7 +17,7 @@ from fieldtwin.decoding.tags import TagMap
 from fieldtwin.gateway.core.values import Scalar
 
 MAX_OPEN = 64
-"""Requests without an answer that are remembered on an MBAP wire; an older one will have none."""
+"""Maximum number of open requests on an MBAP connection; an older one counts as unanswered."""
 
 STRAY_SHOWN = 32
 """Bytes of a stray frame that its text shows; the exchange has all of them."""
@@ -25,7 +25,7 @@ STRAY_SHOWN = 32
 
 @dataclass(frozen=True, slots=True)
 class Unit:
-    """A device that answers on the wire: its name in the system and its tags."""
+    """A device on the connection: its name in the system and its tags."""
 
     name: str
     tags: TagMap
@@ -57,12 +57,12 @@ class ModbusWire:
         self._echo = echo and self._serial
         self._echo_due = b""
         self._served = served
-        self._open: dict[int, _Open] = {}  # by transaction id; on a line there is one, with id -1
+        self._open: dict[int, _Open] = {}  # by transaction ID; a serial line has one entry, with ID -1
         self._given_up: deque[int] = deque(maxlen=MAX_OPEN)
         self._cut_off = False
 
     def feed(self, sent: bool, data: bytes, t_ns: int) -> tuple[list[str], list[Exchange]]:
-        """A chunk, in the order of the trace. Each text describes a frame, or what there is of one."""
+        """Add a chunk, in the order of the trace. Each text describes a whole or partial frame."""
         return self._take_requests(data, t_ns) if sent != self._served else self._take_replies(data, t_ns)
 
     def finish(self) -> list[Exchange]:
@@ -87,7 +87,7 @@ class ModbusWire:
         done: list[Exchange] = []
         frames = self._requests.feed(data, t_ns)
         if not self._served:
-            frames += self._requests.flush()  # what we send is a frame, whole
+            frames += self._requests.flush()  # each chunk that is sent is one whole frame
             self._echo_due = data if self._echo else b""
         for frame in frames:
             if frame.bad:
@@ -109,7 +109,7 @@ class ModbusWire:
             return f"{text}, to all"
         if (replaced := self._open.pop(frame.transaction, None)) is not None:
             done.append(self._unanswered(replaced))
-        self._cut_off = self._replies.pending > 0  # it may go on, or its connection was lost and this is another one
+        self._cut_off = self._replies.pending > 0  # the reply may continue, or the connection was lost and replaced
         if len(self._open) >= MAX_OPEN:
             done.append(self._unanswered(self._open.pop(next(iter(self._open)))))
         self._open[frame.transaction] = opened
@@ -154,7 +154,7 @@ class ModbusWire:
         return texts, done
 
     def _begins_a_reply(self, data: bytes) -> bool:
-        """Whether what came is the beginning of an answer that is awaited, though another one is unfinished (MBAP)."""
+        """Return whether `data` begins an awaited answer although another answer is incomplete (MBAP)."""
         opened = self._open.get(int.from_bytes(data[:2])) if len(data) >= 7 else None
         return opened is not None and data[2:4] == b"\0\0" and data[6] == opened.frame.unit
 
@@ -211,7 +211,7 @@ class ModbusWire:
         return text
 
     def _sender_of(self, frame: Frame) -> Unit | None:
-        """Return the device that sent a frame with a unit ID that is not on the wire: the one that was asked, or the only one."""
+        """Return the sender of a frame with an unknown unit ID: the device of the request, or the only device."""
         opened = self._open.get(frame.transaction)
         if opened is not None and opened.frame.unit in self._units:
             return self._units[opened.frame.unit]
@@ -281,7 +281,7 @@ def _values(tags: TagMap | None, span: Span, data: bytes, t_ns: int) -> str:
 
 
 def _shown(tags: TagMap | None, span: Span, found: dict[str, Scalar | None], registers: tuple[int, ...]) -> str:
-    """The tags where there are any, else the words."""
+    """Return the tags as text if there are any, else the words."""
     if tags is not None and found:
         return tags.show(found)
     if tags is not None and tags.secret(span):

@@ -35,7 +35,7 @@ _KINDS = (("TPDO", TPDO_COMMUNICATION, TPDO_MAPPING), ("RPDO", RPDO_COMMUNICATIO
 
 @dataclass(frozen=True, slots=True)
 class Pdo:
-    """A PDO of a node: ``TPDO1``, whether the node sends it, and what it carries; None where that is not known."""
+    """A PDO of a node: its name such as ``TPDO1``, whether the node sends it, and its content; None if that is not known."""
 
     node: int
     name: str
@@ -82,18 +82,18 @@ class NodeMap:
                 value = decode(entry.type_code, data)
                 return {}, value.hex() if isinstance(value, bytes) else value
             except FieldtwinError:
-                pass  # another size than the type's: shown as it is
+                pass  # a size other than the type's: shown as hex
         return {}, data.hex()
 
     def named(self, index: int, subindex: int) -> str:
-        """``6010h:00 slope_long``: the tag, else what the EDS calls the object, else the number alone."""
+        """Return a name such as ``6010h:00 slope_long``: the tag, else the EDS's name of the object, else the number alone."""
         number, tag = f"{index:04X}h:{subindex:02X}", self.tags.by_object.get((index, subindex))
         entry = self._dictionary.get(index, subindex) if self._dictionary else None
         name = tag.name if tag else entry.name.rpartition(".")[2] if entry else ""
         return f"{number} {name}".rstrip()
 
     def said(self, index: int, subindex: int, data: bytes, t_ns: int) -> str:
-        """The value in words: with its unit where it is a tag; identifiers and mappings of PDOs as what they are."""
+        """Return the value in words: a tag with its unit, a PDO's identifiers and mappings in their own form."""
         word = int.from_bytes(data, "little")
         if len(data) == 4 and index in _PARAMETERS:
             if index not in _MAPPINGS and subindex == 1:
@@ -153,7 +153,7 @@ class NodeMap:
 
 
 def _dictionary(config: DeviceConfig) -> ObjectDictionary | None:
-    """The node's EDS; None where it has none or it cannot be read, which says nothing about the run."""
+    """Return the node's EDS; None without one or if it cannot be read, which does not affect the run."""
     path = config.profile.eds_path
     try:
         return load_dictionary(path, config.address) if path else None

@@ -18,7 +18,7 @@ _ABORT = 0x80
 
 @dataclass(slots=True)
 class Transfer:
-    """A transfer, as far as it is known. `data` is whole once it is over; `aborted_by` is client or server."""
+    """A transfer, as far as it is known. `data` is complete at its end; `aborted_by` is client or server."""
 
     upload: bool
     index: int
@@ -32,12 +32,12 @@ class Transfer:
     aborted_by: str = ""
     answered: bool = False
     segments: dict[int, bytes] = field(default_factory=dict)
-    """Of the present sub-block, not acknowledged."""
+    """The segments of the current sub-block, not yet acknowledged."""
     in_segments: bool = False
     last: int = 0
-    """The number of the last segment of a sub-block, if that is the last of all; else 0."""
+    """The number of the sub-block's last segment if it ends the transfer; else 0."""
     last_sent: bool = False
-    """Of a segmented download: the client has nothing more."""
+    """True when the client of a segmented download has sent its last segment."""
 
     @property
     def name(self) -> str:
@@ -203,7 +203,7 @@ def _segment_of_block(now: Transfer, data: bytes) -> Seen:
 
 
 def _acknowledge(now: Transfer, upto: int) -> None:
-    """Segments 1 to `upto` count; the rest will come again, numbered from 1."""
+    """Accept the segments 1 to `upto`; the client repeats the rest, numbered from 1."""
     for number in range(1, upto + 1):
         _keep(now, now.segments.get(number, b""))
     if upto and upto == now.last:

@@ -16,7 +16,7 @@ from fieldtwin.gateway.core.values import Scalar, TagValue
 from fieldtwin.gateway.devices.codec import apply_scale, decode, decode_little
 
 _KEPT_PLANS = 1024
-"""Different spans of a device whose tags are remembered: a scan of all addresses may not fill the memory."""
+"""Maximum number of spans of a device whose tags are cached, so that a scan of all addresses does not fill the memory."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +29,7 @@ class _Plan:
 
 
 class TagMap:
-    """The tags of one device. Remembers scale factors, which may be read before what they scale."""
+    """The tags of one device. Keeps scale factors, which may be read before the values that they scale."""
 
     def __init__(self, profile: DeviceProfile) -> None:
         self.profile = profile
@@ -49,7 +49,7 @@ class TagMap:
 
     @property
     def has_secrets(self) -> bool:
-        """Whether the device has any secret tag, so that a frame of unknown content may hold one."""
+        """Return whether the device has any secret tag, so that a frame of unknown content may hold one."""
         return bool(self._secrets)
 
     def secret(self, span: Span) -> bool:

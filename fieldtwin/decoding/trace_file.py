@@ -1,4 +1,4 @@
-"""Files that hold what happened: a run's trace (`fieldtwin run --trace`) and a capture of its wires (`--capture`)."""
+"""Read recorded traffic: a run's trace (`fieldtwin run --trace`) or a capture of its buses (`--capture`)."""
 
 from __future__ import annotations
 
@@ -19,8 +19,9 @@ _EXPECTED = "[ns, kind, where, data], as `fieldtwin run --virtual --trace` write
 
 
 def read_events(path: Path, system: System) -> Iterator[Event]:
-    """The events of a trace or, of a capture, its frames on the system's buses, ns since the first. A last line that was cut
-    off is left out. Raises `FileInvalid` with the line at any other flaw.
+    """Yield the events of a trace, or the frames of a capture on the system's buses, in ns since the first.
+
+    A truncated last line is omitted. Raises `FileInvalid` with the line number for any other invalid line.
     """
     try:
         with open_input(path) as file:

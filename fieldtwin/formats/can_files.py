@@ -25,14 +25,14 @@ SUFFIXES = (".asc", ".blf", ".trc")
 MAX_TIME_S = 1 << 33
 MAX_LINE = 65_536
 MAX_CONTAINER = 16_000_000
-"""Bytes of a packed block of a .blf file when it is unpacked; writers close one at a hundredth of it."""
+"""Maximum unpacked size in bytes of a packed block of a .blf file; writers end a block at a hundredth of it."""
 _BLOCK = 65_536
 _CONTAINER, _PLAIN, _ZLIB = 10, 0, 2
 MAX_OBJECT = 65_536
 
 
 def read_can_file(path: Path, left: LeftOut) -> Iterator[tuple[int, str, CanFrame]]:
-    """(ns, channel, frame), in the file's order. Raises `FileInvalid`, at the number of the message where that is known."""
+    """Yield (ns, channel, frame) in the file's order. Raises `FileInvalid` with the number of the message if known."""
     try:
         from can.io.asc import ASCReader
         from can.io.blf import BLFReader
@@ -81,7 +81,7 @@ def _guarded(reader: Any, file: IO[Any], path: Path) -> Iterator[Any]:
 
 
 def _check_lines(path: Path) -> None:
-    """A reader takes a line into memory whatever its length."""
+    """Check the length of each line, because a reader loads a line into memory whatever its length."""
     since = number = 0
     with open_input(path) as file:
         while block := file.read(_BLOCK):
@@ -94,7 +94,7 @@ def _check_lines(path: Path) -> None:
 
 
 def _check_blocks(path: Path) -> None:
-    """A reader unpacks a container into memory whatever it becomes."""
+    """Check the size of each container, because a reader unpacks it into memory whatever its size."""
     with open_input(path) as file:
         head = file.read(8)
         if len(head) < 8 or head[:4] != b"LOGG":

@@ -1,7 +1,7 @@
-"""CAN logs as candump writes them with -L: ``(1436509052.249713) can0 585#4B06200034120000``. Frames and lines, both ways.
+"""Read and write CAN logs in the format of candump -L: ``(1436509052.249713) can0 585#4B06200034120000``.
 
-Written so that candump's own players read it again; read with what kernels and adapters add: CAN FD frames and error frames are
-counted and left out. It must never know what frames mean.
+The written logs can be replayed by candump's own tools. Logs may contain additions of kernels and adapters: CAN FD
+frames and error frames are counted and omitted. This module must not depend on the meaning of frames.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def line_of(t_ns: int, frame: CanFrame, channel: str = "can0") -> bytes:
 
 
 def read_log(path: Path, left: LeftOut | None = None) -> Iterator[tuple[int, str, CanFrame]]:
-    """(ns, channel, frame) of each line. A last line that was cut off is left out. Raises `FileInvalid` with the line."""
+    """Yield (ns, channel, frame) of each line. A truncated last line is omitted. Raises `FileInvalid` with the line."""
     left = left if left is not None else LeftOut()
     number = 0
     try:

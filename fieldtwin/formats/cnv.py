@@ -1,9 +1,9 @@
-"""Sea-Bird casts (.cnv, plain, .gz or .bz2) into recordings of the `ctd`.
+"""Import Sea-Bird casts (.cnv, plain, .gz or .bz2) as recordings of the `ctd`.
 
-The format is Sea-Bird's "converted data file": header lines that begin with ``*`` (instrument) or ``#`` (processing), one
-line ``*END*``, then a row a scan of columns 11 characters wide (SBE Data Processing manual, file formats and short variable
-names). Text is Latin-1 in practice. Everything streams: memory does not grow with the file. It knows nothing of runs,
-emulators or the command line.
+The format is Sea-Bird's "converted data file": header lines that begin with ``*`` (instrument) or ``#`` (processing),
+one line ``*END*``, then one row per scan with columns 11 characters wide (SBE Data Processing manual, file formats and
+short variable names). Text is Latin-1 in practice. Streaming: memory does not grow with the file. The module does not
+depend on runs, emulators or the command line.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ T68_IN_T90 = 1.00024
 """IPTS-68 from ITS-90, as oceanography has it (Saunders 1990, WOCE Newsletter 10)."""
 
 Progress = Callable[[int, int], None]
-"""Called with bytes read and bytes in all, both of the file as it is on disk (compressed, if it is)."""
+"""Called with the bytes read and the total, both of the file on disk (compressed, if it is)."""
 
 
 UNITS = {"pressure": "dbar", "temperature": "degC", "conductivity": "S/m"}
@@ -56,7 +56,7 @@ COLUMNS: dict[str, dict[str, float]] = {
         for unit, divisor in (("S/m", 1.0), ("mS/cm", 10.0), ("uS/cm", 10_000.0))
     },
 }
-"""For each signal the columns that can give it, the best first, and what to divide them by."""
+"""For each signal the columns that can provide it, the best first, and their divisor."""
 
 TIME_COLUMNS = (
     ("timeS", 1.0),
@@ -79,11 +79,11 @@ _START = re.compile(r"([A-Z][a-z]{2}) (\d{1,2}) (\d{4})\s+(\d{2}:\d{2}:\d{2})(?:
 
 @dataclass(frozen=True, slots=True)
 class ImportSummary:
-    """What became of a cast.
+    """The result of importing a cast.
 
-    `seconds` is from the first row to the last. `columns` maps each signal, and ``time``, to the column it came from.
-    `bad_values` were marked bad or not finite: they are "no value" in the recording. `rows_announced` is what the header
-    promised, 0 where it did not; fewer rows than that mean a file that was cut.
+    `seconds` is from the first row to the last. `columns` maps each signal, and ``time``, to its source column.
+    `bad_values` counts values that were marked bad or not finite: they are "no value" in the recording.
+    `rows_announced` is the number in the header, 0 without one; fewer rows than that mean a truncated file.
     """
 
     rows: int
@@ -109,7 +109,7 @@ class CnvHeader:
 
 @dataclass(frozen=True, slots=True)
 class _Plan:
-    """Which column becomes what: index and divisor; `time`: index and factor, None where the header's interval counts."""
+    """The use of the columns: index and divisor; `time`: index and factor, None if the header's interval is used."""
 
     signals: tuple[tuple[int, float], ...]
     time: tuple[int, float] | None
@@ -143,7 +143,7 @@ def import_cnv(
 
 
 class _Lines:
-    """The file's lines as text, decompressed on the way; knows the line it is at."""
+    """The file's lines as text, decompressed on the way, with the current line number."""
 
     def __init__(self, path: Path, progress: Progress | None) -> None:
         self.path = path
@@ -240,7 +240,7 @@ def _read_header_line(header: CnvHeader, text: str, lines: _Lines) -> None:
 
 
 def _start_utc(text: str) -> str:
-    """ISO 8601 where the header says that the time is UTC, else nothing: an instrument's clock may be set to anything."""
+    """Return ISO 8601 if the header states UTC, else an empty string: an instrument's own clock is not reliable."""
     match = _START.match(text)
     if not match or match[1] not in _MONTHS or not re.search(r"\b(NMEA|UTC)\b", match[5] or ""):
         return ""
@@ -270,7 +270,7 @@ def _plan(header: CnvHeader, path: Path, chosen: Mapping[str, str]) -> _Plan:
 
 
 def _candidates(chosen: Mapping[str, str]) -> dict[str, list[str]]:
-    """The columns to look for, for each signal; a chosen one alone."""
+    """Return the candidate columns for each signal; a chosen column alone."""
     for signal, name in chosen.items():
         if signal not in COLUMNS:
             raise UsageError("no such signal", expected=", ".join(COLUMNS), got=signal)
@@ -292,7 +292,7 @@ def _recording_header(path: Path, header: CnvHeader, plan: _Plan) -> RecordingHe
 
 
 def _copy_rows(lines: _Lines, header: CnvHeader, plan: _Plan, writer: RecordingWriter) -> tuple[int, float, int]:
-    """All rows into the recording; returns rows, seconds, bad values."""
+    """Copy all rows into the recording; return rows, seconds, bad values."""
     origin, last_t, bad = math.nan, 0.0, 0
     for line in lines:
         if not line.strip():
@@ -315,7 +315,7 @@ def _copy_rows(lines: _Lines, header: CnvHeader, plan: _Plan, writer: RecordingW
 
 
 def _cells(line: str, header: CnvHeader, lines: _Lines) -> list[str]:
-    """A row's columns. Values that fill their width touch their neighbour: then the width tells them apart."""
+    """Return a row's columns. Values that fill their width touch their neighbours: then the width separates them."""
     cells = line.split()
     if len(cells) == header.nquan:
         return cells
@@ -335,7 +335,7 @@ def _time(cells: list[str], header: CnvHeader, plan: _Plan, lines: _Lines, row: 
 
 
 def _value(text: str, bad_flag: float, lines: _Lines) -> float:
-    """A number as the file has it; NaN where it is marked bad."""
+    """Return a number of the file; NaN if it is marked bad."""
     try:
         value = float(text)
     except ValueError:

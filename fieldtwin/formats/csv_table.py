@@ -39,8 +39,11 @@ class TableSummary:
 def import_csv(
     path: Path, out: Path, *, columns: Mapping[str, str], time: str = "", device: str = "", made_by: str = ""
 ) -> TableSummary:
-    """Turn the table at `path` into the recording `out`. `columns` is signal: column (a name, or ``#3`` for the third); without
-    it every column is a signal. Raises `FileInvalid` with the line, `UsageError` for a column that is not there."""
+    """Convert the table at `path` into the recording `out`.
+
+    `columns` maps signal to column (a name, or ``#3`` for the third); without it every column is a signal. Raises
+    `FileInvalid` with the line, `UsageError` for a missing column.
+    """
     with _open(path) as file:
         rows = _rows(path, file)
         line, names = next(rows, (1, []))

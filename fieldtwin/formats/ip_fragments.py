@@ -1,4 +1,4 @@
-"""IP packets that came in pieces, put together again (RFC 791 3.2, RFC 8200 4.5). Bounded; knows nothing of what is in them."""
+"""Reassemble fragmented IP packets (RFC 791 3.2, RFC 8200 4.5). Bounded; independent of the payload."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Hashable
 from dataclasses import dataclass, field
 
 MAX_PACKETS = 64
-"""Packets that are put together at once; then the oldest is given up."""
+"""Maximum number of incomplete packets; beyond it the oldest is dropped."""
 MAX_BYTES = 65_535
 MAX_PIECES = 64
 

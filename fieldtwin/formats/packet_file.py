@@ -1,7 +1,8 @@
-"""Packets out of pcap and pcapng files, in order: when, on what kind of link, and the bytes from the link layer on.
+"""Read packets from pcap and pcapng files, in order: time, link type, and the bytes from the link layer on.
 
-Reads a packet at a time, so that a file of any size needs no more memory than its longest packet. A file whose last packet is cut
-off is read up to it (`truncated`); any other flaw is `FileInvalid` with the offset. It must never know what the packets carry.
+Reads a packet at a time, so that a file of any size needs no more memory than its longest packet. A file whose last
+packet is truncated is read up to it (`truncated`); any other error is `FileInvalid` with the offset. This module must
+not depend on the content of the packets.
 
 Sources: draft-ietf-opsawg-pcap (pcap), draft-ietf-opsawg-pcapng (pcapng).
 """
@@ -34,11 +35,11 @@ _INTERFACE, _OBSOLETE, _SIMPLE, _ENHANCED = 1, 2, 3, 6
 _TSRESOL, _TSOFFSET = 9, 14
 
 Packet = tuple[int, int, bytes]
-"""(time in ns since 1970, 0 where the file has none; link type; bytes)"""
+"""(time in ns since 1970, 0 if the file has none; link type; bytes)"""
 
 
 def is_packet_file(head: bytes) -> bool:
-    """Whether a file that begins with these four bytes is one that is read here."""
+    """Return whether a file that begins with these four bytes can be read here."""
     return head[:4] in _CLASSIC or head[:4] == _SECTION
 
 
@@ -69,7 +70,7 @@ class PacketFile:
 
     @property
     def read_bytes(self) -> int:
-        """How much of the file was read, for a progress bar: packed bytes where it is packed."""
+        """The number of bytes read from the file, for a progress bar: packed bytes if it is packed."""
         return self._raw.tell()
 
     def __iter__(self) -> Iterator[Packet]:

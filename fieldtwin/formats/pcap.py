@@ -115,10 +115,10 @@ def link_type(endpoint: Endpoint) -> int:
 
 
 def packets(captured: Iterable[Captured], endpoint: Endpoint) -> Iterator[Packet]:
-    """The packets of one endpoint's conversation, in order.
+    """Yield the packets of one endpoint's conversation, in order.
 
-    ``tcp``: one connection to port 502, handshake included; where the capture spans several connections the packets
-    are those of one. ``rtu``, ``rtu+tcp``: a packet for each request, and for all that came until the next one.
+    ``tcp``: one connection to port 502, handshake included; where the capture spans several connections the packets are
+    those of one. ``rtu``, ``rtu+tcp``: a packet for each request, and one for all bytes until the next request.
     ``can``: a packet for each frame.
     """
     seen = (c for c in captured if c.endpoint == endpoint)
@@ -129,10 +129,10 @@ def packets(captured: Iterable[Captured], endpoint: Endpoint) -> Iterator[Packet
 
 
 def write_pcap(path: Path, captured: Iterable[Captured], endpoint: Endpoint, utc_offset_ns: int = 0) -> int:
-    """Write one endpoint's conversation as a pcap file; how many packets.
+    """Write one endpoint's conversation as a pcap file; return the number of packets.
 
-    `utc_offset_ns` is added to the captures' monotonic times to make UTC of them. Raises `FileInvalid` where the file
-    cannot be written.
+    `utc_offset_ns` is added to the captures' monotonic times to convert them to UTC. Raises `FileInvalid` where the
+    file cannot be written.
     """
     count = 0
     try:

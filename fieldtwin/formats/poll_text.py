@@ -1,8 +1,9 @@
-"""What modpoll and mbpoll print, as exchanges: the request that they say they make, and the values that they got.
+"""Convert the output of modpoll and mbpoll into exchanges: the request that they report, and the values that they received.
 
-They print values and no bytes, so the reply is put together from them: 16-bit registers and bits as they are, 32-bit values in
-the word order that they name (or, unnamed, modpoll's: low word first). Their times are not printed; polls count by their rate. A
-poll that failed with an exception that they name is one; any other failure has no reply. Pure text; bounded by a line.
+They print values and no bytes, so the reply is reconstructed from them: 16-bit registers and bits as they are, 32-bit
+values in the word order that they name (or, unnamed, modpoll's: low word first). They print no times; polls are spaced
+by their rate. A poll that failed with a named exception has that exception; any other failure has no reply. Pure text;
+bounded by a line.
 """
 
 from __future__ import annotations
@@ -79,7 +80,7 @@ class _Asked:
 
 
 def read_polls(lines: Iterable[str], path: str = "") -> Iterator[Exchange]:
-    """The polls of a session, or of several one behind the other. Raises `FileInvalid` with the line."""
+    """Yield the polls of one session or of several in sequence. Raises `FileInvalid` with the line."""
     asked, cells, failed, polls, number = _Asked(), dict[int, str](), "", 0, 0
     polling = False
     for number, line in enumerate(lines, 1):
@@ -105,7 +106,7 @@ def read_polls(lines: Iterable[str], path: str = "") -> Iterator[Exchange]:
             yield asked.exchange(polls, cells, failed)
         except (ValueError, KeyError, struct.error, OverflowError) as e:
             if len(cells) == asked.count:
-                raise _invalid(path, number, e) from e  # otherwise it was cut off in its last poll
+                raise _invalid(path, number, e) from e  # otherwise the file was truncated in its last poll
 
 
 def _read_head(asked: _Asked, text: str) -> None:

@@ -24,7 +24,7 @@ _PLAIN_IP4 = b"\x08\x00\x45"
 """An EtherType, and an IPv4 header without options."""
 
 MAX_WAITING = 64
-"""Segments of one direction that wait for an earlier one; with one more, the earlier one is taken as lost by the capture."""
+"""Maximum number of segments that wait for an earlier one; beyond it the capture counts as having lost the earlier one."""
 MAX_WAITING_BYTES = 65_536
 MAX_CONVERSATIONS = 1024
 
@@ -39,7 +39,7 @@ class Segments:
 
     @property
     def waits(self) -> bool:
-        """Whether something came that lies behind what is missing."""
+        """Return whether data after a gap has arrived."""
         return bool(self._waiting)
 
     def __init__(self) -> None:
@@ -116,7 +116,7 @@ class Conversation:
 
 
 OnData = Callable[[Conversation, Side, bytes, int, int], None]
-"""(conversation, the side that said it, bytes, time in ns, bytes lost just before)"""
+"""(conversation, the sending side, bytes, time in ns, bytes lost just before)"""
 OnEnd = Callable[[Conversation], None]
 
 
@@ -143,7 +143,7 @@ class _Path:
 
 
 class Conversations:
-    """All conversations of a capture. A connection that is opened anew with the same ports is another one."""
+    """All conversations of a capture. A connection that is opened again with the same ports is a new conversation."""
 
     def __init__(self, on_data: OnData, on_end: OnEnd) -> None:
         self.counters = PacketCounters()
@@ -198,7 +198,7 @@ class Conversations:
         return True
 
     def _remember(self, data: bytes) -> None:
-        """The way of the packets that follow this one, once both sides were heard."""
+        """Store the connection of the following packets, once both sides were seen."""
         sender, other = (data[26:30], data[34] << 8 | data[35]), (data[30:34], data[36] << 8 | data[37])
         conversation = self._open.get(_key(False, sender, other))
         if conversation is not None and len(conversation.segments) == 2:
@@ -247,7 +247,7 @@ class Conversations:
     def _piece(
         self, t_ns: int, key: Hashable, offset: int, more: bool, data: bytes, addresses: bytes, protocol: int
     ) -> None:
-        """A piece of an IP packet; the last one brings what it carries."""
+        """Add a fragment of an IP packet; the last fragment yields the payload."""
         whole = self._fragments.add(key, offset, data, more=more)
         if whole is not None:
             half = len(addresses) // 2
@@ -343,7 +343,7 @@ def _key(udp: bool, left: Side, right: Side) -> tuple[bool, Side, Side]:
 
 
 def _network(link: int, data: bytes) -> tuple[int, int] | None:
-    """What network protocol (an EtherType) a packet carries and where it begins; None where the link says none."""
+    """Return the network protocol (an EtherType) of a packet and its offset; None if the link layer states none."""
     if link == LINK_ETHERNET:
         kind, at = int.from_bytes(data[12:14]), 14
         while kind in _VLAN and at + 4 <= len(data):

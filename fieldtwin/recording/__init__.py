@@ -1,1 +1,1 @@
-"""Recording what others say on a wire, and asking whether two recordings say the same."""
+"""Record foreign traffic, and compare two recordings."""

@@ -17,7 +17,7 @@ from fieldtwin.decoding.modbus_pdu import parse_reply, parse_request, words
 from fieldtwin.gateway.core.recording import Exchange
 
 MOST_WORDS = 1_000_000
-"""Values of both sides that are kept for aligning; a longer dialogue is compared position by position."""
+"""Maximum number of values of both sides that are kept; a longer dialogue is compared position by position."""
 LEAST_DIFFERENT = 2
 """Different values that a shifted match must show."""
 
@@ -27,7 +27,7 @@ Cell = tuple[int, str, int]
 
 @dataclass(frozen=True, slots=True)
 class Shift:
-    """Where the values of a cell continue the recorded ones: at index `at` of `recorded`, for `compared` values."""
+    """The position at which the values of a cell continue the recorded ones: index `at` of `recorded`, `compared` values."""
 
     unit: int
     where: str
@@ -38,7 +38,7 @@ class Shift:
 
 @dataclass(frozen=True, slots=True)
 class Aligned:
-    """A pair to be compared; `recorded` None: it cannot be compared, because the recording has nothing at that position."""
+    """A pair to be compared. `recorded` None: not comparable, because the recording has no value at that position."""
 
     recorded: Exchange | None
     other: Exchange
@@ -72,16 +72,19 @@ class _Series:
 
     @property
     def may_wrap(self) -> bool:
-        """Whether the tail is the beginning of the recorded values again."""
+        """Return whether the tail equals the beginning of the recorded values."""
         return bool(self.tail) and self.tail == self.recorded[: len(self.tail)]
 
     @property
     def holds(self) -> bool:
-        """Whether the tail is the last recorded value, held."""
+        """Return whether the tail repeats the last recorded value."""
         return all(value == self.recorded[-1] for value in self.tail)
 
     def fits(self, shift: int) -> bool:
-        """Whether all that came is recorded from `shift` on, and after the end is the beginning again or the last value held."""
+        """Return whether all live values are recorded from `shift` on.
+
+        After the end of the recording they must repeat its beginning or hold its last value.
+        """
         size = len(self.recorded) - shift
         overlap, tail = self.other[:size], self.other[size:]
         if overlap != self.recorded[shift : shift + len(overlap)]:
@@ -89,7 +92,7 @@ class _Series:
         return tail == self.recorded[: len(tail)] or all(value == self.recorded[-1] for value in tail)
 
     def shows(self, shift: int) -> bool:
-        """Whether the match at `shift` shows enough different values to be no chance."""
+        """Return whether the match at `shift` has enough different values not to be chance."""
         size = len(self.recorded) - shift
         tail = self.other[size:]
         begins_again = tail == self.recorded[: len(tail)] and any(value != self.recorded[-1] for value in tail)
@@ -110,7 +113,7 @@ class Dialogue:
 
     @property
     def is_full(self) -> bool:
-        """Whether no more is kept: then everything is compared position by position."""
+        """Return whether the limit is reached: then everything is compared position by position."""
         return self._words >= MOST_WORDS
 
     def add(self, recorded: Exchange, other: Exchange) -> None:
@@ -138,9 +141,9 @@ class Dialogue:
         self._words += len(values)
 
     def aligned(self, alike: Callable[[Exchange, Exchange], bool]) -> list[Aligned]:
-        """All pairs, each with the recorded exchange at the position that was found; fills `shifts`.
+        """Return all pairs, each with the recorded exchange at the position that was found; fills `shifts`.
 
-        Only what is not `alike` position by position is looked for elsewhere.
+        Only exchanges that are not `alike` position by position are looked up elsewhere.
         """
         differ = {(one.unit, one.request) for one, other in self._pairs if not alike(one, other)}
         if self.is_full or not differ or not self._shift_all(differ):
@@ -177,8 +180,11 @@ class Dialogue:
         return bool(self.shifts)
 
     def _wrap_all(self) -> None:
-        """Find the cells whose values begin again after their end. Where the first and the last value are equal, a cell that is
-        read with it and is at the same position tells it."""
+        """Find the cells whose values repeat from the beginning after their end.
+
+        Where the first and the last value are equal, a cell that is read together with it and is at the same position
+        decides.
+        """
         moved = [series for series in self._cells.values() if series.shift and series.sure and series.may_wrap]
         certain = {(request, s.shift) for s in moved if not s.holds for request in s.asked}
         for series in moved:
@@ -229,8 +235,10 @@ def _reply(function: int, values: Sequence[int]) -> bytes:
 
 
 def _overlaps(live: Sequence[int], recorded: Sequence[int]) -> list[int]:
-    """Positions in `recorded`, ascending, from which on it is equal to `live` as far as both go. Linear in their lengths (Knuth,
-    Morris, Pratt)."""
+    """Return the positions in `recorded`, ascending, from which on it equals `live` as far as both go.
+
+    Linear in their lengths (Knuth, Morris, Pratt).
+    """
     if not live:
         return []
     borders = _borders(live)
@@ -250,7 +258,7 @@ def _overlaps(live: Sequence[int], recorded: Sequence[int]) -> list[int]:
 
 
 def _borders(values: Sequence[int]) -> list[int]:
-    """For each prefix the length of the longest proper prefix that is also its suffix."""
+    """Return for each prefix the length of the longest proper prefix that is also its suffix."""
     borders, length = [0] * len(values), 0
     for at in range(1, len(values)):
         while length and values[at] != values[length]:

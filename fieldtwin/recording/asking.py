@@ -41,7 +41,7 @@ def asked_of(pdu: bytes) -> Asked | None:
 
 
 def changes(pdu: bytes) -> bool:
-    """Whether a request may change the device; so for every function that no standard knows."""
+    """Return whether a request may change the device. Functions outside the standard count as changes."""
     asked = asked_of(pdu)
     return asked is None or asked.changes
 
@@ -55,7 +55,7 @@ def frame_for(url: str, unit: int, pdu: bytes) -> bytes | None:
 
 
 class _Sent(Tap):
-    """When the last byte of the last frame was on the wire."""
+    """A tap that notes the time of the last byte of the last sent frame."""
 
     def __init__(self, char_time_ns: int) -> None:
         self.t_ns = 0
@@ -66,7 +66,7 @@ class _Sent(Tap):
             self.t_ns = t_ns + len(data) * self._char_time_ns
 
     def on_frame(self, endpoint: Endpoint, direction: Direction, t_ns: int, frame: CanFrame) -> None:
-        """Modbus has none."""
+        """Ignore CAN frames: Modbus has none."""
 
 
 class Asker:
@@ -129,7 +129,7 @@ async def asker_at(
     connector: Connector | None = None,
     clock: Clock | None = None,
 ) -> AsyncIterator[Asker]:
-    """An asker on the wire at `url`; errors as `modbus_at`. `zero_ns`: since when times count, now where it is not said."""
+    """Yield an asker on the endpoint `url`; errors as `modbus_at`. Times count from `zero_ns`, by default from now."""
     clock = clock or WallClock()
     endpoint = Endpoint.parse(url)
     sent = _Sent(round(endpoint.serial.char_time_s * NS_PER_S) if endpoint.is_serial else 0)

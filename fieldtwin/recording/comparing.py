@@ -1,8 +1,9 @@
-"""Whether one device, or its recording, does as another did: same requests, same outcomes, values inside tolerance, same time.
+"""Compare the behaviour of a device with that of another one or of a recording: outcomes, values and timing.
 
-Fidelity (SPEC part 2 row 10) has two figures. *Values*: the share of exchanges with the same outcome (values inside their
-tolerance, the same exception, the same silence). *Timing*: how near the two distributions of latency are, as the mean ratio of
-their quantiles. Pure and bounded: exchanges come in pairs, differences are kept up to a number and counted beyond it.
+Fidelity (SPEC part 2 row 10) has two figures. *Values*: the share of exchanges with the same outcome (values inside
+their tolerance, the same exception, the same silence). *Timing*: the similarity of the two distributions of latency, as
+the mean ratio of their quantiles. Pure and bounded: exchanges come in pairs, differences are kept up to a number and
+only counted beyond it.
 """
 
 from __future__ import annotations
@@ -24,11 +25,11 @@ from fieldtwin.recording.aligning import Shift
 
 MAX_DIFFERENCES = 1000
 MAX_LATENCIES = 200_000
-"""Latencies that are kept of each side; later ones are counted only."""
+"""Maximum number of latencies kept of each side; later ones are only counted."""
 LOOK_AHEAD = 10_000
-"""How far the other recording may be out of step before an exchange is taken as missing there."""
+"""Maximum offset of the other recording; an exchange further away counts as missing."""
 MAX_UNWRITTEN = 100_000
-"""Cells that left-out writes had set, of which it is remembered."""
+"""Maximum number of cells that are remembered as targets of omitted writes."""
 QUANTILES = tuple(q / 100 for q in range(5, 100, 5))
 FLOOR_S = 0.001
 """Added to both quantiles of a ratio, so that a tenth of a millisecond more than zero is not a difference."""
@@ -52,8 +53,11 @@ class Tolerance:
 
 @dataclass(frozen=True, slots=True)
 class Rules:
-    """What counts as alike. `tags` go before `values`; `latency` is for the median and the 90th percentile in seconds, None
-    where timing is not judged. `least` is the share of exchanges that has to be alike."""
+    """The criteria of equality.
+
+    `tags` override `values`; `latency` is for the median and the 90th percentile in seconds, None if timing is not
+    compared. `least` is the minimum share of equal exchanges.
+    """
 
     values: Tolerance = Tolerance()
     tags: Mapping[str, Tolerance] = field(default_factory=dict)
@@ -63,8 +67,11 @@ class Rules:
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """An exchange that went otherwise. `what` is value, exception, silence, reply or missing; `where` a tag or
-    register. `after_left_out`: a write that was left out had set what was read."""
+    """An exchange with a different outcome.
+
+    `what` is value, exception, silence, reply or missing; `where` is a tag or register. `after_left_out`: an omitted
+    write had set the value that was read.
+    """
 
     t_s: float
     unit: int
@@ -98,9 +105,9 @@ class Comparison:
     left_out: int = 0
     left_out_writes: int = 0
     after_left_out: int = 0
-    """Exchanges that differ and read what a left-out write had set."""
+    """Number of differing exchanges that read a cell set by an omitted write."""
     not_compared: int = 0
-    """Exchanges that were asked, and for which the recording has nothing at the position that was found."""
+    """Number of repeated exchanges for which the recording has no value at the position that was found."""
     shifts: list[Shift] = field(default_factory=list)
     extra: int = 0
     latency: list[LatencyRow] = field(default_factory=list)
@@ -109,19 +116,19 @@ class Comparison:
 
     @property
     def values(self) -> float:
-        """The share of exchanges that are alike; 0 where none was compared."""
+        """The share of equal exchanges; 0 if none was compared."""
         return self.alike / self.compared if self.compared else 0.0
 
     @property
     def met(self) -> bool:
-        """Whether the one can stand for the other."""
+        """Return whether one side can replace the other."""
         if not self.compared or not all(row.alike for row in self.latency):
             return False
         return self.alike >= self.least * (self.compared + self.not_compared)
 
     @property
     def inconclusive(self) -> bool:
-        """Whether it is not met only because of what could not be compared."""
+        """Return whether the comparison fails only because of exchanges that could not be compared."""
         if self.met or not self.not_compared or not all(row.alike for row in self.latency):
             return False
         return self.alike + self.not_compared >= self.least * (self.compared + self.not_compared)
@@ -159,7 +166,7 @@ class Comparer:
                 kept[1].append(other.latency_s)
 
     def is_alike(self, recorded: Exchange, other: Exchange) -> bool:
-        """Whether the two are alike by the rules. Counts nothing."""
+        """Return whether two exchanges are equal by the rules. Counts nothing."""
         if recorded.reply == other.reply and recorded.error == other.error:
             return True
         trial = Comparer(self._rules, self._profile)
@@ -177,11 +184,11 @@ class Comparer:
             self._unwritten.update((exchange.unit, *cell) for cell in _cells(asked.write_span))
 
     def not_compared(self) -> None:
-        """An exchange that was asked and that the recording says nothing about."""
+        """Count an exchange that was repeated but for which the recording has no value."""
         self._result.not_compared += 1
 
     def shifted(self, shifts: Iterable[Shift]) -> None:
-        """Where the dialogue continued the recorded one."""
+        """Add the positions at which the dialogue continued the recorded one."""
         self._result.shifts += shifts
 
     def result(self) -> Comparison:
@@ -216,7 +223,7 @@ class Comparer:
             self._judge_values(recorded, asked.read_span, one, two)
 
     def _judge_values(self, recorded: Exchange, span: Span, one: Answer, two: Answer) -> None:
-        """Tags where the profile knows them, registers and bits elsewhere; one difference a exchange is counted."""
+        """Compare the values: tags known to the profile, else registers and bits. One difference per exchange is counted."""
         covered: set[int] = set()
         found: list[tuple[str, str, str]] = []
         if self._maps is not None:

@@ -52,7 +52,7 @@ class _Kind:
 
 
 class _Side:
-    """What one log holds: transfers as they come, and kinds of messages on the way."""
+    """The content of one log: transfers in order, and the kinds of messages counted on the way."""
 
     def __init__(self, frames: Frames, nodes: frozenset[int], uploads: int) -> None:
         self.kinds: dict[tuple[int, str], _Kind] = {}

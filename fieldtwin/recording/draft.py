@@ -19,7 +19,7 @@ MAX_UNITS = 256
 MAX_SHAPES = 10_000
 """Different requests of one unit that are remembered; later ones are not in the draft."""
 LOOKED_AT = 50
-"""Replies of one request whose values are looked at."""
+"""Maximum number of replies to one request whose values are examined."""
 TABLES: Final = ("coil", "discrete", "input", "holding")
 Cell = tuple[str, int]
 

@@ -1,7 +1,8 @@
-"""Recordings for other programs: tables (CSV, Parquet), candump logs, pcap files that Wireshark opens.
+"""Export recordings for other programs: tables (CSV, Parquet), candump logs, pcap files for Wireshark.
 
-By what the recording is and what the file's name says. Streams, so that a recording of days needs no memory; raises `FileInvalid`
-where a file cannot be written, and `UsageError` for what does not go together.
+The format follows from the kind of the recording and the file's name. Streaming, so that a recording of days needs
+little memory; raises `FileInvalid` where a file cannot be written, and `UsageError` for a kind and a format that do not
+fit.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from fieldtwin.gateway.protocols.modbus.crc import with_crc
 from fieldtwin.recording.rotating import RotatingFile, exchanges_of, header_of, parts_of
 
 BATCH = 10_000
-"""Rows of a Parquet file that are held in memory at once."""
+"""Number of rows of a Parquet file that are held in memory."""
 TARGETS = (".csv", ".parquet", ".log", ".pcap")
 Cell = Scalar | None
 Rows = Iterator[Sequence[Cell]]
@@ -40,7 +41,7 @@ Rows = Iterator[Sequence[Cell]]
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """A column of a table: its name, and what kind of value it has (float, int, str)."""
+    """A column of a table: its name, and the type of its values (float, int, str)."""
 
     name: str
     kind: type
@@ -238,7 +239,10 @@ def _write_log(frames: Iterable[tuple[int, str, CanFrame]], out: Path) -> int:
 
 
 def _write_exchanges(path: Path, header: RecordingHeader, out: Path, framing: str) -> int:
-    """As one conversation: Modbus TCP to port 502, or RTU frames bare. Broadcasts and silence have no reply."""
+    """Write the exchanges as one conversation: Modbus TCP to port 502, or bare RTU frames.
+
+    A broadcast and an unanswered request have no reply.
+    """
     tcp = framing == "mbap"
     endpoint = Endpoint.parse("tcp://192.0.2.2:502" if tcp else "rtu:line")
 

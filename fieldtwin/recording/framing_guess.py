@@ -7,11 +7,11 @@ from collections.abc import Iterable
 from fieldtwin.decoding.modbus_frames import splitter
 
 LOOKED_AT = 65_536
-"""Bytes that are enough to tell."""
+"""Number of bytes after which the guess is final."""
 
 
 def guess_framing(chunks: Iterable[tuple[bool, bytes]]) -> str:
-    """rtu, ascii or mbap, or "" where nothing is a frame. `chunks` are (sent, bytes), in order."""
+    """Return rtu, ascii or mbap, or "" if no bytes form a frame. `chunks` are (sent, bytes), in order."""
     splitters = {framing: {side: splitter(framing) for side in (True, False)} for framing in ("rtu", "ascii", "mbap")}
     good = dict.fromkeys(splitters, 0)
     seen = 0

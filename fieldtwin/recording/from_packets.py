@@ -192,7 +192,7 @@ class PacketImport:
     # -- Modbus on a line ---------------------------------------------------------------------------------------------
 
     def _serial(self, t_ns: int, link: int, data: bytes) -> None:
-        """Frames as analysers write them: bare, or behind the header of the RTAC's serial link type, which knows directions."""
+        """Handle serial frames as analysers write them: bare, or after the RTAC link header, which states the direction."""
         self.summary.packets.packets += 1
         sent = True
         if link == LINK_RTAC:
@@ -250,7 +250,7 @@ class PacketImport:
 
 
 def socketcan_frame(data: bytes) -> CanFrame | None:
-    """A classic frame of link type 227; None for CAN FD and XL, and for what is cut off."""
+    """Return a classic frame of link type 227; None for CAN FD and XL, and for truncated data."""
     if len(data) < 8 or data[4] > 8 or data[5] & 0x04 or len(data) < 8 + min(data[4], 8):
         remote = len(data) >= 8 and data[0] & 0x40 and data[4] <= 8
         if not remote:

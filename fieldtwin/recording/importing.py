@@ -78,7 +78,7 @@ def kind_of(path: Path) -> str:
 
 
 def import_can(path: Path, out: Path) -> TextSummary:
-    """A CAN log of whatever program as candump writes it. Raises `FileInvalid`."""
+    """Convert a CAN log of any supported program to candump's format. Raises `FileInvalid`."""
     summary = TextSummary()
     frames: Iterator[tuple[int, str, CanFrame]] = (
         read_log(path, summary.left_out) if path.suffix.lower() == ".log" else read_can_file(path, summary.left_out)
@@ -99,7 +99,10 @@ def _write_log(frames: Iterable[tuple[int, str, CanFrame]], out: Path, summary: 
 
 
 def import_polls(path: Path, out: Path) -> TextSummary:
-    """A session of modpoll or mbpoll as a recording of exchanges, with a draft profile. Raises `FileInvalid` with the line."""
+    """Convert a session of modpoll or mbpoll into a recording of exchanges, with a draft profile.
+
+    Raises `FileInvalid` with the line.
+    """
     summary, drafts = TextSummary(out), Drafts()
     with open_input(path) as source, _New(out, encode_header(_header(path, out, ""))) as file:
         for exchange in read_polls(_lines(source, path), str(path)):
@@ -207,7 +210,7 @@ def _header(path: Path, out: Path, endpoint: str) -> RecordingHeader:
 
 
 def _of_prototype(capture: Path) -> bool:
-    """Whether the run that a capture is of said so (SPEC ruling 15)."""
+    """Return whether the run of a capture was marked as a prototype's (SPEC ruling 15)."""
     try:
         with open_input(capture) as file:
             head = json.loads(file.readline(MAX_LINE))
@@ -226,7 +229,7 @@ def _lines(source: IO[bytes], path: Path) -> Iterator[str]:
 
 
 class _New:
-    """A recording that has its name only when it is whole: until then ``NAME.part``."""
+    """A recording that gets its name only when it is complete; until then it is ``NAME.part``."""
 
     def __init__(self, out: Path, head: bytes = b"") -> None:
         if out.exists():

@@ -26,7 +26,7 @@ from fieldtwin.recording.comparing import Comparer, Comparison, Rules
 from fieldtwin.recording.comparing_can import TRANSFERS, Frames, compare_logs
 
 MAX_FRAMES = 1_000_000
-"""Frames of a live bus that are kept for comparing."""
+"""Maximum number of frames of a live bus that are kept for the comparison."""
 
 Progress = Callable[[int], None]
 Cell = tuple[str, int]
@@ -51,12 +51,14 @@ async def compare_device(
     stop: asyncio.Event | None = None,
     progress: Progress = lambda done: None,
 ) -> None:
-    """Ask `most` (0: all) of the recorded requests again, of the recorded unit or of `unit`. What may change the device is
-    left out and counted, unless `writes`; and what writes to a cell that is `wearing` (EEPROM) again, in any case. Raises
-    `ConnectionLost`.
+    """Repeat `most` (0: all) of the recorded requests, to the recorded unit or to `unit`.
 
-    The verdict does not depend on how often the device was read before: its dialogue may continue the recorded one anywhere, see
-    `aligning`."""
+    Requests that may change the device are omitted and counted, unless `writes`; repeated writes to a cell in `wearing`
+    (EEPROM) are always omitted. Raises `ConnectionLost`.
+
+    The verdict does not depend on how often the device was read before: its dialogue may continue the recorded one
+    anywhere, see `aligning`.
+    """
     dialogue = Dialogue()
     try:
         await _ask_all(recorded, asker, comparer, dialogue, unit, writes, wearing, most, stop, progress)
@@ -109,7 +111,7 @@ class _Kept(Tap):
         self.frames: list[tuple[int, CanFrame]] = []
 
     def on_bytes(self, endpoint: Endpoint, direction: Direction, t_ns: int, data: bytes) -> None:
-        """A bus has none."""
+        """Ignore bytes: a CAN bus has none."""
 
     def on_frame(self, endpoint: Endpoint, direction: Direction, t_ns: int, frame: CanFrame) -> None:
         if len(self.frames) < MAX_FRAMES:
@@ -126,7 +128,7 @@ def transfers_of(frames: Frames, node: int | None) -> Iterator[Transfer]:
 
 
 def uploads_of(frames: Frames, node: int | None) -> Iterator[Transfer]:
-    """Those that only read."""
+    """Yield the transfers that only read."""
     return (exchange for exchange in transfers_of(frames, node) if exchange.service == TRANSFERS[0])
 
 

@@ -23,7 +23,7 @@ _TYPES = {1: 0x05, 2: 0x06, 3: 0x16, 4: 0x07, 5: 0x18, 6: 0x19, 7: 0x1A, 8: 0x1B
 """Type codes of UNSIGNED by number of bytes (CiA 301, 7.4.7.1)."""
 _OCTETS = 0x0A
 _FIRST_FREE = 0x5F00
-"""Manufacturer's objects, from which on process data without a mapping is put."""
+"""First index of the manufacturer's objects that hold process data without a mapping."""
 _PDO_PARAMETERS = range(0x1400, 0x1C00)
 _PERIODS = 100_000
 
@@ -52,7 +52,7 @@ class _Pdo:
 
 
 def nodes_of(frames: Iterable[tuple[int, CanFrame]]) -> list[int]:
-    """The nodes that answered or said something by themselves in a log."""
+    """Return the nodes that answered or sent messages by themselves in a log."""
     bases = (0x80, 0x180, 0x280, 0x380, 0x480, 0x580, 0x700)
     found = {
         f.can_id & 0x7F for _, f in frames if not (f.extended or f.remote or f.error) and f.can_id & ~0x7F in bases
@@ -92,7 +92,7 @@ class LogSheet:
         if key not in self._objects and len(self._objects) >= MAX_OBJECTS:
             return
         if done.abort is not None or not isinstance(done.value, str):
-            return  # what only ever refused has no size, and so no place in a data sheet
+            return  # an object that was always refused has no known size
         raw = bytes.fromhex(done.value)
         found = self._objects.setdefault(key, _Object())
         found.sizes.add(len(raw))

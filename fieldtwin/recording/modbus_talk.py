@@ -17,7 +17,7 @@ from fieldtwin.recording.pairing import OnBad, Pairer, pairer
 
 MODBUS_PORTS = frozenset({502, 503, 802})
 MAX_UNDECIDED = 600
-"""Bytes that are looked at before a conversation is taken for something else."""
+"""Number of bytes after which a conversation that is not recognised counts as foreign."""
 
 
 class ModbusTalk:
@@ -37,7 +37,7 @@ class ModbusTalk:
         self._undecided = 0
 
     def feed(self, side: Side, data: bytes, t_ns: int, lost: int) -> list[Exchange]:
-        """Bytes that `side` said, `lost` bytes behind the last ones that the capture has of it."""
+        """Add bytes from `side`; `lost` bytes before them are missing in the capture."""
         if self.pairer is not None:
             if lost:
                 self.pairer.lost(side != self.server)
@@ -58,7 +58,7 @@ class ModbusTalk:
 
     @property
     def endpoint(self) -> str:
-        """The server's, as a URL; of a conversation that is not known to be Modbus its second side."""
+        """The server's URL; without a recognised server that of the second side."""
         scheme = {"mbap": "tcp", "rtu": "rtu+tcp"}.get(self.framing, self.framing or "tcp")
         address, port = self.server or self._conversation.sides[1]
         text = str(ipaddress.ip_address(address))
@@ -75,7 +75,7 @@ class ModbusTalk:
         return [e for side, data, t_ns in seen for e in self.pairer.feed(side != self.server, data, t_ns)]
 
     def _decide(self) -> None:
-        """By the first bytes of each side, joined: a frame may come in pieces."""
+        """Decide by the first bytes of each side, joined, because a frame may arrive in parts."""
         for side in self._conversation.sides:
             data = b"".join(d for who, d, _ in self._seen if who == side)
             if len(data) >= 8 and is_mbap(data):
@@ -115,7 +115,7 @@ class ModbusTalk:
 
 
 def is_mbap(data: bytes) -> bool:
-    """Whether these bytes begin with a Modbus TCP frame: protocol 0, a length that fits a PDU, a function."""
+    """Return whether the bytes begin with a Modbus TCP frame: protocol 0, a length that fits a PDU, a function."""
     size = data[4] << 8 | data[5]
     return (
         data[2:4] == b"\0\0" and 3 <= size <= 254 and 0 < data[7] & 0x7F < 0x70 and not (data[7] & 0x80 and size != 3)
@@ -123,14 +123,14 @@ def is_mbap(data: bytes) -> bool:
 
 
 def is_rtu(data: bytes) -> bool:
-    """Whether an RTU frame is in these bytes, by its check sum."""
+    """Return whether the bytes contain an RTU frame with a right check sum."""
     found = RtuSplitter()
     frames = [*found.feed(data[:MAX_UNDECIDED], 0), *found.flush()]
     return bool(frames) and not frames[0].bad and 0 < frames[0].pdu[0] & 0x7F < 0x70
 
 
 def _asks(data: bytes) -> bool | None:
-    """Whether a Modbus TCP frame is a request for registers or bits; None where it may be either."""
+    """Return whether a Modbus TCP frame is a request for registers or bits; None if it may also be a reply."""
     if len(data) < 8 or data[7] & 0x80:
         return None if len(data) < 8 else False
     size = data[4] << 8 | data[5]

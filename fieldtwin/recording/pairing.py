@@ -19,10 +19,10 @@ from fieldtwin.gateway.protocols.modbus.crc import crc16
 from fieldtwin.gateway.protocols.modbus.frame_shapes import MAX_FRAME, MIN_FRAME, frame_lengths
 
 MAX_OPEN = 64
-"""Requests without an answer on one connection; an older one is taken as unanswered."""
+"""Maximum number of open requests on one connection; an older one counts as unanswered."""
 MAX_ADU = 260
 MAX_REMEMBERED = 4096
-"""Requests of which it is remembered how long their reply is."""
+"""Maximum number of requests whose reply length is remembered."""
 _LAST_UNIT = 247
 _DIGITS = 6
 """Times are kept to the microsecond."""
@@ -67,7 +67,7 @@ class Pairer(ABC):
 
     @abstractmethod
     def feed(self, sent: bool, data: bytes, t_ns: int) -> list[Exchange]:
-        """Bytes that went to the device (`sent`) or came from it; the exchanges that are complete by now."""
+        """Add bytes that went to the device (`sent`) or came from it; return the exchanges that are now complete."""
 
     @abstractmethod
     def finish(self) -> list[Exchange]:
@@ -148,7 +148,7 @@ class MbapPairer(Pairer):
 
     def _request(self, transaction: int, unit: int, pdu: bytes, t_ns: int, found: list[Exchange]) -> None:
         while transaction in self._open or len(self._open) >= MAX_OPEN:
-            self._give_up(found)  # from the oldest on, so that the order is kept
+            self._give_up(found)  # the oldest first, which keeps the order
         self._open[transaction] = (t_ns, unit, pdu)
 
     def _give_up(self, found: list[Exchange]) -> None:
@@ -189,9 +189,9 @@ class _Asked:
 
 
 class SerialPairer(Pairer):
-    """A serial line, or one that goes through TCP: one request at a time. `framing` is rtu or ascii.
+    """A serial line, also one carried over TCP: one request at a time. `framing` is rtu or ascii.
 
-    Both directions are known here; see `OneWirePairer` where they are not.
+    Both directions are known here; `OneWirePairer` is for lines without known directions.
     """
 
     def __init__(self, framing: str, zero_ns: int, on_bad: OnBad | None = None) -> None:
@@ -221,7 +221,7 @@ class SerialPairer(Pairer):
         return found
 
     def _is_frame(self, sent: bool, data: bytes) -> bool:
-        """Whether a chunk is one frame and no more, as it mostly is; and nothing of another is waiting for its rest."""
+        """Return whether a chunk is exactly one frame (the usual case) while no incomplete frame is waiting."""
         size = len(data)
         if self._requests.pending or self._replies.pending or not MIN_FRAME <= size <= MAX_FRAME or crc16(data):
             return False
@@ -312,7 +312,7 @@ class OneWirePairer(SerialPairer):
 
 
 def pairer(framing: str, zero_ns: int, on_bad: OnBad | None = None) -> Pairer:
-    """The pairer for a wire with that framing: rtu, ascii, mbap or udp."""
+    """Return the pairer for a connection with that framing: rtu, ascii, mbap or udp."""
     if framing in ("mbap", "udp"):
         return MbapPairer(zero_ns, on_bad, datagrams=framing == "udp")
     return SerialPairer(framing, zero_ns, on_bad)

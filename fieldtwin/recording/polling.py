@@ -1,7 +1,8 @@
-"""Recording a live device by asking it: the tags of a profile, or what another recording asked, round by round.
+"""Record a live device by polling it, round by round: the tags of a profile, or the requests of another recording.
 
-Nothing is written. A round begins on a grid of its period; one that is missed is skipped and counted, never made up for. A
-connection that is lost is opened again, after growing pauses. It must never know a file or a screen: exchanges go to a sink.
+Nothing is written to the device. Rounds begin on a grid of their period; a missed one is skipped and counted, and not
+repeated. A lost connection is opened again, after growing pauses. This module must not depend on files or displays:
+exchanges go to a sink.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from fieldtwin.recording.sinks import CanLogSink
 
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 10.0
 MAX_REQUESTS = 10_000
-"""Different requests that are repeated from another recording."""
+"""Maximum number of different requests that are repeated from another recording."""
 
 Sink = Callable[[Exchange], None]
 
@@ -49,7 +50,7 @@ class Round(Protocol):
 
     @property
     def asks(self) -> list[tuple[int, bytes]]:
-        """Unit and request PDU of what a round asks, as it stands now."""
+        """Return unit ID and request PDU of each request in the current round."""
         ...
 
     async def __call__(self, asker: Asker, sink: Sink) -> None: ...
@@ -100,8 +101,10 @@ def _request(read: Read) -> bytes:
 
 
 class SameRequests:
-    """What another recording asked, each different request once a round, in its order; `left_out` are those that may change the
-    device, or that cannot be sent."""
+    """The requests of another recording, each different one once a round, in order.
+
+    `left_out` counts requests that may change the device, or that cannot be sent.
+    """
 
     def __init__(self, exchanges: Iterable[Exchange], unit: int | None = None) -> None:
         self.requests: dict[tuple[int, bytes], None] = {}
@@ -173,9 +176,9 @@ async def record_node(
     connector: Connector | None = None,
     clock: Clock | None = None,
 ) -> None:
-    """As `record_polls`, for a CANopen node: read each readable tag of its profile, or each object of its EDS, by SDO.
+    """Record a CANopen node as `record_polls` does: read each readable tag of its profile, or each object of its EDS, by SDO.
 
-    `sink` sees the frames. Raises `UsageError` if the target has neither profile nor EDS.
+    `sink` receives the frames. Raises `UsageError` if the target has neither profile nor EDS.
     """
     clock = clock or WallClock()
     tags = tags_of((), "canopen", None, target.profile, target.dictionary)

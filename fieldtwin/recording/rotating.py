@@ -1,7 +1,8 @@
-"""A file of lines that goes on for days: in parts of a bounded size, each line one write, so that a kill loses the last at most.
+"""A file of lines that may grow for days: in parts of a bounded size.
 
-``r.jsonl`` is followed by ``r.0001.jsonl``, ``r.0002.jsonl`` and so on, each with the head of the first. Times go on over the
-parts, which `parts_of` finds again. It must never know what the lines say, nor any clock.
+Each line is one write, so a kill loses one at most. ``r.jsonl`` is followed by ``r.0001.jsonl``, ``r.0002.jsonl`` and
+so on, each with the head of the first. Times continue over the parts, which `parts_of` finds again. This module must
+not depend on the content of the lines, nor on a clock.
 """
 
 from __future__ import annotations
@@ -127,7 +128,7 @@ def parts_of(path: Path) -> list[Path]:
 
 
 def oldest_part(path: Path) -> Path:
-    """The first part of the recording that is still there."""
+    """Return the first part of the recording that still exists."""
     return parts_of(path)[0]
 
 

@@ -41,7 +41,7 @@ class CanLogSink(Tap):
         self._error: FieldtwinError | None = None
 
     def on_bytes(self, endpoint: Endpoint, direction: Direction, t_ns: int, data: bytes) -> None:
-        """A bus has none."""
+        """Ignore bytes: a CAN bus has none."""
 
     def check(self) -> None:
         """Raises `FileInvalid` when a frame could not be written."""
@@ -69,7 +69,7 @@ class LineSink:
 
     def saw(self, direction: Direction, t_ns: int, data: bytes) -> None:
         """`data` passed in that direction: SENT is towards the device."""
-        if self._head is not None:  # with the first bytes: a tap that was never connected leaves nothing
+        if self._head is not None:  # written with the first bytes: a tap that was never connected leaves no file
             head, self._head = self._head, None
             self._line(t_ns, head)
         self.bytes[direction] += len(data)

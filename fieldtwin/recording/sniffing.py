@@ -1,7 +1,7 @@
-"""Listening to a line between other devices with one adapter: requests and replies come on one stream, and nothing is sent.
+"""Listen to a line between other devices with one adapter: requests and replies come in one stream, and nothing is sent.
 
-`Directions` tells them apart by their shape and their order, so that the capture has a direction for each frame. Limit: a client
-that repeats a write (function 05 or 06) because no reply came sends what looks like the reply.
+`Directions` distinguishes them by their shape and order, so that the capture has a direction for each frame. Limit: a
+client that repeats a write (function 05 or 06) after no reply sends a frame that looks like the reply.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Directions:
         self._last_ns: int | None = None
 
     def feed(self, data: bytes, t_ns: int) -> list[tuple[Direction, Frame]]:
-        """A chunk that came at `t_ns`; the frames that are whole now, oldest first, damaged ones too."""
+        """Add a chunk received at `t_ns`; return the frames that are now complete, oldest first, including damaged ones."""
         found = self.settle(t_ns)
         self._last_ns = t_ns
         return found + [self._told(frame) for frame in self._splitter.feed(data, t_ns)]
@@ -74,7 +74,10 @@ class LineSniffer:
         self._connector, self._clock = connector or OsConnector(), clock or WallClock()
 
     async def run(self, stop: asyncio.Event) -> None:
-        """Until `stop` is set. Raises `Unreachable` where the port cannot be opened, `ConnectionLost` when it is gone."""
+        """Listen until `stop` is set.
+
+        Raises `Unreachable` where the port cannot be opened, `ConnectionLost` when it is lost.
+        """
         connection = await self._connector.open_bytes(self._port)
         self._say(f"listening at {self._port}; nothing is sent")
         try:

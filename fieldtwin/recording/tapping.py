@@ -42,8 +42,11 @@ class LineTap:
         self._failed: asyncio.Future[None] | None = None
 
     async def run(self, stop: asyncio.Event) -> None:
-        """Until `stop` is set. Raises `Unreachable` where a side cannot be opened, `ConnectionLost` when a line is gone,
-        `FileInvalid` when the disk refuses."""
+        """Relay until `stop` is set.
+
+        Raises `Unreachable` where a side cannot be opened, `ConnectionLost` when a line is lost, `FileInvalid` when
+        writing fails.
+        """
         self._failed = asyncio.get_running_loop().create_future()
         stopping: asyncio.Future[Any] = asyncio.ensure_future(stop.wait())
         closing: list[SocketListener | ByteConnection] = []

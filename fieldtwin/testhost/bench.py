@@ -29,7 +29,7 @@ from fieldtwin.twin.site.system import System
 
 
 class Bench:
-    """The emulated field side of a system. Raises what opening one raises, and what its emulators fail with."""
+    """The field simulator of a system. Raises the errors of opening one, and those of its emulators."""
 
     def __init__(self, system: System, prototype: Prototype, clock: Clock, folder: Path) -> None:
         self.system = system
@@ -56,10 +56,10 @@ class Bench:
             while True:
                 self.log.on_frame(bus, await ear.recv())
         except ConnectionLost:
-            await asyncio.Event().wait()  # the bus is gone, the test may go on
+            await asyncio.Event().wait()  # the bus is closed, but the test may continue
 
     async def control(self, profiles: tuple[str, ...] = ()) -> None:
-        """Start the system's gateway and PLC against this field side. Once is enough."""
+        """Start the system's gateway and PLC with this field simulator. Further calls have no effect."""
         if self.plc is None:
             plc = RunningPlc(self.system, self.field, self._clock, self._folder)
             await plc.open(profiles)
@@ -75,7 +75,11 @@ class Bench:
         shutil.rmtree(self._folder, ignore_errors=True)
 
     def describe(self) -> dict[str, Any]:
-        """Where everything is: ``buses`` and ``far`` (endpoints in words), ``devices`` (bus, unit, profile, tags, what plays)."""
+        """Return the description of the bench.
+
+        It has ``buses`` and ``far`` (endpoints in words), and ``devices`` (bus, unit, profile, tags, model or
+        recording).
+        """
         buses = {}
         for name, listening in self.field.listening.items():
             plant = self.system.buses[name].endpoint
@@ -99,7 +103,7 @@ class Bench:
         }
 
     def alive(self) -> None:
-        """Raises what an emulator failed with since."""
+        """Raise the error with which an emulator has failed, if any."""
         failure = self._nursery.failure()
         if failure is not None:
             raise failure
@@ -112,7 +116,7 @@ class Bench:
         self.field.faults.set_value(device, tag, value)
 
     def held(self, device: str, tag: str) -> Any:
-        """What `device` holds for `tag` now, in engineering units; None while it never held anything."""
+        """Return the value of `tag` in `device`, in engineering units; None before its first value."""
         found = self._tag(device, tag)
         config = self.system.devices[device]
         put = self.field.faults.value_set(device, tag)

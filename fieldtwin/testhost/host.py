@@ -109,7 +109,7 @@ class Host:
             raise
 
     async def _system(self, args: dict[str, Any]) -> dict[str, Any]:
-        """The field side of `system`; `prototype`, `profiles`, `recordings`, `speed` and `listen` as `FieldConfig` has them."""
+        """Open the field simulator of `system`; `prototype`, `profiles`, `recordings`, `speed`, `listen` as in `FieldConfig`."""
         name, beside = str(args.get("system", "")), str(args.get("beside") or ".")
         folder = new_folder()
         try:
@@ -187,7 +187,7 @@ class Host:
         found = log.since(int(args.get("since") or 0))
         return {"exchanges": found, "pending": log.pending(), "last": log.number, "now_s": log.now_s}
 
-    # -- gateway and PLC before a field side ------------------------------------------------------------------------------
+    # -- gateway and PLC for a field simulator -------------------------------------------------------------------------
 
     async def _control(self, args: dict[str, Any]) -> dict[str, Any]:
         bench = self._bench(args)
@@ -222,7 +222,7 @@ class Host:
         return {"id": number, "values": program.values()}
 
     def _of_system(self, name: str, program: str, folders: tuple[str, ...]) -> tuple[str, tuple[str, ...]]:
-        """The source of a system's program, and where it is."""
+        """Return the source of a system's program, and its folders."""
         own = next((path for folder in folders if (path := Path(folder) / name).is_file()), None)
         system = load_system(str(own or name))
         if program not in system.plc.programs:
@@ -273,5 +273,5 @@ def _wanted(args: dict[str, Any]) -> Wanted:
 
 
 def folder_gone(folder: Path) -> None:
-    """Remove what a bench that never opened has left."""
+    """Remove the folder of a bench that failed to open."""
     shutil.rmtree(folder, ignore_errors=True)

@@ -19,7 +19,7 @@ from fieldtwin.twin.site.data_files import find, find_recording
 
 DEVICE, BUS = "device", "wire"
 RECORDINGS = {"ctd-reference": "cast.jsonl", "inclinometer-cia410": "incl.jsonl"}
-"""Shipped profiles whose recording has another name than they have."""
+"""Shipped profiles whose recording has a different name."""
 KINDS = ("pty", "tcp", "udp", "rtu+tcp", "can")
 
 
@@ -59,7 +59,7 @@ def write_system(wanted: Wanted, folder: Path, profiles: tuple[Path, ...] = (), 
         "system": "test",
         "buses": {BUS: {"url": plant}},
         "devices": {DEVICE: {"profile": str(path.resolve()), "bus": BUS, "node" if can else "unit": unit}},
-        "plc": {"programs": {"none": {"source": "none.st"}}},  # no PLC runs here: a system file has to name one
+        "plc": {"programs": {"none": {"source": "none.st"}}},  # no PLC runs here, but a system file must have a program
     }
     emulated = _stand_in(wanted, profile, path, beside)
     prototype = {
@@ -98,8 +98,11 @@ def _wires(on: str, profile: DeviceProfile) -> tuple[str, str]:
 
 
 def _stand_in(wanted: Wanted, profile: DeviceProfile, path: Path, beside: Path | None) -> dict[str, Any]:
-    """What plays the device: the recording that was named; else its profile, whose registers take what is written to them; else,
-    where registers alone are not all of it, the shipped recording."""
+    """Return the device's entry in the prototype file.
+
+    It replays the recording that was named; else it is a model of its profile, whose registers accept writes; else, if
+    registers alone are not sufficient, it replays the shipped recording.
+    """
     common: dict[str, Any] = {"identity": wanted.identity} if wanted.identity else {}
     if profile.inbox is not None:
         return {"model": "mailbox", "far": "tcp://127.0.0.1:0", **common}
@@ -127,8 +130,10 @@ def _shipped(stem: str) -> str:
 
 
 def endpoint_words(endpoint: Endpoint) -> dict[str, Any]:
-    """An endpoint as plain data: `url`, and what of it there is: `path`, `host`, `port`, `interface`, `channel`, `baudrate`,
-    `frame`."""
+    """Return an endpoint as plain data.
+
+    It has `url`, and those of `path`, `host`, `port`, `interface`, `channel`, `baudrate`, `frame` that apply.
+    """
     words: dict[str, Any] = {"url": str(endpoint)}
     if endpoint.scheme == "pty" or endpoint.is_serial:
         words["path"] = endpoint.path

@@ -31,7 +31,10 @@ STEERING = ("force", "unforce", "pause", "go", "step", "restart", "why")
 
 
 class RunningPlc:
-    """``await open()``, then ask; `aclose` ends both processes, the gateway first, which makes the outputs safe."""
+    """The two processes: ``await open()``, then call the methods.
+
+    `aclose` ends both processes, the gateway first, which makes the outputs safe.
+    """
 
     def __init__(self, system: System, field: FieldSide, clock: Clock, folder: Path) -> None:
         self._system = system
@@ -44,7 +47,7 @@ class RunningPlc:
         self._shore: Shore | None = None
 
     async def open(self, profiles: tuple[str, ...] = ()) -> None:
-        """Raises `ChildFailed` with what the process said, where one does not start."""
+        """Start both processes. Raises `ChildFailed` with the output of a process that does not start."""
         try:
             await self._open(profiles)
         except BaseException:
@@ -95,7 +98,7 @@ class RunningPlc:
                 raise failed
 
     async def names(self) -> list[str]:
-        """Every tag and variable of the process image."""
+        """Return every tag and variable of the process image."""
         found: list[str] = (await self._call("image"))["names"]
         return found
 
@@ -115,7 +118,7 @@ class RunningPlc:
         return await self._call(verb, **args, by=BY)
 
     def send(self, period_s: int) -> None:
-        """The far end commands a period."""
+        """Command a period at the remote end."""
         if self._shore is None:
             raise UsageError("nobody can command this system", expected="a transmitter with a far end")
         self._shore.send(period_s)

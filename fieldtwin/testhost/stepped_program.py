@@ -81,7 +81,7 @@ class SteppedProgram:
             program.execute(ScanInfo(self.now_ns, self.scans, self.scans == 1))
         except ProgramFailed:
             raise
-        except Exception as e:  # the logic is the user's, and can raise anything; translated here, once
+        except Exception as e:  # the logic is the user's, and can raise any exception; it is translated only here
             raise failed(BoundProgram(type(program).__name__, program), e) from e
         for v in program.variables.values():
             box = program.__dict__[v.name]
@@ -93,7 +93,10 @@ class SteppedProgram:
                 program.__dict__[v.name] = ()
 
     def values(self) -> dict[str, Any]:
-        """Every variable by its name; `state` of a state machine by its word; of a message output all that was sent."""
+        """Return every variable by its name.
+
+        The `state` of a state machine is its name; a message output is the list of all sent messages.
+        """
         found: dict[str, Any] = {}
         for v in self.program.variables.values():
             value = self.program.__dict__[v.name]

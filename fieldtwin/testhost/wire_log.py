@@ -29,7 +29,7 @@ class _Line:
 
     @property
     def closed(self) -> bool:
-        """Whether the connection is gone, so that no reply can follow."""
+        """Return whether the connection is closed, so that no reply can follow."""
         return getattr(self.end, "lost", None) is not None
 
 
@@ -43,10 +43,10 @@ class WireLog:
         self._lines: dict[tuple[str, int], _Line] = {}
         self._kept: deque[tuple[int, Exchange]] = deque(maxlen=MOST)
         self.number = 0
-        """Of the latest exchange; they count from 1."""
+        """The number of the latest exchange, counted from 1."""
 
     def on_bytes(self, bus: str, end: object, reply: bool, data: bytes) -> None:
-        """A chunk on a line or socket; `end` tells connections apart."""
+        """Add a chunk on a line or socket; `end` identifies the connection."""
         way = "received" if reply else "sent"
         self._feed(bus, end, {"dir": way, "bytes": data.hex()})
 
@@ -63,7 +63,7 @@ class WireLog:
             if len(self._lines) >= MAX_CONNECTIONS:
                 oldest = min(self._lines, key=lambda k: self._lines[k].last_ns)
                 self._take(self._lines.pop(oldest).decoder.finish())
-            line = self._lines[key] = _Line(Decoder(self._system), end)  # `end` is kept, so that its id stays its own
+            line = self._lines[key] = _Line(Decoder(self._system), end)  # `end` is kept, so that its id stays unique
         line.last_ns = self._clock.monotonic_ns()
         self._take(line.decoder.feed(Event(line.last_ns - self._start_ns, Kind.FRAME, bus, data)))
 
@@ -82,8 +82,10 @@ class WireLog:
         return [_plain(n, e) for n, e in found]
 
     def pending(self) -> list[dict[str, Any]]:
-        """Requests whose reply may still come, with the number 0. On a connection that is closed no reply can come: there the
-        problem is ``no reply``. Looking changes nothing."""
+        """Return the requests whose reply may still come, with the number 0.
+
+        On a closed connection no reply can come: there the problem is ``no reply``. A call has no side effects.
+        """
         found = []
         for line in self._lines.values():
             waiting = line.decoder.pending()

@@ -1,6 +1,6 @@
-"""What fixtures give: a device, a field side (prototype), a stepped program. Handles on what runs in the other process.
+"""The objects that fixtures return: a device, a field simulator (prototype), a stepped program.
 
-Standard library only: see `fieldtwin.testing.runner`.
+They are handles on objects in the other process. Standard library only: see `fieldtwin.testing.runner`.
 """
 
 from __future__ import annotations
@@ -38,8 +38,11 @@ class Endpoint:
 
 
 class Device:
-    """One emulated device. `endpoint` is the wire that it is on, and its parts stand here as well: `device.path`,
-    `device.port`; `unit` its unit or node id."""
+    """One emulated device.
+
+    `endpoint` is its address, whose parts are attributes of the device as well: `device.path`, `device.port`; `unit` is
+    its unit ID or node ID.
+    """
 
     def __init__(self, runner: Runner, bench: int, name: str, description: dict[str, Any]) -> None:
         facts = description["devices"][name]
@@ -51,7 +54,7 @@ class Device:
         self.endpoint = Endpoint(description["buses"][facts["bus"]])
         far = description["far"].get(name)
         self.far = Endpoint(far) if far else None
-        """The far end of a transmitter's link."""
+        """The remote end of a transmitter's link."""
         self.wire = Wire(runner, bench, name)
         self._runner = runner
         self._bench = bench
@@ -62,7 +65,7 @@ class Device:
         return getattr(self.endpoint, name)
 
     def set(self, tag: str, value: float | str | bool | None) -> None:
-        """Make the device hold `value`, in engineering units, whatever it replays; None: return to its own values."""
+        """Make the device hold `value`, in engineering units, instead of its own values; None: return to its own values."""
         __tracebackhide__ = True
         self._runner.call("set", id=self._bench, device=self.name, tag=tag, value=value)
 
@@ -83,7 +86,7 @@ class Device:
 
 
 class Prototype:
-    """The emulated field side of a system. ``prototype["ctd"]`` is a `Device`; `buses` and `far` say where things are."""
+    """The field simulator of a system. ``prototype["ctd"]`` is a `Device`; `buses` and `far` hold the endpoints."""
 
     def __init__(self, runner: Runner, description: dict[str, Any]) -> None:
         self.id: int = description["id"]
@@ -143,7 +146,7 @@ class Plc:
         return self._took(self._runner.call("scan", id=self.id, scans=scans))
 
     def run(self, seconds: float) -> Plc:
-        """As many scans as make up `seconds` at the program's cycle."""
+        """Run the number of scans that take `seconds` at the program's cycle."""
         __tracebackhide__ = True
         return self._took(self._runner.call("scan", id=self.id, seconds=seconds))
 

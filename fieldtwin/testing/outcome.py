@@ -19,9 +19,12 @@ VERDICTS = ("passed", "failed", "error", "inconclusive", "skipped")
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a scenario ended. `verdict` is one of `VERDICTS`; only the first is a pass. `case` is its id, `role` whom it
-    judges, `danger` its class (observe, read, write, disrupt). `checks` are its steps and checks, as
-    `fieldtwin test --json` has them. `on_the_wire` are the exchanges before the check that failed, as lines with a heading."""
+    """The result of a scenario.
+
+    `verdict` is one of `VERDICTS`; only the first is a pass. `case` is its ID, `role` the tested part, `danger` its
+    impact level (observe, read, write, disrupt). `checks` are its steps and checks, in the form of `fieldtwin test
+    --json`. `on_the_wire` are the exchanges before the failed check, as lines with a heading.
+    """
 
     name: str
     verdict: str

@@ -14,7 +14,7 @@ import pytest
 from fieldtwin.testing.runner import FieldtwinRefused, FieldtwinUnavailable, Runner, command_of
 
 _WORKER = re.compile(r"\[gw\d+\] ")
-"""The line that xdist puts before what a failure says."""
+"""The line that xdist adds before the text of a failure."""
 
 
 class Results:
@@ -80,7 +80,7 @@ class Results:
 
 
 def _why(report: pytest.TestReport) -> str:
-    """In one line: a scenario's verdict and its reason, a test's error."""
+    """Return one line: a scenario's verdict and its reason, or a test's error."""
     crash = getattr(report.longrepr, "reprcrash", None)
     said = str(crash.message) if crash is not None else _reason(report)
     lines = [line for line in said.splitlines() if line.strip()]

@@ -23,7 +23,7 @@ COMMAND_VARIABLE = "FIELDTWIN_COMMAND"
 
 
 class FieldtwinUnavailable(Exception):
-    """The process could not be started, or ended; with what it said."""
+    """Raised when the process could not be started, or ended; contains its output."""
 
 
 class FieldtwinRefused(Exception):
@@ -54,7 +54,7 @@ class Runner:
         self._number = 0
 
     def call(self, verb: str, **args: Any) -> Any:
-        """Ask for `verb`, and its result. Raises `FieldtwinRefused` or `FieldtwinUnavailable`."""
+        """Execute the command `verb` and return its result. Raises `FieldtwinRefused` or `FieldtwinUnavailable`."""
         __tracebackhide__ = True
         with self._lock:
             process = self._started()
@@ -99,7 +99,7 @@ class Runner:
                 stderr=self._said,
                 text=True,
                 encoding="utf-8",
-                start_new_session=True,  # Ctrl-C is for pytest: what runs here ends when its input does
+                start_new_session=True,  # Ctrl-C is for pytest: this process ends when its input does
             )
         except OSError as e:
             self._said.close()
@@ -111,7 +111,7 @@ class Runner:
         return process
 
     def _gone(self) -> FieldtwinUnavailable:
-        """Why the process is no longer there, with the end of what it said."""
+        """Return the reason for the end of the process, with the end of its output."""
         assert self._process is not None
         assert self._said is not None
         try:
@@ -148,7 +148,7 @@ class Runner:
 
 
 def _pump(process: subprocess.Popen[str], answers: Queue[str | None]) -> None:
-    """Every line of its output; None when it has ended."""
+    """Put every line of the process's output into `answers`, and None at its end."""
     assert process.stdout is not None
     try:
         for line in process.stdout:

@@ -1,4 +1,4 @@
-"""A PLC that runs, with its gateway, against an emulated field side: its tags, states and variables; forces, single scans.
+"""A running PLC, with its gateway, connected to a field simulator: its tags, states and variables; forces, single scans.
 
 Standard library only: see `fieldtwin.testing.runner`.
 """
@@ -30,8 +30,7 @@ class RunningPlc:
         self.names: tuple[str, ...] = tuple(runner.call("control", id=bench, profiles=list(profiles))["names"])
 
     def tag(self, name: str) -> dict[str, Any]:
-        """All that is known of it: ``value``, ``quality``, ``reason``, ``age_s``, ``unit``, ``forced``, ``side`` (input or
-        output)."""
+        """Return ``value``, ``quality``, ``reason``, ``age_s``, ``unit``, ``forced`` and ``side`` (input or output) of a tag."""
         __tracebackhide__ = True
         if name not in self.names:
             near = get_close_matches(name, self.names, n=3) or self.names[:10]
@@ -49,7 +48,10 @@ class RunningPlc:
         return str(self.tag(name)["quality"])
 
     def wait(self, name: str, value: Any = ..., *, quality: str = "", within_s: float = WITHIN_S) -> Any:
-        """Until it is `value`, or of `quality`, or both; the value then. `AssertionError` with what it was, after `within_s`."""
+        """Wait until the tag has `value`, or `quality`, or both, and return its value.
+
+        Raises `AssertionError` with the current value after `within_s` seconds.
+        """
         __tracebackhide__ = True
         until = time.monotonic() + within_s
         while True:
@@ -64,14 +66,16 @@ class RunningPlc:
             time.sleep(POLL_S)
 
     def send(self, period_s: int) -> None:
-        """The far end of the system's transmitter commands a period, as `fieldtwin shore` does."""
+        """Command a period at the remote end of the system's transmitter, as `fieldtwin shore` does."""
         __tracebackhide__ = True
         self._runner.call("send", id=self._bench, period_s=period_s)
 
     @contextmanager
     def force(self, tag: str, value: float | str | bool) -> Iterator[None]:
-        """``with plc.force("ctd.pressure", 3.5):`` programs see that, with the quality ``simulated``; a forced output is what
-        goes out."""
+        """Force a tag: ``with plc.force("ctd.pressure", 3.5):``.
+
+        Programs see that value with the quality ``simulated``; the forced value of an output is sent.
+        """
         self._steer("force", tag=tag, value=value)
         try:
             yield
@@ -79,7 +83,7 @@ class RunningPlc:
             self._steer("unforce", tag=tag)
 
     def pause(self) -> None:
-        """Execute nothing more, until `go`; outputs stay."""
+        """Stop executing scans until `go`; outputs keep their values."""
         self._steer("pause")
 
     def step(self, scans: int = 1) -> None:
@@ -90,11 +94,11 @@ class RunningPlc:
         self._steer("go")
 
     def restart(self, *, cold: bool = False) -> None:
-        """Make the programs anew; `cold`: without what is retained."""
+        """Recreate the programs; `cold`: without retained values."""
         self._steer("restart", cold=cold)
 
     def why(self, tag: str) -> list[dict[str, Any]]:
-        """Which program changed it last, when, and what it saw."""
+        """Return the last changes of a tag: the program, the time, and the inputs that it used."""
         __tracebackhide__ = True
         changes: list[dict[str, Any]] = self._steer("why", tag=tag)["changes"]
         return changes

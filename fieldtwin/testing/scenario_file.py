@@ -1,7 +1,7 @@
-"""A scenario file as pytest's: one test, whose outcome is the scenario's verdict.
+"""A scenario file as a pytest item: one test, whose outcome is the scenario's verdict.
 
-PASSED is a pass. SKIPPED (the target cannot do what it takes) is a skip, with the reason. FAILED is a failure, and so are
-INCONCLUSIVE and ERROR: what did not pass must not look as if it had.
+PASSED is a pass. SKIPPED (the target lacks an ability that the scenario needs) is a skip, with the reason. FAILED is a
+failure, and so are INCONCLUSIVE and ERROR: a scenario that did not pass must not look as if it had.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ ABOUT = ("case", "role", "danger")
 
 
 class NotPassed(Exception):
-    """A scenario that ended otherwise."""
+    """Raised for a scenario that did not pass."""
 
     def __init__(self, outcome: Outcome) -> None:
         super().__init__(outcome.verdict)

@@ -24,16 +24,17 @@ SHOWN = 10
 class Exchange:
     """A request with its answer, or a message that has none (a heartbeat, a PDO).
 
-    `function` is the Modbus function code, 0 on CANopen; `access` is read, write, read and write, or ""; `address` the first
-    register, bit or object (index) as it is sent, `count` how many. `tags` are the values carried, in engineering units, by the
-    profile's names. `exception` or `abort` is the code where it was refused. `problem` is "" where all is well, else
-    ``pending``, ``no reply``, ``exception``, ``abort``, ``check sum``, ``stray`` or ``malformed``. `t_s` counts from when the
-    wire came up. `request` and `reply` are the bytes, `text` and `reply_text` the same in words. `transaction` is the
-    transaction id on Modbus TCP.
+    `function` is the Modbus function code, 0 on CANopen; `access` is read, write, read and write, or ""; `address` is
+    the first register, bit or object (index) as sent, `count` their number. `tags` are the values carried, in
+    engineering units, by the profile's names. `exception` or `abort` is the code of a refusal. `problem` is "" for a
+    good exchange, else ``pending``, ``no reply``, ``exception``, ``abort``, ``check sum``, ``stray`` or ``malformed``.
+    `t_s` counts from the opening of the connection. `request` and `reply` are the bytes, `text` and `reply_text` the
+    same in words. `transaction` is the transaction ID on Modbus TCP.
 
-    A request is ``pending`` until its reply comes. It has ``no reply`` once none can follow: the next request was sent on a
-    serial line, a later request was answered on Modbus TCP, or the connection was closed. A ``stray`` is a frame that answers no
-    request: it has a `reply` and no `request`. `number` counts what has ended; that of a pending request is 0.
+    A request is ``pending`` until its reply comes. It has ``no reply`` once none can follow: the next request was sent
+    on a serial line, a later request was answered on Modbus TCP, or the connection was closed. A ``stray`` is a frame
+    that answers no request: it has a `reply` and no `request`. `number` counts completed exchanges; that of a pending
+    request is 0.
     """
 
     number: int
@@ -76,7 +77,7 @@ def _exchange(plain: dict[str, Any]) -> Exchange:
 
 
 class Wire:
-    """All wires of a field side, or those of one `device`."""
+    """The traffic of all buses of a field simulator, or that of one `device`."""
 
     def __init__(self, runner: Runner, bench: int, device: str = "") -> None:
         self._runner = runner
@@ -122,7 +123,7 @@ class Wire:
         )
 
     def clear(self) -> None:
-        """Forget what was exchanged so far, also requests whose reply is still to come."""
+        """Discard the exchanges so far, including requests whose reply is still to come."""
         while True:
             answer = self._runner.call("exchanges", id=self._bench, since=self._since)
             self._after_s = answer["now_s"]
@@ -168,7 +169,7 @@ class Wire:
         at_most: int | None = None,
         **like: Any,
     ) -> list[Exchange]:
-        """Do as `expect` does, while the event loop goes on."""
+        """Do as `expect` does, without blocking the event loop."""
         __tracebackhide__ = True
         wanted = _Wanted.of(times, at_least, at_most, like)
         until = time.monotonic() + within_s
@@ -179,7 +180,10 @@ class Wire:
             await asyncio.sleep(POLL_S)
 
     def _look(self, wanted: _Wanted, like: dict[str, Any], until: float) -> tuple[list[Exchange], bool]:
-        """One look: the exchanges, and whether the wait is over. Raises `AssertionError` where they cannot be right any more."""
+        """Return the exchanges, and whether the wait is over.
+
+        Raises `AssertionError` when their number can no longer be right.
+        """
         __tracebackhide__ = True
         late = time.monotonic() >= until
         found = self.exchanges(**like)
@@ -194,8 +198,10 @@ class Wire:
 
     @contextmanager
     def fault(self, name: str, **more: Any) -> Iterator[str]:
-        """The wire misbehaves while the block runs: ``with wire.fault("silence"):``; names and parameters as `fieldtwin faults`
-        lists them."""
+        """Inject a fault while the block runs: ``with wire.fault("silence"):``.
+
+        `fieldtwin faults` lists names and parameters.
+        """
         __tracebackhide__ = True
         aim = {"device": self._device} if self._device and not {"device", "bus"} & set(more) else {}
         id = self._runner.call("fault", id=self._bench, fault={"name": name, **aim, **_keys(more)})
@@ -224,7 +230,7 @@ def _keys(more: dict[str, Any]) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class _Wanted:
-    """How many exchanges are expected, and in words which."""
+    """The expected number of exchanges, and a description of them."""
 
     least: int
     most: float

@@ -1,4 +1,4 @@
-"""The requirement matrix: the scenarios that judge each requirement. A requirement is met if all of them passed."""
+"""The requirement matrix: the scenarios that test each requirement. A requirement is met if all of them passed."""
 
 from __future__ import annotations
 

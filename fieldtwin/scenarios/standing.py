@@ -1,5 +1,4 @@
-"""The rules of a scenario for the whole run besides its steps: `always`, `never`, and that every part of the system
-runs.
+"""The rules of a scenario for the whole run: `always`, `never`, and that every part of the system runs.
 
 These rules are checked whenever the runner looks. A rule that is unknown is neither kept nor broken: a rule that was
 never known, or was unknown for a while after it was known, is INCONCLUSIVE at the end.

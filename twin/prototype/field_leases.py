@@ -1,9 +1,10 @@
-"""Leases on the simulated field devices: the faults and values of a judge stay only while it renews its lease.
+"""Leases on the simulated field devices: the faults and values of a test runner stay only while it renews its lease.
 
-A judge (a scenario on a running system) opens a lease on the control channel, injects faults and sets values under its
-id, and renews it. Whatever happens to the judge, including kill -9 and a lost network, everything that it injected is
-removed when the lease ends: faults are cleared, and each device value becomes what it was before the judge's first
-`set`. Only one judge at a time can hold the lease, because two would change each other's verdicts.
+A test runner (a scenario on a running system; *judge* in messages) opens a lease on the control channel, injects faults
+and sets values under its id, and renews it. Whatever happens to the test runner, including kill -9 and a lost network,
+everything that it injected is removed when the lease ends: faults are cleared, and each device value becomes what it
+was before the test runner's first `set`. Only one test runner at a time can hold the lease, because two would change
+each other's verdicts.
 
 Pure: the time is passed in, in ns on the clock of the field process.
 """
@@ -16,12 +17,12 @@ from typing import TYPE_CHECKING, Any
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.errors import UsageError
 
-if TYPE_CHECKING:  # a judge on a plant, which loads no emulators, needs LEASE_S from here
+if TYPE_CHECKING:  # a test runner on a plant imports LEASE_S without emulators
     from fieldtwin.twin.prototype.field_faults import FieldFaults
 
 
 LEASE_S = 10.0
-"""Seconds after which a lease that was not renewed ends, unless the judge asks for another time."""
+"""Seconds after which a lease that was not renewed ends, unless the test runner asks for another time."""
 MOST_LEASE_S = 60.0
 MOST_ID = 100
 
@@ -31,7 +32,7 @@ class LeaseEnded(UsageError):
 
 
 class LeaseTaken(UsageError):
-    """Another judge holds the lease."""
+    """Another test runner holds the lease."""
 
 
 @dataclass
@@ -50,7 +51,7 @@ class FieldLeases:
         self._faults = faults
         self._lease: _Lease | None = None
         self.expired = 0
-        """Number of leases that ended because their judge did not renew them."""
+        """Number of leases that ended because their test runner did not renew them."""
 
     @property
     def until_ns(self) -> int | None:
@@ -58,7 +59,7 @@ class FieldLeases:
         return None if self._lease is None else self._lease.until_ns
 
     def open(self, id: str, for_s: float, now_ns: int) -> None:
-        """Give the lease to judge `id` for `for_s` seconds. Raises `LeaseTaken` while another judge holds it."""
+        """Give the lease to test runner `id` for `for_s` seconds. Raises `LeaseTaken` while a different one holds it."""
         self.expire(now_ns)
         if not id or len(id) > MOST_ID:
             raise UsageError("the lease's id", expected=f"1 to {MOST_ID} characters", got=repr(id)[:60])
@@ -115,7 +116,7 @@ class FieldLeases:
     def _end(self) -> None:
         lease, self._lease = self._lease, None
         assert lease is not None
-        for fault in sorted(lease.faults & set(self._faults.ids())):  # the judge may have cleared some
+        for fault in sorted(lease.faults & set(self._faults.ids())):  # the test runner may have cleared some
             self._faults.clear(fault)
         for (device, tag), value in lease.before.items():
             self._faults.set_value(device, tag, value)

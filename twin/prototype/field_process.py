@@ -178,7 +178,7 @@ class FieldProcess:
                     await self._make_anew()
 
     async def _end_leases(self) -> None:
-        """Remove what a judge injected as soon as its lease has expired."""
+        """Remove what a test runner injected as soon as its lease has expired."""
         while True:
             self._lease_changed.clear()
             until_ns = self._leases.until_ns
@@ -254,7 +254,7 @@ class FieldProcess:
         return {"number": self._field.faults.history.count}
 
     async def _lease(self, args: dict[str, Any]) -> dict[str, Any]:
-        """Open, prolong or end a judge's lease. The answer names the faults and values that are active."""
+        """Open, prolong or end a test runner's lease. The answer names the faults and values that are active."""
         id, for_s, now_ns = str(args.get("id", "")), args.get("for_s", LEASE_S), self._clock.monotonic_ns()
         if not isinstance(for_s, int | float):
             raise UsageError("how long a lease lasts", expected="a number of seconds", got=repr(for_s)[:60])

@@ -1,4 +1,4 @@
-"""Checks every state that a program can reach with any inputs, breadth first, against what must always hold.
+"""Checks the invariants of a program in every state that it can reach with any inputs, breadth first.
 
 A `Proof` defines the possible inputs (a finite domain per scan: values, qualities, how much time passes), which part of
 the program's state matters, and the invariants. The program itself runs, scan by scan; there is no second model. The
@@ -61,7 +61,7 @@ Invariant = Callable[[Any], bool]
 
 @dataclass(frozen=True)
 class Proof:
-    """What is to be proved of a program.
+    """The definition of a proof about a program.
 
     `make` creates it; `domain` has for each input the values that a scan may bring (those of a message input are
     payloads, and None for no message; for any other input None is BAD without a value, and a `TagValue` has any

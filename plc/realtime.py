@@ -81,7 +81,7 @@ def sleep_until_ns(deadline_ns: int) -> None:
 
 @dataclass(frozen=True, slots=True)
 class RealtimeReport:
-    """What the host granted, and what it refused, with the reason."""
+    """The requests that the host granted, and those that it refused, with the reason."""
 
     granted: tuple[str, ...]
     refused: tuple[tuple[str, str], ...]

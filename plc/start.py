@@ -45,7 +45,7 @@ class InputsMissing(FieldtwinError):
 
 @dataclass(frozen=True, slots=True)
 class StartPolicy:
-    """How long a program waits for its inputs (`timeout_ms`, from 0 ms), and what happens then.
+    """The longest wait of a program for its inputs (`timeout_ms`, from 0 ms), and the action after it.
 
     ``wait``: it continues to wait, and the status shows that it is overdue. ``stop``: the PLC stops, with its outputs
     safe. ``start_anyway``: it starts with the inputs that it has. Whatever the policy, the program then no longer waits

@@ -51,7 +51,7 @@ def place_of(at: RegisterRange, read: RegisterRange) -> slice:
 
 @dataclass
 class Learnt:
-    """What was learnt about a device from its refusals, over all its poll groups.
+    """The gaps and limits that a device's refusals have shown, over all its poll groups.
 
     `gaps` are ranges between two values that no read may cover. A gap of 0 registers is a border: a new read begins
     after it (the device accepts fewer registers per read than the profile states). `missing` are tags that the device

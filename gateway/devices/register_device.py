@@ -117,14 +117,14 @@ class RegisterDriver(DeviceDriver):
         return apply_scale(tag, value, of) if tag.scale_by is not None else value
 
     def know(self, learnt: Learnt) -> None:
-        """Take over the gaps and missing ranges that were learnt in an earlier run, before anything is read. Missing
-        ranges are asked for once more."""
+        """Take over the gaps and missing tags that were learnt in an earlier run, before anything is read. Missing tags
+        are read once more."""
         self.learnt.gaps = list(learnt.gaps)
         self.learnt.missing = list(learnt.missing)
         self.ask_again()
 
     def ask_again(self) -> None:
-        """Plan to ask again for ranges that the device did not have: after an absence it may have them."""
+        """Plan to read tags again that the device did not have: after an absence it may have them."""
         for plan in self.plans.values():
             plan.plan_again()
 

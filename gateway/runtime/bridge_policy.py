@@ -47,7 +47,7 @@ def within(peer: str, networks: tuple[Network, ...]) -> bool:
 
 @dataclass(frozen=True)
 class AllowRule:
-    """What the clients of `networks` may request. `units` as the client sends them; None: every unit.
+    """A rule for the requests of clients in `networks`. `units` as the client sends them; None: every unit.
 
     `addresses` holds first and last address by table; None: every address. If it is given, a table that it does not
     name is not allowed, and neither is a function without register addresses. `roles` are roles in clients'

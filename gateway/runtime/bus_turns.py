@@ -21,7 +21,7 @@ FOREVER_NS = 2**62
 
 @dataclass
 class DeviceState:
-    """What the bus knows about one of its devices. `tried`: it was asked since the connection was opened. `polls`
+    """The bus's record of one of its devices. `tried`: it was asked since the connection was opened. `polls`
     counts the groups that were read, and the tries while it was away."""
 
     driver: RegisterDriver

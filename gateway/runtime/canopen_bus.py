@@ -64,7 +64,7 @@ START_AGAIN_S = 2.0
 
 @dataclass
 class NodeStatus:
-    """What the bus knows about one node. `wanted` is set while the node has to be brought up (again), `up` while it is
+    """The bus's record of one node. `wanted` is set while the node has to be brought up (again), `up` while it is
     up."""
 
     driver: CanopenDriver
@@ -403,7 +403,7 @@ class CanopenBus:
     async def _assign(self, driver: CanopenDriver, error: FieldtwinError) -> FieldtwinError:
         """Assign the node ID, which no node answered to, over LSS to the node that is to have it.
 
-        Return the error of the assignment, or `error` itself if the assignment did not fail.
+        Return the error of a failed assignment, otherwise `error`.
         """
         address = driver.config.canopen.lss
         if address is None or self._lss is None or not self._allow_writes:
@@ -445,7 +445,7 @@ class CanopenBus:
             await driver.send()
 
     def _restate_limits(self, driver: CanopenDriver) -> None:
-        """State again how old values may become: that depends on whether the node's heartbeat is received."""
+        """Set the age limits of the node's values again, because they depend on whether its heartbeat is received."""
         for tag in driver.profile.tags.values():
             if tag.readable:
                 self._tags.restate(f"{driver.config.name}.{tag.name}", driver.stale_after_ms(tag))

@@ -23,6 +23,9 @@ class Distortions:
     """Of one device. `apply` is asked for every number that the device is about to hold."""
 
     _puts: dict[str, _Put] = field(default_factory=dict)
+    counts_given: bool = False
+    """Whether a fault strikes when `gave` reports the value. Otherwise it strikes with each number that `apply` changes, which
+    suits a device that computes its values when they are read."""
 
     def __bool__(self) -> bool:
         return bool(self._puts)
@@ -52,6 +55,13 @@ class Distortions:
                 continue
             if put.since_ns is None:
                 put.since_ns, put.held = now_ns, value
-            put.active.struck += 1
+            put.active.struck += not self.counts_given
             value = fault.distort(value, (now_ns - put.since_ns) / NS_PER_S, put.held, put.active.random)
         return value
+
+    def gave(self, tag: str, now_ns: int, *, named: bool = False) -> None:
+        """Count a strike of each fault that distorts `tag`, because the device has sent the value. `named`: as `of`."""
+        for put in self._puts.values():
+            aimed = put.tag == tag or (put.tag == "" and not named)
+            if aimed and in_time(put.active, now_ns) and put.fault.on(tag) is not None:
+                put.active.struck += 1

@@ -36,6 +36,8 @@ class ClientView:
         for service in self._owners(index):
             service.check_read(index, subindex)
         self._core.answer(entry.key, now_ns)
+        if self._core.given is not None:
+            self._core.given((entry.key,), now_ns)
         return self._core.data.get(index, subindex)
 
     def begin_write(self, index: int, subindex: int, size: int | None) -> int | None:

@@ -39,6 +39,7 @@ from fieldtwin.emulators.canopen.service import (
     AnswersReads,
     Change,
     Core,
+    Given,
     Held,
     NmtState,
     NodeCounters,
@@ -74,8 +75,8 @@ class NodeContext:
 
     `source` plays values, by time and, if it is an `AnswersReads`, by upload. `model` computes the device's behaviour
     from them and from the values that clients write; `distort` changes the model's output, for faults. `held` is called
-    with every value that the objects then have. `factory` replaces defaults (a serial number). `refusals` are objects
-    that SDO clients get an abort for, regardless of the data sheet.
+    with every value that the objects then have, `given` with the objects that the node has sent. `factory` replaces defaults (a
+    serial number). `refusals` are objects that SDO clients get an abort for, regardless of the data sheet.
 
     `tolerate_short_sdo` accepts SDO requests of fewer than 8 bytes as if padded with zeros, as for old PLCs; by default
     they are ignored. `sdo_block` is how many segments a client may send in one sub-block, 1 to 127. A TIME producer
@@ -86,6 +87,7 @@ class NodeContext:
     source: Source | None = None
     model: DeviceModel | None = None
     held: Held | None = None
+    given: Given | None = None
     distort: Distort | None = None
     factory: Mapping[Key, bytes] = field(default_factory=dict)
     refusals: Mapping[Key, Abort] = field(default_factory=dict)
@@ -115,6 +117,7 @@ class CanopenNode:
         self._behaviour = None if model is None else Behaviour(model, source, data, context.distort)
         self._core = core = Core(data, node_id, self._behaviour or source, context.journal_size)
         core.held = context.held
+        core.given = context.given
         core.answers = source if isinstance(source, AnswersReads) else None
         self.accepts = Acceptance(core)
         """The acceptance filter: whether a frame can concern this node. Feeding other frames is harmless."""

@@ -7,7 +7,7 @@ core, but not the SDO server or each other, unless one is passed to a different 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields
 from enum import IntEnum
 from typing import Protocol, runtime_checkable
@@ -94,6 +94,10 @@ Held = Callable[[Mapping[tuple[int, int], bytes], int], None]
 """Called with (values by object, now_ns) when the node's objects change: the reference values of a prototype run."""
 
 
+Given = Callable[[Iterable[tuple[int, int]], int], None]
+"""Called with the objects whose values the node has sent, in an SDO reply or a TPDO, and the time in ns."""
+
+
 class Source(Protocol):
     """Values that change by themselves: a recorded or computed signal."""
 
@@ -131,6 +135,7 @@ class Core:
         self._out: list[CanFrame] = []
         self.held: Held | None = None
         self.answers: AnswersReads | None = None
+        self.given: Given | None = None
 
     @property
     def communicating(self) -> bool:

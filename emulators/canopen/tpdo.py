@@ -215,6 +215,8 @@ class Tpdos(Service):
         self._core.counters.tpdos += 1
         self._core.journal.append(SentPdo(now_ns, can_id, data))
         self._core.send(can_id, data, now_ns)
+        if self._core.given is not None:
+            self._core.given([mapped.key for mapped in tpdo.parameters.settings.mapping], now_ns)
 
     def _build(self, tpdo: _Tpdo, now_ns: int) -> bytes:
         self._core.refresh(now_ns)

@@ -35,11 +35,12 @@ class DistortedObjects:
     ) -> None:
         """`named`: only faults that name a tag distort it, not faults that are aimed at all tags."""
         self._named = named
-        self.distortions = Distortions()
+        self.distortions = Distortions(counts_given=True)
         self.data: NodeData | None = None
         self._source = source
         self._has_model = has_model
         self._tags: dict[Key, tuple[Tag, int]] = {}
+        self._played: Mapping[Key, str] = {}
         for tag in tags:
             entry = dictionary.entry(*tag.object) if tag.object is not None else None
             if tag.object is not None and entry is not None and not tag.is_text and codec.is_number(entry.data_type):
@@ -48,6 +49,21 @@ class DistortedObjects:
         """The undistorted values of objects that no source provides."""
         self._given: dict[Key, bytes] = {}
         """The last distorted value of each of them."""
+
+    def share(self, distortions: Distortions, names: Mapping[Key, str]) -> None:
+        """Use the `distortions` of a source that distorts the tags of the objects `names` itself."""
+        self.distortions, self._played = distortions, names
+        distortions.counts_given = True
+
+    def given(self, keys: Iterable[Key], now_ns: int) -> None:
+        """The node has sent the values of the objects `keys`: each fault that distorts one of them has struck."""
+        if not self.distortions:
+            return
+        for key in keys:
+            if key in self._played:
+                self.distortions.gave(self._played[key], now_ns)
+            elif key in self._tags:
+                self.distortions.gave(self._tags[key][0].name, now_ns, named=self._named)
 
     def __call__(self, now_ns: int) -> dict[Key, bytes]:
         values = {} if self._source is None else self._source(now_ns)

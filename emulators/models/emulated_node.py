@@ -82,20 +82,20 @@ def emulated_node(
             tag for tag in tags if tag.name not in recording.names
         ]  # the other tags are distorted when they are played
         distorted = DistortedObjects(unfed, dictionary, played, has_model=model is not None, named=True)
-        distorted.distortions = played.distortions
+        distorted.share(played.distortions, played.names)
     else:
         objects = None if recording is None else recorded_objects(recording, dictionary, node_id)
         if objects is not None:
             context = replace(context, factory={**objects.initial, **own}, refusals=objects.refusals)
         distorted = DistortedObjects(tags, dictionary, objects, has_model=model is not None)
-    distortions = distorted.distortions
     context = replace(context, source=distorted, distort=distorted.over if model is not None else None)
+    context = replace(context, given=distorted.given)
     node = CanopenNode(dictionary, node_id, context)
     distorted.data = node.data
     for tag in tags:  # values of the data sheet, for tags that no source provides, are journalled too
         if tag.object is not None and node.data.has(*tag.object):
             held({tag.object: node.data.get(*tag.object)}, now_ns)
-    return EmulatedNode(node, held.journal, distortions, node_remarks(dictionary, node_id, model, options))
+    return EmulatedNode(node, held.journal, distorted.distortions, node_remarks(dictionary, node_id, model, options))
 
 
 def node_remarks(dictionary: Dictionary, node_id: int, model: DeviceModel | None, options: NodeOptions) -> list[Remark]:

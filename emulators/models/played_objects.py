@@ -52,6 +52,11 @@ class PlayedObjects:
                 got=", ".join(player.names),
             )
 
+    @property
+    def names(self) -> dict[Key, str]:
+        """The tag of each object that is played."""
+        return {key: name for name, key, *_ in self._objects}
+
     def __call__(self, now_ns: int) -> dict[Key, bytes]:
         values = self._player.values(now_ns)
         out: dict[Key, bytes] = {}

@@ -77,3 +77,17 @@ def test_a_value_that_never_took_effect_is_said(tmp_path: Path) -> None:
     result = run(tmp_path, "observatory", steps + "  - set: {tag: ctd.pressure, value: 5}\n  - pause: 2s\n")
     assert result.verdict is Verdict.INCONCLUSIVE
     assert "ctd.pressure takes effect: no effect" in result.reason
+
+
+@pytest.mark.parametrize(("tag", "value", "effect"), [("serial", 5, False), ("slope_long", 5, True)])
+def test_an_object_takes_effect_when_the_node_has_sent_it(tmp_path: Path, tag: str, value: int, effect: bool) -> None:
+    """Observed: a serial number, which the gateway reads once at the start, was set in the middle of a scenario that passed."""
+    steps = (
+        "  - wait: {until: \"quality(inclinometer.slope_long) == 'good'\", within: 5s}\n"
+        f"  - set: {{tag: inclinometer.{tag}, value: {value}}}\n"
+        "  - pause: 5s\n"
+        "  - expect: {that: \"quality(inclinometer.slope_long) == 'good'\"}\n"
+    )
+    result = run(tmp_path, "observatory", steps)
+    assert result.verdict is (Verdict.PASSED if effect else Verdict.INCONCLUSIVE), result.reason
+    assert (f"inclinometer.{tag} takes effect: no effect" in result.reason) is not effect

@@ -1,8 +1,8 @@
-"""The strict oracle of a run in virtual time: was every value that was published as good held by its device inside its age.
+"""The strict check of a run in virtual time: the device held every value that was published as good within the value's age.
 
-Both sides share one clock there, so "inside its age" is exact: from the moment in which the device was asked (for what it sends
-unasked: the value's own time) to the publication it must have held those very bytes at least once. Bounded: what lies `KEPT_NS`
-back is forgotten.
+Both sides share one clock there, so the check is exact: between the moment of the request (for an unrequested value:
+the value's own time) and the publication the device must have held those very bytes at least once. Bounded: history
+older than `KEPT_NS` is dropped.
 """
 
 from __future__ import annotations
@@ -29,7 +29,10 @@ class _Held:
         self.raws.append(raw)
 
     def was(self, raw: bytes, from_ns: int, to_ns: int) -> bool:
-        """Whether it was `raw` at any time between, both ends included: what ended at `from_ns` was so at that instant."""
+        """Return whether the value was `raw` at any time in the interval, both ends included.
+
+        A value that was replaced at `from_ns` counts as held at that instant.
+        """
         first = bisect_left(self.times_ns, from_ns)
         last = bisect_right(self.times_ns, to_ns, first)
         return raw in self.raws[first - 1 if first else 0 : last]
@@ -41,7 +44,7 @@ class _Held:
 
 
 class AgeOracle:
-    """Tell it what was published (`published`) and what was held (`held`), in order of time; then `judge`."""
+    """The check: report `published` and `held` values in order of time; then call `judge`."""
 
     def __init__(self) -> None:
         self.checked = 0
@@ -52,15 +55,15 @@ class AgeOracle:
         self._still_good: list[tuple[int, str, bytes, object, int]] = []
 
     def held(self, tag: str, raw: bytes, t_ns: int) -> None:
-        """From `t_ns` on the device holds `raw` for DEVICE.TAG."""
+        """Record that the device holds `raw` for DEVICE.TAG from `t_ns` on."""
         self._held.setdefault(tag, _Held()).note(t_ns, raw)
 
     def published(self, tag: str, raw: bytes, value: object, source_ns: int, now_ns: int) -> None:
-        """DEVICE.TAG was published as good at `now_ns`; nothing older than `source_ns` may stand for it."""
+        """Record that DEVICE.TAG was published as good at `now_ns`; its value may not be older than `source_ns`."""
         self._waiting.append((now_ns, tag, raw, value, source_ns))
 
     def still_good(self, tag: str, raw: bytes, value: object, source_ns: int, now_ns: int) -> None:
-        """DEVICE.TAG is still good at `now_ns`; judged like `published`, but not counted as one more published value."""
+        """Record that DEVICE.TAG is still good at `now_ns`; checked like `published`, but not counted as a published value."""
         self._still_good.append((now_ns, tag, raw, value, source_ns))
 
     def judge(self, emulated: frozenset[str]) -> None:

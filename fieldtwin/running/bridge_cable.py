@@ -31,7 +31,7 @@ class BridgeCable:
 
     @classmethod
     async def open(cls, plant: Endpoint, run_dir: Path, name: str) -> BridgeCable:
-        """Make both ends in `run_dir`. Raises `EndpointBusy` or `Unreachable`; then nothing stays open."""
+        """Open both ends in `run_dir`. Raises `EndpointBusy` or `Unreachable`; then neither stays open."""
         inside = await PtyEnd.open(run_dir / f"bridge-{name}.gateway", plant)
         try:
             outside = await PtyEnd.open(run_dir / f"bridge-{name}", plant, plant.serial)

@@ -83,7 +83,7 @@ def bridge_config(options: BridgeOptions) -> BridgeConfig:
 
 
 def instance_name(options: BridgeOptions) -> str:
-    """A run directory's name for the audit log: the listening side tells bridges of one host apart."""
+    """Return the name of the run directory for the audit log; the listening endpoint distinguishes the bridges of a host."""
     where = (
         f"{options.listen.host}-{options.listen.port or os.getpid()}" if options.listen.host else options.listen.path
     )

@@ -24,14 +24,17 @@ from fieldtwin.scenarios.form import Scenario, load_scenario
 from fieldtwin.scenarios.runner import ByChance
 
 SHORTEST_S = 600.0
-"""How long a run with random faults lasts where neither the command line nor the scenario asks for longer."""
+"""Default duration in seconds of a run with random faults."""
 _BY_RUN = ("running", "refused", "judge")
-"""Checks whose text is the same whatever broke them."""
+"""Checks whose text does not depend on the cause of the failure."""
 
 
 @dataclass(frozen=True)
 class Campaign:
-    """A scenario file and what its seeds may choose. `duration_s` 0: as long as the scenario may take, at least `SHORTEST_S`."""
+    """A scenario file and the choices of its seeds.
+
+    `duration_s` 0: the scenario's maximum duration, at least `SHORTEST_S`.
+    """
 
     path: Path
     profiles: tuple[Path, ...] = ()
@@ -41,7 +44,10 @@ class Campaign:
     """The command-line options, apart from the seed, that reproduce a seed's run."""
 
     def check(self) -> Scenario:
-        """Return the scenario. Raise `UsageError` where it has nothing that random faults could break, or cannot be struck."""
+        """Return the scenario.
+
+        Raise `UsageError` if it has no rule that random faults could break, or no target for faults.
+        """
         scenario = load_scenario(self.path, self.profiles)
         if self.random_faults is None:
             return scenario
@@ -111,9 +117,10 @@ def run_campaign(
 
 
 def verdict_of(campaign: Campaign, results: Sequence[ScenarioResult]) -> ScenarioResult:
-    """Return the result of the campaign as a whole: how many seeds judged each rule, and how often faults struck.
+    """Return the result of the campaign: how many seeds checked each rule, and how often faults took effect.
 
-    It is FAILED if a seed is. It is INCONCLUSIVE if a seed is, if no seed judged a rule of the scenario, or if no fault struck.
+    It is FAILED if a seed is. It is INCONCLUSIVE if a seed is, if no seed checked a rule of the scenario, or if no
+    fault took effect.
     """
     scenario = load_scenario(campaign.path, campaign.profiles)
     checks = [*_seeds_check(results), *_rule_checks(results)]
@@ -144,7 +151,10 @@ def _seeds_check(results: Sequence[ScenarioResult]) -> list[CheckResult]:
 
 
 def _rule_checks(results: Sequence[ScenarioResult]) -> list[CheckResult]:
-    """Return a check for each rule. A rule that no seed judged is INCONCLUSIVE, unless it is an invariant of the system file."""
+    """Return a check for each rule.
+
+    A rule that no seed checked is INCONCLUSIVE, unless it is an invariant of the system file.
+    """
     found: dict[str, list[CheckResult]] = {}
     for result in results:
         for check in result.checks:
@@ -154,7 +164,7 @@ def _rule_checks(results: Sequence[ScenarioResult]) -> list[CheckResult]:
     for number, every in found.items():
         first = next((one for one in every if one.verdict.bad), every[0])
         broken = sum(one.verdict.bad for one in every)
-        puts_in = number.startswith(("fault ", "set "))  # said only where it had no effect
+        puts_in = number.startswith(("fault ", "set "))  # listed only if it had no effect
         judged = len(results) - len(every) if puts_in else sum(not one.vacuous for one in every)
         verdict = Verdict.FAILED if broken else Verdict.PASSED
         if not judged and "invariant" not in number:
@@ -175,7 +185,7 @@ def _faults_check(results: Sequence[ScenarioResult]) -> CheckResult:
 
 
 def broken_by(result: ScenarioResult) -> list[str]:
-    """Return what broke in a run, without the places in the file: the same in a scenario that was written for it."""
+    """Return the failures of a run without their places in the file, so that they match those of a scenario written for it."""
     told: list[str] = []
     for check in result.checks:
         if not check.verdict.bad:

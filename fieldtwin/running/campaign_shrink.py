@@ -21,8 +21,11 @@ _KEPT = ("requirements", "start", "needs", "stopped", "refused", "probes")
 
 @dataclass(frozen=True)
 class ShrunkSeed:
-    """The fewest faults with which a seed still breaks the same rule. `minimal`: none of them can be left out. `result`: the run
-    with them, with its events. `without`: the run without random faults."""
+    """The fewest faults with which a seed still breaks the same rule.
+
+    `minimal`: all of them are necessary. `result`: the run with them, with its events. `without`: the run without
+    random faults.
+    """
 
     seed: int
     faults: list[dict[str, Any]]
@@ -32,7 +35,7 @@ class ShrunkSeed:
 
 
 def shrink_seed(campaign: Campaign, found: ScenarioResult) -> ShrunkSeed:
-    """Return the fewest random faults with which the seed of `found` breaks what it broke with all of them."""
+    """Return the fewest random faults with which the seed of `found` still breaks the same rules."""
     assert found.seed is not None
     seed, wanted = found.seed, broken_by(found)
     faults = schedule(campaign, campaign.check(), seed)
@@ -68,7 +71,7 @@ def scenario_of(campaign: Campaign, small: ShrunkSeed, folder: Path) -> str:
 def _from(folder: Path, path: Path) -> str:
     try:
         return Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix()
-    except ValueError:  # another drive of Windows
+    except ValueError:  # on a different drive of Windows
         return str(path.resolve())
 
 
@@ -82,7 +85,7 @@ def _rule(scenario: Scenario, result: ScenarioResult) -> dict[str, Any]:
 
 
 def _acts(scenario: Scenario, result: ScenarioResult) -> list[tuple[float, dict[str, Any]]]:
-    """Return what the steps did until the rule broke, with the time of each, in seconds of the run."""
+    """Return the effects of the steps until the rule broke, with the time of each, in seconds of the run."""
     acts: list[tuple[float, dict[str, Any]]] = []
     for check in result.checks:
         if not check.number.isdigit():

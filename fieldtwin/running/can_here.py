@@ -14,7 +14,7 @@ DEFAULT_BIT_RATE = 125_000
 
 
 def only_bus(wires: Sequence[Endpoint]) -> Endpoint:
-    """The one bus among the endpoints; raises `UsageError` for anything else."""
+    """Return the one bus among the endpoints; raises `UsageError` for anything else."""
     if len(wires) != 1 or not wires[0].is_can:
         raise UsageError(
             "a CANopen node stands on one bus",

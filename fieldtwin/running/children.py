@@ -15,7 +15,7 @@ POLL_S = 0.02
 
 
 class ChildFailed(FieldtwinError):
-    """A process that we started ended by itself. Its own exit code is ours."""
+    """A child process ended by itself. Its exit code becomes that of this process."""
 
     def __init__(self, name: str, code: int, said: str, log: Path) -> None:
         self.child_exit_code = code
@@ -53,7 +53,7 @@ class Child:
 
     @property
     def returncode(self) -> int | None:
-        """The exit code once it ended, negative for a signal; None while it runs."""
+        """The exit code after its end, negative for a signal; None while it runs."""
         return self._process.poll()
 
     def failure(self) -> ChildFailed | None:
@@ -65,7 +65,7 @@ class Child:
         return ChildFailed(self.name, code, lines[-1] if lines else "", self.log)
 
     async def connect(self, timeout_s: float = START_TIMEOUT_S) -> ControlClient:
-        """Wait until it says that it is ready. Raises `ChildFailed` when it ends instead."""
+        """Wait until the process reports that it is ready. Raises `ChildFailed` when it ends instead."""
         deadline = asyncio.get_running_loop().time() + timeout_s
         while True:
             failed = self.failure()

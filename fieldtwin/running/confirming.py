@@ -1,4 +1,4 @@
-"""Confirm a scenario that was written for a failure: it has to fail in the same way as what it was written for."""
+"""Confirm a scenario that was written for a failure: it has to fail in the same way."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ from fieldtwin.twin.site.system import System
 
 PLC_EVERY_S = 0.25
 STARTING_S = 5.0
-"""How long a PLC may take to start and to see the gateway's heartbeat for the first time."""
+"""Time in seconds in which a PLC may start and receive the gateway's first heartbeat."""
 HELD_KEPT = 20_000
 SERVED_WITHIN_S = 5.0
 SERVED_LOOK_S = 0.005
@@ -56,31 +56,37 @@ SERVED_LOOK_S = 0.005
 
 @dataclass(frozen=True)
 class Where:
-    """How a running system is reached: its run directory on this host; its field side, ``HOST[:PORT]`` with a token, or empty
-    for the one in the run directory; its far end, where no field side says it; the file that its wires are captured to."""
+    """The access to a running system.
+
+    `run_dir` is its run directory on this host. `field_host` is its field simulator, ``HOST[:PORT]`` with a token, or
+    empty for the one in the run directory. `far` is its remote end, if no field simulator reports it. `capture` is the
+    capture file of its buses.
+    """
 
     run_dir: Path
     field_host: str = ""
     token: str = field(default="", repr=False)
     field_socket: Path | None = None
-    """The Unix socket of a field side on this host, where that is not in the run directory."""
+    """The Unix socket of a field simulator on this host, if it is not in the run directory."""
     far: str = ""
     capture: Path | None = None
     plant: bool = False
-    """Nothing is emulated: no faults, nothing set, whatever else is there."""
+    """No device is emulated: no faults and no values are put in, whatever else is reachable."""
     own: bool = False
-    """The system was brought up for this scenario alone, so it is fresh."""
+    """The system was started for this scenario alone, so it is fresh."""
     foreign: bool = False
     """The controller is a user's program: there is no fieldtwin gateway to query."""
     env: Mapping[str, str] = field(default_factory=dict)
-    """What that program finds the devices by; endpoints of probes may name it."""
+    """The environment variables that tell that program the endpoints; endpoints of probes may refer to them."""
     allowed: Danger = Danger.DISRUPT
 
 
 class ControlBench(Started):
-    """``async with ControlBench(system, where, trace, target="local", names=[...]) as bench``. `names` is what readings are asked
-    for. `fresh` is given what the bench can do, and tells whether the system is to be made anew before time begins. `gone` tells
-    why the system is not there any more, or None."""
+    """A bench: ``async with ControlBench(system, where, trace, target="local", names=[...]) as bench``.
+
+    `names` are the tags and variables to read. `fresh` is called with the bench's abilities and returns whether the
+    system is to be reset before the scenario begins. `gone` returns the reason why the system has ended, or None.
+    """
 
     def __init__(
         self,
@@ -105,7 +111,7 @@ class ControlBench(Started):
         self._fresh = fresh
         self._gone = gone
         self._env: dict[str, str] = {}
-        """Where the simulated devices are: endpoints of probes may name it."""
+        """The endpoints of the simulated devices, to which endpoints of probes may refer."""
         self.lease: FieldLease | None = None
         self._clock = WallClock()
         self._start_ns = self._clock.monotonic_ns()
@@ -129,7 +135,7 @@ class ControlBench(Started):
         self._plc_due_s = 0.0
         self._stopped: Stopped | None = None
         self._fault_numbers: set[int] = set()
-        """Of the faults that were put in here, as the field simulator counts them."""
+        """The field simulator's numbers of the faults that this bench put in."""
         self._not_started = ""
         self._gateway_seen = False
         self._worst_us = -1.0
@@ -183,7 +189,7 @@ class ControlBench(Started):
         self._updates.clear()
 
     async def _open_lease(self, nursery: Nursery) -> None:
-        """From here on, nothing that this judge puts into the simulated devices outlives it."""
+        """Open the lease, which limits the lifetime of everything that the bench puts into the simulated devices."""
         if self._field is None:
             return
         self.lease = FieldLease(await self._connect_field())
@@ -212,7 +218,7 @@ class ControlBench(Started):
         self._words = {f"{p}.state": w for p, w in state_words(layout, self.system.plc.programs).items()}
 
     async def _connect_field(self) -> ControlClient:
-        """Another connection to the field side."""
+        """Open another connection to the field simulator."""
         if not self._where.field_host:
             return await self._connect_unix(self._field_socket)
         client, _ = await connect_control(self._where.field_host, self._where.token)
@@ -239,7 +245,7 @@ class ControlBench(Started):
             self._env = {**environment_from(status, self.system, self._field_at, self._field_socket), **self._where.env}
 
     async def _served(self, name: str) -> Endpoint:
-        """Where the gateway serves what the system file calls `name`, once it does."""
+        """Return the endpoint at which the gateway serves `name` of the system file; wait until it does."""
         assert self._gateway is not None
         until_s = self.now_s() + SERVED_WITHIN_S
         while not (listening := (await self._gateway.call("get"))["serve"][name]["listening"]):
@@ -256,7 +262,7 @@ class ControlBench(Started):
 
     @property
     def _field_at(self) -> str:
-        """The host of the field side."""
+        """The host of the field simulator."""
         return self._where.field_host.rpartition(":")[0] or self._where.field_host or "localhost"
 
     # -- Bench ----------------------------------------------------------------------------------------------------------
@@ -265,7 +271,7 @@ class ControlBench(Started):
         return (self._clock.monotonic_ns() - self._start_ns) / NS_PER_S
 
     async def sleep_until_s(self, t_s: float) -> None:
-        """Raises what the system is gone for."""
+        """Sleep until `t_s`. Raises the reason if the system has ended."""
         before_s = self.now_s()
         await asyncio.sleep(max(0.0, t_s - before_s))
         asked_s, slept_s = max(t_s, before_s), self.now_s()
@@ -369,7 +375,7 @@ class ControlBench(Started):
                 raise UsageError(str(e)) from e
             raise
 
-    # -- what happens ---------------------------------------------------------------------------------------------------
+    # -- events -------------------------------------------------------------------------------------------------------
 
     def _note(self, kind: Kind, where: str, data: dict[str, Any]) -> None:
         self.trace.note(round(self.now_s() * NS_PER_S), kind, where, data)
@@ -411,12 +417,12 @@ class ControlBench(Started):
         return events
 
     def _changed_states(self) -> list[Event]:
-        """What programs show, looked at now; between two looks a value may have been another one unseen."""
+        """Return the changes of programs' states since the last call; a value between two calls may be missed."""
         if self._outputs is None:
             return []
         snapshot = self._outputs.snapshot()
         if snapshot.stopped and self._stopped is None:
-            self._plc_due_s = 0.0  # why it stopped is asked at once
+            self._plc_due_s = 0.0  # query the reason of the stop at once
         if not snapshot.counter:
             return []
         events = []
@@ -429,11 +435,11 @@ class ControlBench(Started):
         return events
 
     async def _ask_plc(self) -> None:
-        """How late scans were since the last question: a new maximum, or the limit that some overran."""
+        """Query the lateness of scans since the last query: a new maximum, or an overrun of the limit."""
         assert self._plc is not None
         told = await self._plc.call("get", brief=True)
         self._stopped = self._what_stopped(told)
-        waiting = told.get("waiting", {})  # a PLC of an older version has none
+        waiting = told.get("waiting", {})  # an older PLC has none
         self._not_started = "; ".join(f"program {name} waits for {start['reason']}" for name, start in waiting.items())
         tasks = told["tasks"].values()
         worst_us = max(task["lateness_us"]["max"] for task in tasks)
@@ -449,7 +455,7 @@ class ControlBench(Started):
             await self._field.call("ready")  # raises if the field simulator is gone
 
     def _what_stopped(self, told: dict[str, Any]) -> Stopped | None:
-        """Return what the PLC's status says that does not run: the PLC itself, or the gateway, whose heartbeat it watches."""
+        """Return the stopped part according to the PLC's status: the PLC itself, or the gateway, whose heartbeat it monitors."""
         starting = self.now_s() < STARTING_S
         state, late_s = told["state"], float(self.system.plc.watchdog.late_ms) / 1000
         if state == "stopped":

@@ -19,12 +19,12 @@ from fieldtwin.plc.prove import Given, Proof, Result, shown
 from fieldtwin.twin.site.system import System
 
 ARRIVES = "5s"
-"""How long the last stimulus may take to get to the program."""
+"""Time that the last input may take to reach the program."""
 _NEEDS = {"send": "send_command", "set": "set_value", "fault": "inject_fault", "clear": "inject_fault"}
 
 
 def scenario(system: System, program: str, proof: Proof, result: Result) -> str:
-    """A scenario file (docs/scenarios.md) for what `result` found of `program`."""
+    """Return a scenario file (docs/scenarios.md) for the counterexample `result` of `program`."""
     steps = list(_steps(system, program, proof.make(), result.way))
     needs = list(dict.fromkeys(_NEEDS[word] for word, _ in steps if word in _NEEDS))
     lines = [

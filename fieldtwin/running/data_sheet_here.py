@@ -53,11 +53,11 @@ async def run_data_sheet(
     wires = [Endpoint.parse(url) for url in endpoints]
     wire = only_bus(wires)
     node = _node(dictionary, node_id or dictionary.node_id or DEFAULT_NODE_ID, log, options)
-    if log is None or options.model is not None:  # a node of a log is known by what it did
+    if log is None or options.model is not None:  # a node of a log is known by its recorded behaviour
         print_remarks(path.name, node_remarks(dictionary, node.node_id, node.context.model, options))
     closing: list[SoftBusServer | CanConnection] = []
     try:
-        async with Nursery() as nursery:  # inside: who serves is stopped before what it serves on is closed
+        async with Nursery() as nursery:  # inside: servers stop before their connections close
             connection, where = await stand_on_bus(wire, bitrate or dictionary.bit_rate, path.stem, closing)
             nursery.start(serve_node(connection, node, WallClock()), f"node on {wire}")
             talk.print(f"{_named(node)} on {where}", soft_wrap=True)
@@ -69,7 +69,7 @@ async def run_data_sheet(
 
 
 async def run_log(path: Path, endpoints: tuple[str, ...], node_id: int | None, bitrate: int | None = None) -> int:
-    """As `run_data_sheet`, for a log alone: the data sheet is made from it, so that the node has what the log has and no more."""
+    """Run as `run_data_sheet`, with a data sheet made from the log, so that the node has exactly the logged objects."""
 
     def frames() -> Iterator[tuple[int, CanFrame]]:
         return ((t_ns, frame) for t_ns, _, frame in read_log(path))
@@ -89,7 +89,7 @@ async def run_log(path: Path, endpoints: tuple[str, ...], node_id: int | None, b
 
 
 def print_remarks(name: str, found: Iterable[Remark]) -> None:
-    """Print what does not fit a node's data sheet, and which option of `emulate` overrides it."""
+    """Print the differences from a node's data sheet, and the option of `emulate` that overrides each."""
     for remark in found:
         advice = ""
         if remark.by_parameter_value:
@@ -100,7 +100,7 @@ def print_remarks(name: str, found: Iterable[Remark]) -> None:
 
 
 def _node(dictionary: Dictionary, node_id: int, log: Path | None, options: NodeOptions) -> CanopenNode:
-    """With what was recorded of it, and the model that `options` or 1000h name, where there are such."""
+    """Return the node with its recorded values, and with the model that `options` or 1000h name, if any."""
     model = model_for(dictionary, options.model)
     if log is not None:
         played = recorded_objects(CanLog(log), dictionary, node_id)

@@ -60,7 +60,7 @@ from fieldtwin.twin.prototype.field import unit_limits
 from fieldtwin.twin.site.data_files import find_recording
 
 DEFAULT_RECORDINGS = {"fieldtwin/ctd-reference": "cast.jsonl", "fieldtwin/inclinometer-cia410": "incl.jsonl"}
-"""Shipped reference devices whose recording has another name than their profile."""
+"""Shipped reference devices whose recording has a different name than their profile."""
 MAX_CLIENTS = 32
 LINE_PARAMS = ("mode", "echo")
 """Parameters of an emulated line, apart from its serial settings."""
@@ -88,7 +88,7 @@ async def run_device(
     """
     host = DeviceHost(speed, extras or Extras())
     try:
-        async with Nursery() as nursery:  # inside: who serves is stopped before what it serves on is closed
+        async with Nursery() as nursery:  # inside: servers stop before their connections close
             wires = [Endpoint.parse(url) for url in endpoints]
             if kind == "recording":
                 host.fault(None)
@@ -130,7 +130,7 @@ class Extras:
 
 
 class DeviceHost:
-    """Builds a device and puts it on wires."""
+    """A builder of a device and its servers."""
 
     def __init__(self, speed: float, extras: Extras = Extras()) -> None:
         self._extras = extras
@@ -156,8 +156,10 @@ class DeviceHost:
         return ModbusUnit(bank, unit_limits(profile), name=profile.name)
 
     def _recorded(self, profile: DeviceProfile, recording: Path | None) -> ModbusUnit:
-        """A device that is known by its exchanges: a recording that is given, or the shipped one under the profile's name.
-        Without either, its profile is all there is of it."""
+        """Return a device that replays exchanges: a given recording, or the shipped one under the profile's name.
+
+        Without either, the device is built from its profile alone.
+        """
         if recording is None and self._recording_of(profile) is None:
             talk.print(f"{profile.name}: nothing recorded; every register of its profile begins with 0", soft_wrap=True)
             return self._stated(profile, {})
@@ -184,7 +186,7 @@ class DeviceHost:
 
     @property
     def put_in(self) -> list[Active]:
-        """The faults that were put in, once for each wire."""
+        """The faults that were injected, once for each endpoint."""
         return self._faults.put_in if self._faults is not None else []
 
     def replayed(
@@ -373,7 +375,7 @@ def _framing(ascii_: bool) -> Framing:
 
 
 def _behind(faults: WireFaults, serve: OnClient) -> OnClient:
-    """Serve clients through the faults of their wire."""
+    """Return a server of clients that applies the faults of their connection."""
 
     async def client(connection: SocketEnd) -> None:
         if faults.refuses(round(asyncio.get_running_loop().time() * NS_PER_S)):

@@ -1,7 +1,7 @@
-"""A run that is driven in virtual time: its folder, its trace, and between two of its pieces a look at the world.
+"""A run that is driven in virtual time: its folder, its trace, and its progress between two pieces.
 
-It must never know what runs. Everything of the run is sealed off from clocks, sockets and threads; the run stops the loop when
-a piece is over.
+This module must not depend on what runs. Everything in the run is sealed off from clocks, sockets and threads; the run
+stops the loop when a piece is over.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from fieldtwin.scenarios.trace import Trace, open_sink
 TRACE_KEPT = 20_000
 """Events that stay in memory; the hash and a file have them all."""
 PIECE_S = 10.0
-"""Virtual seconds between two looks at the world, and between two judgements."""
+"""Virtual seconds between two progress reports, and between two checks."""
 MAX_ERRORS = 100
 
 
@@ -36,7 +36,7 @@ class Timed(Protocol):
 
 
 class DrivenRun(ABC):
-    """One run, of whatever `_main` does. ``run()``, then `summary()`; errors are kept in `errors`."""
+    """One run of `_main`: ``run()``, then `summary()`; errors are kept in `errors`."""
 
     faults: tuple[dict[str, Any], ...] = ()
     """The injected faults, including those that the seed chose."""
@@ -53,11 +53,11 @@ class DrivenRun(ABC):
 
     @abstractmethod
     async def _main(self, loop: VirtualLoop, folder: Path) -> None:
-        """The run, from start to end. `folder` is empty and goes with it."""
+        """Execute the run from start to end. `folder` is empty and is removed afterwards."""
 
     @abstractmethod
     def summary(self) -> dict[str, Any]:
-        """Plain data; nothing in it depends on how fast it was."""
+        """Return plain data that does not depend on the speed of the run."""
 
     @property
     @abstractmethod
@@ -104,5 +104,5 @@ class DrivenRun(ABC):
             await bench.sleep_until_s(bench.now_s() + min(left_s, PIECE_S))
             self.elapsed_s = bench.now_s()
             judge()
-            loop.stop()  # the world is looked at
+            loop.stop()  # interrupt the loop to report progress
             await asyncio.sleep(0)

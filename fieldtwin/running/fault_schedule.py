@@ -1,4 +1,7 @@
-"""Faults that a seed chooses: what, on whom, from when to when. The last part of a run has none, so that recovery can be seen."""
+"""Faults that a seed chooses: kind, target, begin and end.
+
+The last part of a run has none, so that recovery can be observed.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +30,10 @@ MOST = 500
 WATER_MEAN_S = 300.0
 LONGEST_IN_WATER_S = 60.0
 NOT_BY_CHANCE = frozenset({"set", "late-frame"})
-"""Nothing that goes wrong, and what no gateway could notice: no CAN frame says when its values were measured."""
+"""Faults that are never random.
+
+`set` is not a fault; no gateway could detect `late-frame`, because no CAN frame carries the time of its values.
+"""
 UNSEEN_ON_TCP = frozenset({"corrupt-bits", "collision", "wrong-baud", "wrong-parity", "noise", "echo"})
 """Serial faults that sockets do not get: Modbus TCP has no check sum of its own, so no gateway could detect them."""
 
@@ -47,7 +53,7 @@ class RandomFaults:
     aims: tuple[str, ...] = ()
 
     def check(self, system: System, network: Network | None = None) -> None:
-        """Raise `UsageError` for a fault or an aim that does not exist, and for kinds of which none fits any aim."""
+        """Raise `UsageError` for a fault or an aim that does not exist, and for kinds that fit no aim."""
         if self.mean_s <= 0:
             raise UsageError(
                 "the time between two random faults", expected="more than 0, such as 30s", got=f"{self.mean_s:g}"

@@ -22,7 +22,7 @@ LOCAL_HOSTS = ("localhost", "127.0.0.1", "::1")
 
 
 class FieldContact:
-    """A field side that was reached."""
+    """A connected field simulator."""
 
     def __init__(self, client: ControlClient, mapping: dict[Endpoint, Endpoint], far: dict[str, Endpoint]) -> None:
         self.client = client
@@ -30,16 +30,16 @@ class FieldContact:
         self.far = far
         self.links: list[LinkChild] = []
         self.life = ""
-        """Which process it is: a field side that was started again is another one."""
+        """The identity of its process: a restarted field simulator has a different one."""
         self.listening: dict[str, str] = {}
         self.far_said: dict[str, str] = {}
-        """Where buses and far modems are, as the field side says it."""
+        """The endpoints of buses and remote modems, as the field simulator reports them."""
         self.remarks: list[str] = []
-        """What does not fit a node's data sheet, each with the device's name."""
+        """Differences from a node's data sheet, each with the device's name."""
         self.clients_before: dict[str, dict[str, dict[str, int]]] = {}
         """By bus and client: the counts of the field simulator before this run connected."""
         self.counted_before: dict[str, dict[str, int]] = {}
-        """By device, what its counters said when we came: a field side may have served others before us."""
+        """By device: its counters before this run connected, because a field simulator may have served others before."""
 
     async def aclose(self) -> None:
         await self.client.aclose()
@@ -63,7 +63,7 @@ async def connect_control(host_port: str, token: str) -> tuple[ControlClient, st
 
 
 async def contact_elsewhere(host_port: str, token: str, system: System, run_dir: Path) -> FieldContact:
-    """The field side was started elsewhere; `host_port` is its control channel."""
+    """Return the contact with a field simulator that was started elsewhere; `host_port` is its control channel."""
     client, host = await connect_control(host_port, token)
     try:
         return await _contact(client, system, host, run_dir)
@@ -96,12 +96,12 @@ async def _contact(client: ControlClient, system: System, host: str, run_dir: Pa
         raise
     for name, bus in system.buses.items():
         if name not in status["listening"]:
-            contact.mapping[bus.endpoint] = bus.endpoint  # the prototype file says `plant` for this bus
+            contact.mapping[bus.endpoint] = bus.endpoint  # the prototype file has `plant` for this bus
     return contact
 
 
 def check_same(system: System, status: dict[str, Any]) -> None:
-    """Raise `FileInvalid` where a field side with this status has another version of the system file."""
+    """Raise `FileInvalid` if the status of a field simulator has a different version of the system file."""
     if status["system_hash"] != system.hash:
         raise FileInvalid(
             f"the field side runs another version of {system.name!r}",
@@ -112,9 +112,9 @@ def check_same(system: System, status: dict[str, Any]) -> None:
 
 
 def reachable(listening: Endpoint, host: str) -> Endpoint:
-    """The endpoint as seen from here: a wildcard address is the host that we reached the field side at.
+    """Return the endpoint as seen from here: a wildcard address becomes the host of the field simulator.
 
-    The host stays a name: a field side that comes back (a container that was restarted) may have another address.
+    The host stays a name: a restarted field simulator (for example a container) may have a different address.
     """
     if listening.scheme == "pty":
         if host not in LOCAL_HOSTS:

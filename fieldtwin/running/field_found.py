@@ -1,8 +1,8 @@
-"""Which simulated field side `--target compose` means where the user named none.
+"""Find the field simulator of `--target compose` if the user named none.
 
-In this order: FIELDTWIN_CONTROL (the judge runs under `fieldtwin with`), the field side in the instance's own run directory, the
-only field side of this system that runs on this host alone (`fieldtwin with`, `fieldtwin emulate`), and the host `field` of the
-compose file.
+In this order: FIELDTWIN_CONTROL (the scenario runs under `fieldtwin with`), the field simulator in the instance's own
+run directory, the only field simulator of this system that runs on this host alone (`fieldtwin with`, `fieldtwin
+emulate`), and the host `field` of the compose file.
 """
 
 from __future__ import annotations
@@ -21,7 +21,10 @@ MOST_LOOKED_AT = 200
 
 
 async def find_field(system: System, run_dir: Path, environ: Mapping[str, str] = os.environ) -> tuple[str, Path | None]:
-    """``HOST`` and no path, or an empty host and the path of a Unix socket. Raises `UsageError` where there are several."""
+    """Return ``HOST`` and no path, or an empty host and the path of a Unix socket.
+
+    Raises `UsageError` if there are several.
+    """
     if said := environ.get("FIELDTWIN_CONTROL"):
         return "", Path(said)
     own = run_dir / "field.sock"
@@ -51,7 +54,7 @@ def _sockets(root: Path) -> list[Path]:
 
 
 async def _is_of(path: Path, system: System) -> bool:
-    """Whether a field side answers there that simulates the devices of exactly this system file."""
+    """Return whether a field simulator answers there that simulates the devices of exactly this system file."""
     try:
         client = await ControlClient.connect_unix(path)
     except FieldtwinError:

@@ -1,4 +1,4 @@
-"""The field side of a system in this process: what `fieldtwin emulate SYSTEM` runs."""
+"""The field simulator of a system in this process: `fieldtwin emulate SYSTEM` runs it."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class FieldOptions:
 
 
 async def run_field(options: FieldOptions) -> int:
-    """Serve until SIGINT or SIGTERM. Prints where everything listens, once it does."""
+    """Serve until SIGINT or SIGTERM. Prints the endpoints once they listen."""
     allow_open_files()
     name = load_system(str(options.system), options.profiles).name
     with Instance(options.instance or f"{name}-field") as instance:

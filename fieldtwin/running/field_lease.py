@@ -20,7 +20,7 @@ from fieldtwin.twin.prototype.field_leases import LEASE_S
 
 RENEW_EVERY_S = 2.0
 OPEN_WITHIN_S = 2 * LEASE_S
-"""A judge that was killed left its lease: the next judge waits until that has expired."""
+"""Time in seconds to wait for a lease: that of a killed process has to expire first."""
 TRY_EVERY_S = 0.2
 FRESH_TIMEOUT_S = 30.0
 
@@ -44,7 +44,7 @@ class FieldLease:
         self._life = ""
 
     async def open(self) -> None:
-        """Open it; another judge's lease is waited for, `OPEN_WITHIN_S` seconds. Raises `Unreachable` after that."""
+        """Open the lease; wait `OPEN_WITHIN_S` seconds for the end of a different one. Raises `Unreachable` after that."""
         loop = asyncio.get_running_loop()
         deadline_s = loop.time() + OPEN_WITHIN_S
         while True:
@@ -64,7 +64,7 @@ class FieldLease:
             return
 
     async def run(self) -> None:
-        """Renew it until cancelled, or until it is lost: `lost` says why then."""
+        """Renew the lease until cancelled, or until it is lost; then `lost` is the reason."""
         while self.lost is None:
             await asyncio.sleep(RENEW_EVERY_S)
             try:
@@ -77,7 +77,7 @@ class FieldLease:
                 self.lost = LeaseLost(f"the simulated field devices cannot be reached: {e}")
 
     async def call(self, verb: str, **args: Any) -> Any:
-        """`fault` and `set` under this lease. Raises `LeaseLost`; `UsageError` for what makes no sense."""
+        """Call `fault` or `set` under this lease. Raises `LeaseLost`, and `UsageError` for invalid arguments."""
         try:
             return await self._client.call(verb, lease=self.id, **args)
         except RemoteError as e:
@@ -89,12 +89,12 @@ class FieldLease:
             raise
 
     async def fresh(self) -> int:
-        """Every device from its beginning; when that was done, ns on the host's monotonic clock."""
+        """Reset every device; return the time of the reset in ns on the host's monotonic clock."""
         answer = await self._client.call("fresh", FRESH_TIMEOUT_S, lease=self.id)
         self._life, self.before = answer["life"], ""
         return int(answer["now_ns"])
 
     async def release(self) -> None:
-        """End it. Where the field side cannot be reached, it ends by itself."""
+        """End the lease. If the field simulator cannot be reached, it expires."""
         with suppress(FieldtwinError):
             await self._client.call("lease", id=self.id, release=True)

@@ -19,7 +19,7 @@ from fieldtwin.twin.site.system import System
 
 FIRST_S, LIMIT_S = 0.25, 4.0
 CONNECT_S = 4.0
-"""A host that is gone answers nothing, and TCP would try for minutes."""
+"""Time limit of an attempt in seconds: a host that is down does not answer, and TCP would try for minutes."""
 
 
 class FieldReturn:
@@ -50,7 +50,7 @@ class FieldReturn:
         self.news = ""
         """The latest return, for a person."""
         self.moved = ""
-        """Why the gateway cannot reach who came back, if so."""
+        """The reason why the gateway cannot reach the returned simulator, if any."""
 
     @property
     def client(self) -> ControlClient | None:
@@ -64,14 +64,14 @@ class FieldReturn:
         return self._reason or f"the field side at {self._where} was lost: nobody knows what its devices held"
 
     def lost(self) -> None:
-        """A call was not answered, or its connection is gone."""
+        """Record that a call was not answered, or that its connection is lost."""
         if not self._gone.is_set():
             self.losses += 1
             self._gone_s = asyncio.get_running_loop().time()
             self._gone.set()
 
     async def run(self) -> None:
-        """Connect again whenever it is lost, until cancelled."""
+        """Reconnect after every loss, until cancelled."""
         while True:
             await self._gone.wait()
             backoff = Backoff(FIRST_S, LIMIT_S)
@@ -119,11 +119,11 @@ class FieldReturn:
         )
 
     def describe(self) -> dict[str, Any]:
-        """For the run's summary."""
+        """Return the counts for the run's summary."""
         gone_s = asyncio.get_running_loop().time() - self._gone_s if self._gone.is_set() else 0.0
         return {"at": self._where, "losses": self.losses, "away_s": round(self._away_s + gone_s, 3)}
 
 
 def is_loss(error: FieldtwinError) -> bool:
-    """Whether a call's failure says that the other process, or the way to it, is gone."""
+    """Return whether a failed call means that the other process, or the connection to it, is lost."""
     return isinstance(error, Unreachable | ReplyTimeout)

@@ -1,7 +1,7 @@
-"""`start: fresh` on a system that runs already: PLC, simulations and devices begin anew, and no container is restarted.
+"""`start: fresh` on a running system: PLC, simulations and devices are reset, without restarting a container.
 
-The order matters. The PLC forgets everything first and stays paused, so that no scan sees what the old devices said and no output
-of the old run reaches a new device. Then the devices are made anew, the gateway reads all of them, and the PLC goes on.
+The order matters. The PLC is reset first and stays paused, so that no scan sees values of the old devices and no output
+of the old run reaches a new device. Then the devices are reset, the gateway reads all of them, and the PLC continues.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from fieldtwin.running.field_lease import FieldLease
 
 BY = "fieldtwin test, start: fresh"
 WITHIN_S = 60.0
-"""The gateway looks for a device that does not answer less and less often; a busy host starts slowly."""
+"""Time limit in seconds: the gateway retries a silent device at growing intervals, and a busy host starts slowly."""
 SCANS_WITHIN_S = 10.0
 LOOK_EVERY_S = 0.05
 
@@ -49,7 +49,7 @@ async def programs_scan(plc: ControlClient) -> None:
 
 
 async def _all_read(gateway: ControlClient, since_ns: int) -> None:
-    """Until the gateway has read every device after `since_ns`, on the host's monotonic clock."""
+    """Wait until the gateway has read every device after `since_ns`, on the host's monotonic clock."""
     loop = asyncio.get_running_loop()
     deadline_s = loop.time() + WITHIN_S
     while missing := await _not_read(gateway, since_ns):

@@ -23,7 +23,7 @@ MIN_OPEN_FILES = 1024
 
 
 def examine() -> list[Check]:
-    """Run every check; none of them changes anything but temporary files."""
+    """Run every check; they change nothing except temporary files."""
     checks: tuple[Callable[[], Check], ...] = (
         _python,
         _data,
@@ -126,7 +126,7 @@ def _realtime() -> Check:
 
 
 def _files() -> Check:
-    """The hard limit counts: what serves many devices raises its own up to it."""
+    """Check the hard limit: a process that serves many devices raises its own limit up to it."""
     hard = here.most_open_files()
     if hard is None:
         return Check("open files", Verdict.OK, "no limit")
@@ -149,7 +149,7 @@ def _clock() -> Check:
 
 def _disk() -> Check:
     root = runtime_root()
-    # Not Path.exists: that raises where a folder above may not be looked into.
+    # Path.exists raises if a parent folder is not accessible.
     existing = next((p for p in (root, *root.parents) if os.path.exists(p)), Path("/"))
     free = shutil.disk_usage(existing).free
     found = f"{free // (1024 * 1024)} MiB free at {existing}"

@@ -1,4 +1,4 @@
-"""What numbers of a computer mean for a plant's controller, and what to change. Pure: `health` asks the computer."""
+"""Judge a computer's properties for a plant's controller, with remedies. Pure: `health` reads the computer."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from enum import Enum
 
 MIN_INOTIFY = 16
 MIN_CPUS = 1.0
-"""Gateway, PLC and the run's own process share what there is; less than one processor makes scans late."""
+"""Gateway, PLC and the run's own process share the processors; fewer than one makes scans late."""
 
 
 class Verdict(Enum):
-    """NOTE: something optional is missing, and everything else works."""
+    """The verdict of a check. NOTE: something optional is missing, and everything else works."""
 
     OK = "ok"
     NOTE = "note"
@@ -31,7 +31,7 @@ class Check:
 
 @dataclass(frozen=True)
 class ClockState:
-    """The kernel's clock: whether something disciplines it, and its own estimate of how far it is off."""
+    """The kernel's clock: whether it is synchronised, and its own estimate of its error."""
 
     synchronised: bool
     error_s: float
@@ -91,7 +91,7 @@ def judged_processor(cpus: int, quota: float | None) -> Check:
 
 
 def quota_of(text: str) -> float | None:
-    """What cgroup v2's ``cpu.max`` says, ``QUOTA PERIOD`` or ``max PERIOD`` in microseconds, as processors."""
+    """Return the number of processors in cgroup v2's ``cpu.max``, ``QUOTA PERIOD`` or ``max PERIOD`` in microseconds."""
     words = text.split()
     if len(words) != 2 or not all(w.isascii() and w.isdigit() for w in words) or int(words[1]) == 0:
         return None

@@ -53,7 +53,7 @@ def can_interfaces() -> dict[str, bool]:
     """The kernel's CAN interfaces, and whether each is up."""
     found = {}
     for kind in sorted(Path("/sys/class/net").glob("*/type")):
-        with suppress(OSError, ValueError):  # it may be gone by now
+        with suppress(OSError, ValueError):  # the interface may have been removed
             if int(kind.read_text()) == _ARPHRD_CAN:
                 found[kind.parent.name] = bool(int((kind.parent / "flags").read_text(), 16) & _IFF_UP)
     return found
@@ -123,7 +123,7 @@ def clock_state() -> ClockState | None:
 
 
 def join_advice(ports: Sequence[str]) -> str:
-    """What lets us open `ports`: the groups that own them, if their members may; else a rule for udev."""
+    """Return the way to get access to `ports`: the groups that own them, if their members have access; else a udev rule."""
     groups: list[str] = []
     try:
         import grp

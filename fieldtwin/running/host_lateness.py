@@ -1,8 +1,8 @@
-"""How late things were while a judge waited for a system on the same host. Times are in seconds since the scenario's start.
+"""The lateness of a test on the same host as the system. Times are in seconds since the scenario's start.
 
-Two measures that must not be mixed. *Own* lateness is the time by which a sleep of the judge ended too late: the host did not
-serve the judge, and nothing of the system under test has a part in it. *Any* lateness also has answers that took long and scans
-of the PLC that began late: that may be the host, and it may be a gateway that is stuck.
+Two measures that must not be mixed. *Own* lateness is the time by which a sleep of the testing process ended too late:
+the host did not serve it, and the system under test has no part in it. *Any* lateness also includes slow answers and
+scans of the PLC that began late: the cause may be the host, or a gateway that is stuck.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ class HostLateness:
         return max((late_s for t_s, late_s in self._any if t_s >= since_s), default=0.0)
 
     def own_s(self, since_s: float) -> float:
-        """All own lateness after `since_s` together. Sleeps do not overlap; what lies before `since_s` is not counted."""
+        """Return the total own lateness after `since_s`. Sleeps do not overlap; the part before `since_s` is not counted."""
         return sum(min(late_s, t_s - since_s) for t_s, late_s in self._own if t_s > since_s)
 
     def any_s(self, since_s: float) -> float:
-        """All lateness of any kind after `since_s` together."""
+        """Return the total lateness of any kind after `since_s`."""
         return sum(min(late_s, t_s - since_s) for t_s, late_s in self._any if t_s > since_s)

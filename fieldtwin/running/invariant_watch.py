@@ -1,4 +1,4 @@
-"""The invariants of a system file in a run: judged while it runs, and told in its summary. A broken one makes the run not ok."""
+"""Check the invariants of a system file during a run and report them in its summary. A broken one makes the run fail."""
 
 from __future__ import annotations
 
@@ -18,16 +18,17 @@ Rule = AlwaysRule | WithinRule
 
 
 class InvariantWatch:
-    """The invariants of `system`. `run` looks at them until it is cancelled; `results` and `errors` tell of them at any time.
+    """The invariants of `system`. `run` checks them until it is cancelled; `results` and `errors` are valid at any time.
 
-    Each invariant is judged until it is broken for the first time. Raises `FileInvalid` for an invariant that means nothing.
+    Each invariant is checked until it is broken for the first time. Raises `FileInvalid` for an invariant without
+    meaning.
     """
 
     def __init__(self, system: System) -> None:
         self._system = system
         stated = invariants_of(system)
         self.names = sorted(stated.names)
-        """The tags and variables that they look at."""
+        """The tags and variables that they use."""
         self._rules: list[Rule] = [*map(always_rule, stated.stated), *map(within_rule, stated.followed)]
         self._broken: dict[str, tuple[Verdict, str]] = {}
         self._ended = ""
@@ -37,7 +38,7 @@ class InvariantWatch:
         return bool(self._rules)
 
     async def run(self, bench: Bench, every_s: float) -> None:
-        """Look every `every_s` seconds of the run. Raises what the bench fails with."""
+        """Check every `every_s` seconds of the run. Raises the bench's errors."""
         knowledge = Knowledge(self._system, names_of(self._system), bench)
         bench.trace.listen(knowledge.hear)
         while True:
@@ -45,7 +46,7 @@ class InvariantWatch:
             await bench.sleep_until_s(bench.now_s() + every_s)
 
     def end(self, why: str) -> None:
-        """From now on nothing is known, because of `why`."""
+        """Stop checking, because of `why`."""
         self._ended = f"; not judged from {self._now_s:.3f} s on: {why}"
 
     def _look(self, now_s: float, knowledge: Knowledge, bench: Bench) -> None:
@@ -65,7 +66,7 @@ class InvariantWatch:
                 self._broken[rule.number] = verdict, f"broken at {now_s:.3f} s: {said.got}{late}"
 
     def results(self) -> list[dict[str, Any]]:
-        """Return each invariant with its verdict, as plain data: passed, failed, or inconclusive where it was not known."""
+        """Return each invariant with its verdict, as plain data: passed, failed, or inconclusive if its value was not known."""
         return [self._result(rule) for rule in self._rules]
 
     def _result(self, rule: Rule) -> dict[str, Any]:

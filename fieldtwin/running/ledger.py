@@ -1,6 +1,7 @@
-"""The ledger of virtual hours: one line a run that ended, so that nights add up and none is run twice.
+"""The ledger of virtual hours: one line per finished run, so that nights add up and no run is repeated.
 
-A line belongs to what was run: system and prototype file, version, virtual time, faults. Only lines of the same make a seed done.
+A line belongs to a fingerprint of system and prototype file, version, virtual time and faults. Only lines with the same
+fingerprint mark a seed as done.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from fieldtwin.running.many_seeds import SeedResult
 
 
 class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One run. `what` is `many_seeds.what_runs` of what was run; `wrong` values of `checked` were never held by their device."""
+    """One run. `what` is its `many_seeds.what_runs`; `wrong` of the `checked` values were never held by their device."""
 
     what: str
     version: str
@@ -34,7 +35,7 @@ MAX_BYTES = 256 * 1024 * 1024
 
 
 class Ledger:
-    """A file of entries, appended to. A last line that a kill cut off is taken away. Raises `FileInvalid`, `Unreachable`."""
+    """A file of entries, appended to. A last line that a kill truncated is removed. Raises `FileInvalid`, `Unreachable`."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -81,7 +82,7 @@ class Ledger:
 
     @property
     def hours(self) -> float:
-        """All virtual hours in it."""
+        """The sum of all virtual hours in the ledger."""
         return sum(e.hours for e in self.entries)
 
     @property

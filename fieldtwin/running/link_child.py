@@ -12,7 +12,7 @@ from fieldtwin.running.children import START_TIMEOUT_S, spawn
 from fieldtwin.twin.plant.child import command
 
 LINGER_S = 2.0
-"""The line outlives us for so long when we are killed: the gateway writes its safe values over it."""
+"""Time in seconds that the line remains after this process was killed: the gateway writes its safe values over it."""
 
 
 class LinkChild:

@@ -1,5 +1,7 @@
-"""Which event loop a program that only serves runs on: uvloop where it is installed (the `perf` extra), else asyncio's, with
-waits that end on time. uvloop, fastest over sockets, waits in whole milliseconds: too coarse for a serial line."""
+"""Choose the event loop of a server program: uvloop if it is installed (the `perf` extra), else asyncio's with exact waits.
+
+uvloop, the fastest over sockets, waits in whole milliseconds: too coarse for a serial line.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,7 @@ T = TypeVar("T")
 
 
 def run(main: Coroutine[Any, Any, T], *, serial: bool = False) -> T:
-    """As `asyncio.run`. `serial`: it keeps the times of a serial line."""
+    """Run `main` as `asyncio.run` does. `serial`: it needs the timing of a serial line."""
     factory: Callable[[], asyncio.AbstractEventLoop] = precise_loop
     if not serial:
         with suppress(ImportError):

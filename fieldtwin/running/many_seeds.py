@@ -15,12 +15,12 @@ from fieldtwin.running.workers import each
 MAX_SEEDS = 100_000
 _ERRORS_SHOWN = 5
 Options = VirtualOptions | VirtualNetworkOptions
-"""Of a run that a seed makes: a system's, or a network's."""
+"""The options of a run with a seed: of a system, or of a network."""
 
 
 @dataclass(frozen=True, slots=True)
 class SeedResult:
-    """How the run of one seed ended. `checked` values were compared with what devices held, `wrong` of them never were."""
+    """The result of one seed's run. `checked` values were compared with devices' values, `wrong` of them were never held."""
 
     seed: int
     ok: bool
@@ -30,11 +30,11 @@ class SeedResult:
     events: int
     sha256: str
     faults: tuple[tuple[str, int, int], ...] = ()
-    """By fault name: how many were put in, and how often they struck in all."""
+    """By fault name: how many were injected, and how often they took effect."""
 
 
 def fingerprint(*parts: str) -> str:
-    """A name for what was run: the same texts (files, options) give the same name."""
+    """Return a fingerprint of a run: the same texts (files, options) give the same fingerprint."""
     digest = hashlib.sha256()
     for part in parts:
         digest.update(len(part).to_bytes(8, "big") + part.encode())
@@ -77,9 +77,11 @@ def _by_name(faults: Sequence[dict[str, Any]]) -> tuple[tuple[str, int, int], ..
 
 @dataclass(frozen=True, slots=True)
 class Shrunk:
-    """The fewest faults with which a run still fails as it did: `faults`. `minimal`: none of them can be left out. `result`: how
-    the run ends with them. `without`: how it ends without any fault; the same as `result` if it takes none. `scripted`: when (s)
-    the remote client commands which period."""
+    """The fewest faults with which a run still fails in the same way: `faults`.
+
+    `minimal`: all of them are necessary. `result`: the result with them. `without`: the result without any fault; the
+    same as `result` if none is necessary. `scripted`: the times (s) and periods of the remote client's commands.
+    """
 
     faults: list[dict[str, Any]]
     minimal: bool
@@ -89,7 +91,7 @@ class Shrunk:
 
 
 def shrunk(options: Options, found: SeedResult) -> Shrunk:
-    """Return the fewest faults with which the run of `found`'s seed still fails as it did with all of them."""
+    """Return the fewest faults with which the run of `found`'s seed still fails in the same way."""
     options = replace(options, seed=found.seed)
     run = options.make()
     base = replace(options, random_faults=None, faults=())

@@ -1,4 +1,4 @@
-"""The oracle of mailboxes in virtual time: each command of the far end arrives at most once, in order and unchanged."""
+"""The check of mailboxes in virtual time: each command of the remote client arrives at most once, in order and unchanged."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from fieldtwin.gateway.core.events import Consumer, Producer
 from fieldtwin.gateway.core.values import DATA
 
 MOST_KEPT = 100_000
-"""Messages that are kept for the comparison. A run in which more arrive is judged by the newest ones only."""
+"""Maximum number of messages kept for the comparison. If more arrive, only the newest are checked."""
 
 
 class MessageOracle:

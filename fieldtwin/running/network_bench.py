@@ -24,7 +24,10 @@ from fieldtwin.twin.network.water_faults import WaterFaults
 
 
 class MemberTrace(Trace):
-    """What one system's bench notes, in the trace of all, under its name. `later_ns`: by how much it began later."""
+    """The events of one system's bench, under its name in the common trace.
+
+    `later_ns`: its start after that of the first system.
+    """
 
     def __init__(self, whole: Trace, member: str, later_ns: Callable[[], int]) -> None:
         super().__init__(0)
@@ -55,7 +58,10 @@ class Part:
 
 
 class NetworkBench:
-    """A `fieldtwin.scenarios.bench.Bench`. `parts` by the names of the network's members; `shore` commands from the ship."""
+    """A `fieldtwin.scenarios.bench.Bench`.
+
+    `parts` by the names of the network's members; `shore` sends from the topside modem.
+    """
 
     def __init__(self, network: Network, trace: Trace, target: str, faults: WaterFaults) -> None:
         self.network = network
@@ -66,11 +72,11 @@ class NetworkBench:
         self.shore: Shore | None = None
         self.faults = faults
         self._where: dict[str, str] = {}
-        """Fault to the system, or the water, that it is in."""
+        """For each fault: its system, or the acoustic channel."""
 
     @property
     def can(self) -> frozenset[Can]:
-        """What all can; commands come from the ship."""
+        """The abilities that all parts have; commands come from the topside modem."""
         can = frozenset.intersection(*(part.bench.can for part in self.parts.values())) - {Can.SEND_COMMAND, Can.PROBE}
         return can | ({Can.SEND_COMMAND} if self.shore is not None else frozenset())
 
@@ -120,7 +126,7 @@ class NetworkBench:
         return max(part.bench.host_late_s(since_s - part.trace.offset_ns / NS_PER_S) for part in self.parts.values())
 
     def host_late_total_s(self, since_s: float) -> tuple[float, float]:
-        """One judge sleeps for all systems, in the first one's bench."""
+        """Return the first part's lateness: only its bench sleeps, for all systems."""
         told = [p.bench.host_late_total_s(since_s - p.trace.offset_ns / NS_PER_S) for p in self.parts.values()]
         return told[0][0], max(any_s for _, any_s in told)
 

@@ -1,4 +1,4 @@
-"""A network's scenario on the target `local`: all its systems as processes on this host, judged over their control channels."""
+"""Run a network's scenario on the target `local`: all its systems as processes on this host, over their control channels."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from fieldtwin.scenarios.trace import FAR_END, Kind, Trace
 
 
 async def run_network(scenario: Scenario, seed: int | None, trace: Trace) -> ScenarioResult:
-    """Bring the network up, run the scenario, take all down. Raises `FieldtwinError` for what is gone."""
+    """Start the network, run the scenario, stop everything. Raises `FieldtwinError` for a part that has ended."""
     assert scenario.network is not None
     chosen = seed if seed is not None else scenario.form.seed
     options = NetworkOptions(f"test-{os.getpid()}", 0.0, chosen, scenario.profiles, cold=True, capture=True)
@@ -52,7 +52,7 @@ async def run_network(scenario: Scenario, seed: int | None, trace: Trace) -> Sce
 
 
 class _Tidy:
-    """Folders of a run, gone with it; where something of it was gone before, its logs are what tells why."""
+    """The folders of a run, removed with it; if a part ended early they are kept, because its logs contain the reason."""
 
     def __init__(self) -> None:
         self.folders: list[Path] = []
@@ -67,7 +67,7 @@ class _Tidy:
 
 
 def _later(bench: NetworkBench, name: str) -> Callable[[], int]:
-    """By how much the bench of a system began later than the first."""
+    """Return a function that returns how much later than the first the bench of a system began."""
     known: list[int] = []
 
     def later_ns() -> int:

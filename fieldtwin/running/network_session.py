@@ -43,9 +43,9 @@ class NetworkOptions:
     """Whether each system's bus traffic is written to ``capture.jsonl`` in its run directory."""
     commands: tuple[Scripted, ...] = ()
     faults: tuple[dict[str, Any], ...] = ()
-    """Of the systems and of the water, under the network's names."""
+    """The faults of the systems and of the acoustic channel, under the network's names."""
     thread: str = ""
-    """Where each system's thread listens: on a free port. Empty for none."""
+    """The address on which each system's thread listens, at a free port. Empty for none."""
 
 
 class NetworkSession(Started):
@@ -81,7 +81,7 @@ class NetworkSession(Started):
             self._stack.push_async_callback(ship.aclose)
         await self._start_systems(socket)
         self.started_ns = self.faults.start_ns = self.clock.monotonic_ns()
-        for fault in self._faults.get(WATER, ()):  # each knows its time
+        for fault in self._faults.get(WATER, ()):  # each has its own start time
             self.faults.inject(fault)
         if self.ship is not None:
             like = next(iter(self.network.members.values()))
@@ -93,7 +93,7 @@ class NetworkSession(Started):
             await self.shore.halt()
 
     async def _start_systems(self, socket: Path) -> None:
-        """All at once. What did start is ended with the rest, also where another one did not."""
+        """Start all systems at the same time. If one fails to start, the others are stopped with the rest."""
         self.sessions = {
             name: RunSession(self._of(number, name, socket)) for number, name in enumerate(self.network.members)
         }
@@ -127,11 +127,11 @@ class NetworkSession(Started):
         return (self.clock.monotonic_ns() - self.started_ns) / 1e9
 
     def counters(self) -> dict[str, dict[str, int]]:
-        """Of each modem in the water."""
+        """Return the counters of each modem in the acoustic channel."""
         return {name: counters.as_dict() for name, counters in self.medium.counters.items()}
 
     async def wait(self) -> None:
-        """Until the time asked for is over, `stopped` is set, or our own part of it fails."""
+        """Wait until the duration is over, `stopped` is set, or a part in this process fails."""
         waiting = self._nursery.start(self.stopped.wait(), "until stopped")
         done = asyncio.ensure_future(self._nursery.wait())
         try:

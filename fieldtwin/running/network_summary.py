@@ -1,4 +1,4 @@
-"""The verdict on a run of a network: that on each of its systems, and what happened in the water."""
+"""The verdict on a run of a network: those on its systems, and the events in the acoustic channel."""
 
 from __future__ import annotations
 
@@ -16,7 +16,10 @@ def summarise_network(
     errors: list[str],
     water_faults: list[dict[str, Any]],
 ) -> dict[str, Any]:
-    """Plain data for `--json` and for people. `systems`: each one's own summary. `ok` when all are, and nothing else failed."""
+    """Return plain data for `--json` and for printing.
+
+    `systems`: each system's own summary. `ok` if all of them are, and nothing else failed.
+    """
     return {
         "fieldtwin": __version__,
         "network": network.name,

@@ -13,7 +13,10 @@ from fieldtwin.gateway.store.knowledge import check_place
 
 @dataclass(frozen=True)
 class RunOptions:
-    """A run. `duration_s` 0 means until stopped; `field_host` is ``HOST[:PORT]`` of a field side started elsewhere."""
+    """The options of a run.
+
+    `duration_s` 0 means until stopped; `field_host` is ``HOST[:PORT]`` of a field simulator that was started elsewhere.
+    """
 
     system: str
     prototype: bool
@@ -32,20 +35,20 @@ class RunOptions:
     capture: Path | None = None
     cold: bool = False
     thread: str = ""
-    """Where the plant's side of a digital thread goes (`fieldtwin.twin.thread.place`), empty for none."""
+    """The destination of the plant's side of a digital thread (`fieldtwin.twin.thread.place`), empty for none."""
     thread_store: str = ""
     """The store of its log; by default a file of the instance."""
     thread_every_s: float | None = None
-    """A tag's new value goes into it at most so often. None: each one; over a modem, one a second."""
+    """Minimum time in seconds between two new values of a tag in it. None: every value; over a modem, one a second."""
     seed: int | None = None
-    """Of the emulators; None: the prototype file's."""
+    """The seed of the emulators; None: the prototype file's."""
     faults: tuple[dict[str, Any], ...] = ()
-    """As `fieldtwin.emulators.faults.schema.load_faults` gives them."""
+    """Faults as `fieldtwin.emulators.faults.schema.load_faults` returns them."""
     water: dict[str, tuple[str, str]] = field(default_factory=dict)
     """Transmitters that are in a network's water (`fieldtwin.twin.prototype.field_process.FieldConfig`)."""
 
     def __post_init__(self) -> None:
-        """Raises `UsageError` for a password in a URL, before it is handed on to a process or a file."""
+        """Raise `UsageError` for a password in a URL, before the URL is passed to a process or a file."""
         check_place(self.thread_store)
         if has_password(self.thread):
             raise UsageError(

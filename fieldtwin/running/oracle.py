@@ -1,7 +1,8 @@
-"""The oracle of a prototype run: was every value that was published as good one that the device held.
+"""The check of a prototype run: the device held every value that was published as good.
 
-Fetches what the gateway published and what the emulators held, by number, so that nothing is compared twice and memory stays
-bounded. A value is right when the device held those very bytes for that tag at some time not after the value's own.
+It fetches the values that the gateway published and those that the emulators held, by number, so that none is compared
+twice and memory stays bounded. A value is right when the device held those very bytes for that tag at some time not
+after the value's own.
 """
 
 from __future__ import annotations
@@ -12,19 +13,19 @@ from typing import Any
 from fieldtwin.gateway.core.control import ControlClient
 
 KEPT = 100_000
-"""Held values kept a tag, newest first to be forgotten last."""
+"""Maximum number of held values per tag; the oldest are dropped first."""
 EXAMPLES = 10
 
 
 class Oracle:
-    """Call `update` about once a second and once at the end."""
+    """The check: call `update` about once a second and once at the end."""
 
     def __init__(self) -> None:
         self.checked = 0
         self.wrong: list[str] = []
         self.wrong_count = 0
         self.unknown = 0
-        """Values from while the field side was away: what its devices held then went with it."""
+        """Number of values from the time when the field simulator was away: its devices' values of that time are lost."""
         self._published = 0
         self._held_numbers: dict[str, int] = {}
         self._held: dict[str, set[str]] = defaultdict(set)
@@ -52,12 +53,12 @@ class Oracle:
         self._gap = False
 
     def begin_again(self) -> None:
-        """The field side is another process from now on: its journals begin anew, and the end of the first one's was not seen."""
+        """Handle a new process of the field simulator: its journals begin again, and the end of the old ones was not seen."""
         self._held_numbers.clear()
         self._gap = True
 
     async def _fetch_held(self, field: ControlClient) -> bool:
-        """Take the next piece of what the devices held; False when there was nothing new."""
+        """Fetch the next piece of the devices' held values; return False when there was none."""
         new = False
         for device, entries in (await field.call("held", since=self._held_numbers)).items():
             self._emulated.add(device)

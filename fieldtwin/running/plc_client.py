@@ -21,13 +21,13 @@ from fieldtwin.twin.site.system import System
 
 T = TypeVar("T")
 ACCEPTS_WITHIN_S = 1.0
-"""How long a process may take to accept a connection before it counts as gone."""
+"""Time in seconds in which a process has to accept a connection before it counts as gone."""
 LOOK_S = 0.02
-"""Between two looks at whether all steps are done."""
+"""Seconds between two queries of whether all steps are done."""
 
 
 def running_instances() -> list[str]:
-    """Return the names of the instances on this host whose PLC accepts connections. A PLC that was killed leaves its socket."""
+    """Return the names of the instances on this host whose PLC accepts connections. A killed PLC leaves its socket."""
     return sorted(p.parent.name for p in runtime_root().glob("*/plc.sock") if _accepts(p))
 
 
@@ -71,7 +71,7 @@ def talk_to(instance: str, ask: Callable[[ControlClient], Awaitable[T]]) -> T:
 
 
 async def step_and_wait(call: Callable[..., Awaitable[Any]], count: int, by: str) -> dict[str, int]:
-    """Let a paused PLC execute `count` steps, and return the scans of each task once all are done, or it is paused no more."""
+    """Let a paused PLC execute `count` steps; return the scans of each task once all are done, or it is no longer paused."""
     scans: dict[str, int] = (await call("step", count=count, by=by))["scans"]
     while True:
         now = await call("get", brief=True)
@@ -98,7 +98,7 @@ def parse_value(text: str, words: Sequence[str] = ()) -> bool | int | float:
 
 
 def programs(system: System) -> dict[str, Program]:
-    """Each program of a system by name, made but not run. Raises `FileInvalid`."""
+    """Load each program of a system by name, without running it. Raises `FileInvalid`."""
     folder = str(system.path.parent)
     return {name: load_program(form.source, (folder,)) for name, form in system.plc.programs.items()}
 

@@ -1,4 +1,4 @@
-"""Probes: registers of a controller that is not ours, polled with the gateway's own Modbus master into a table of their own."""
+"""Probes: registers of a third-party controller, polled with the gateway's own Modbus client into a separate table."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ MOST_EVENTS = 50_000
 class Probes:
     """All probes of a scenario. ``await run()`` until cancelled; meanwhile `reading`, and `changes` since the last call.
 
-    `served` gives the endpoint of what the system itself serves, by name.
+    `served` returns the endpoint of a server of the system itself, by name.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class Probes:
             await nursery.wait()
 
     def reading(self, name: str) -> Reading | None:
-        """None: never answered."""
+        """Return the current reading; None if the register was never read."""
         now_ns = self._clock.monotonic_ns()
         seen = self._tags.current(name, now_ns)
         if seen.value is None:
@@ -81,7 +81,7 @@ class Probes:
         )
 
     def why_unknown(self, name: str) -> str:
-        """Return which endpoint did not answer for a probe's register, and with what error; empty for all other names."""
+        """Return the endpoint that did not answer for a probe's register, and its error; empty for all other names."""
         bus = next((one for one in self._buses if one.config.name == name.partition(".")[0]), None)
         if bus is None or name not in self.names:
             return ""

@@ -13,7 +13,7 @@ from fieldtwin.gateway.core.control import ControlClient
 from fieldtwin.running.plc_client import choose
 
 PATIENCE_S = 120.0
-"""A device whose group takes long has its new configuration when that group was read."""
+"""Time limit in seconds: a device has its new configuration after the next read of its group, which may be slow."""
 
 
 @dataclass(frozen=True)
@@ -37,9 +37,10 @@ class Reloaded:
 
 
 async def reload(gateway: ControlClient, plc: ControlClient | None, by: str, *, check: bool = False) -> Reloaded:
-    """Let the instance behind these two read its files again. With `check` nothing is taken over.
+    """Make the instance behind these two clients read its files again. With `check` nothing is applied.
 
-    Raises `RemoteError` where a file is invalid, with its line, and what reaching them may raise; nothing has changed then.
+    Raises `RemoteError` with the line if a file is invalid, and the errors of the connections; nothing has changed
+    then.
     """
     programs = (await plc.call("sources"))["changed"] if plc is not None else []
     answer = await gateway.call("reload", timeout_s=PATIENCE_S, by=by, check=check or bool(programs))
@@ -56,7 +57,7 @@ def _of_program(source: dict[str, str]) -> dict[str, Any]:
 
 
 async def reload_instance(instance: str, by: str, *, check: bool = False) -> Reloaded:
-    """As `reload`, for an instance by its name; "" is the only one that runs."""
+    """Call `reload` for an instance by its name; "" is the only one that runs."""
     plc_socket: Path = choose(instance)
     gateway = await ControlClient.connect_unix(plc_socket.with_name("gateway.sock"))
     try:

@@ -27,7 +27,7 @@ class _Judged(VirtualRun):
     disturbed = True
     """The scenario decides what a program should do."""
     may_refuse: tuple[str, ...] = ()
-    """The outputs whose refusal it expects."""
+    """The outputs whose refusal the scenario expects."""
 
 
 class RunJudge:
@@ -61,7 +61,7 @@ class RunJudge:
         self._where = scenario.line("judge")
 
     def attach(self, benches: Mapping[str, VirtualBench]) -> None:
-        """From now on what happens is judged. One system has the name ``""``."""
+        """Begin to check the events of the benches. A single system has the name ``""``."""
         self._benches = benches
         for name, run in self._runs.items():
             run.attach(benches[name])

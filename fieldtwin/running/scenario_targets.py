@@ -1,5 +1,8 @@
-"""Scenarios on every target: `virtual` in this thread, `local` as processes on this host, `compose` and `real` what runs already
-or is started here. The scenario is the same; targets differ in what they can do and what may be done to them."""
+"""Run scenarios on every target.
+
+`virtual` runs in this thread, `local` as processes on this host, `compose` and `real` use a running system or start one
+here. The scenario is the same; targets differ in their abilities and in what is allowed on them.
+"""
 
 from __future__ import annotations
 
@@ -39,11 +42,14 @@ from fieldtwin.twin.prototype.field_process import FieldConfig
 
 @dataclass(frozen=True)
 class Target:
-    """Where scenarios run. `instance` of `compose` and `real`: one that runs on this host already; empty: `compose` takes the
-    system's name, `real` starts the plant. `field_host`, `token`: the field side of `compose`. `far`: the far end of a plant.
-    `capture`: the file that a running instance's wires are captured to. `allow`: what may be done to a plant. `can`: on `local`
-    the interface that emulated CAN buses are on (`socketcan/vcan0`); empty: as the prototype file says. `controller`: on `local`
-    the user's program and its arguments, which control instead of our gateway and PLC."""
+    """The target of a scenario.
+
+    `instance` of `compose` and `real`: one that runs on this host already; empty: `compose` takes the system's name,
+    `real` starts the plant. `field_host`, `token`: the field simulator of `compose`. `far`: the remote end of a plant.
+    `capture`: the capture file of a running instance. `allow`: the highest impact level on a plant. `can`: on `local`
+    the interface of emulated CAN buses (`socketcan/vcan0`); empty: that of the prototype file. `controller`: on `local`
+    the user's program and its arguments, which replaces fieldtwin's gateway and PLC.
+    """
 
     name: str = "virtual"
     seed: int | None = None
@@ -60,8 +66,10 @@ class Target:
 def run_scenario(
     scenario: Scenario, target: Target, trace_file: Path | None = None, retries: int = 0
 ) -> ScenarioResult:
-    """Run it, and again, at most `retries` times, while it is INCONCLUSIVE; the first other verdict counts. In virtual time an
-    attempt is like the one before, so there is one only."""
+    """Run the scenario, and repeat it at most `retries` times while it is INCONCLUSIVE; the first other verdict counts.
+
+    In virtual time there is one attempt only, because all would be equal.
+    """
     earlier: list[str] = []
     while True:
         result = _attempt(scenario, target, trace_file)
@@ -96,9 +104,9 @@ def _attempt(scenario: Scenario, target: Target, trace_file: Path | None) -> Sce
             result = result_of(scenario, target.name, Verdict.SKIPPED, reason=refused)
         else:
             result = asyncio.run(_run(scenario, target, trace))
-    except asyncio.CancelledError:  # SIGTERM: everything went down in order
+    except asyncio.CancelledError:  # SIGTERM: everything has stopped in order
         raise KeyboardInterrupt from None
-    except NothingKnown as e:  # the host was late, or another judge interfered: nothing is known
+    except NothingKnown as e:  # the host was late, or another test interfered
         result = result_of(scenario, target.name, Verdict.INCONCLUSIVE, reason=str(e), trace=tuple(trace.events))
     except FieldtwinError as e:
         events = tuple(trace.events)
@@ -127,7 +135,7 @@ def _of_a_plant(scenario: Scenario, target: Target) -> str:
 
 
 def _words(target: Target) -> list[str]:
-    """How the command line says it; never a token."""
+    """Return the target as command-line options, without a token."""
     words = ["--target", target.name]
     said = {
         "--seed": "" if target.seed is None else str(target.seed),
@@ -142,12 +150,12 @@ def _words(target: Target) -> list[str]:
 
 
 def _with_words(target: Target) -> str:
-    """How the command line ends where the user's program controls."""
+    """Return the end of the command line for a user's controller."""
     return f" --with -- {shlex.join(target.controller)}" if target.controller else ""
 
 
 def _of_a_foreign_controller(scenario: Scenario) -> str:
-    """Why a program of the user cannot be judged by it; empty when it can."""
+    """Return the reason why a user's program cannot be tested by the scenario; empty if it can."""
     probed = {name for probe in scenario.probes for name in probe.names}
     ours = sorted(scenario.used - probed) + [
         f"the probe {probe.name} (serve)" for probe in scenario.probes if probe.serve
@@ -185,7 +193,7 @@ async def _run(scenario: Scenario, target: Target, trace: Trace) -> ScenarioResu
             own = session.instance.dir
 
             def tidy(kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-                if kind is None or not issubclass(kind, FieldtwinError):  # else its logs are what tells why
+                if kind is None or not issubclass(kind, FieldtwinError):  # else its logs contain the reason
                     shutil.rmtree(own, ignore_errors=True)
 
             stack.push(tidy)

@@ -48,19 +48,19 @@ if TYPE_CHECKING:
     from fieldtwin.twin.prototype.field_process import FieldConfig
 
 MODEM_EVERY_S = 1.0
-"""So often, at most, a tag goes over a modem: it takes some thirty events a second."""
+"""Minimum seconds between two values of a tag over a modem, which carries some thirty events a second."""
 WATCH_S = 0.02
 ANSWERS_WITHIN_S = 5.0
-"""A process that does not say how it is by then is stopped, or gets no processor."""
+"""Time in seconds after which a process without a status counts as stopped, or without processor time."""
 STILL_S = 3.0
-"""Looks of this process that are so far apart mean the same of itself."""
+"""Time in seconds between two checks after which this process counts as stopped itself."""
 ORACLE_S = 1.0
 INVARIANTS_S = 0.1
-"""How often the invariants of the system file are looked at."""
+"""Period in seconds of the checks of the system file's invariants."""
 MAX_ERRORS = 100
 SETTLE_S = 4.0
 FIELD_LINGER_S = 1.5
-"""Should we be killed, the emulators stay for so long: the gateway makes its outputs safe meanwhile."""
+"""Time in seconds that the emulators remain after this process was killed, in which the gateway makes its outputs safe."""
 
 
 class RunSession(Started):
@@ -110,20 +110,20 @@ class RunSession(Started):
         self.started_ns = 0
         self.answered_ns: dict[str, int] = {}  # when gateway and PLC last did
         self._looked_ns = 0
-        """When this process last looked after the others."""
+        """The time of this process's last check of the others."""
         self._still_ns = -(1 << 62)
-        """When it last noticed that it had stood still."""
+        """The time when this process last noticed that it had been stopped."""
         self.stopped = asyncio.Event()
         self._nursery = Nursery()
         self._clients: dict[str, ControlClient] = {}
         self._field: FieldContact | None = None
         self.made_anew = 0
-        """How often a scenario made the simulated devices anew."""
+        """How often a scenario reset the simulated devices."""
         self.field_return: FieldReturn | None = None
-        """Of a field side elsewhere: that it was lost, and came back."""
+        """The reconnection to a remote field simulator."""
 
     def _lent_to_the_thread(self) -> str:
-        """The transmitter whose mailboxes the thread has, if any. Raises `UsageError` where it cannot have them."""
+        """Return the transmitter whose mailboxes the thread uses, if any. Raises `UsageError` if that is not possible."""
         o = self.options
         lent = lent_transmitter(o.thread, self.system)
         if lent and not o.prototype and not o.allow_writes:
@@ -139,7 +139,7 @@ class RunSession(Started):
 
     @property
     def disturbed(self) -> bool:
-        """Whether faults were put in, or the field side was away: then both sides need not count alike."""
+        """Return whether faults were injected, or the field simulator was away: then the counts of both sides may differ."""
         lost = self.field_return is not None and self.field_return.losses > 0
         return bool(self.options.faults) or lost or self.made_anew > 0
 
@@ -180,7 +180,7 @@ class RunSession(Started):
 
     async def _put_faults_in(self) -> None:
         if self._field is not None:
-            for fault in self.options.faults:  # each knows its time
+            for fault in self.options.faults:  # each has its own start time
                 await self._field.client.call("fault", fault=fault, start_ns=self.started_ns)
 
     async def _start_thread(self, run_dir: Path) -> None:
@@ -202,7 +202,7 @@ class RunSession(Started):
             "thread", "fieldtwin.twin.thread.plant_thread", self._write("thread.json", config)
         )
         self.thread_place = str((await client.call("get"))["place"])
-        if not self.lent:  # where it is found again, had it been free to choose a port
+        if not self.lent:  # the address for a restart, even if the port was chosen freely
             config = msgspec.structs.replace(config, place=self.thread_place)
         self._keep_thread(config)
         if self.lent in self.far:
@@ -315,7 +315,7 @@ class RunSession(Started):
     # -- while it runs --------------------------------------------------------------------------------------------------
 
     async def wait(self) -> None:
-        """Until the time asked for is over, `stopped` is set, or our own watching fails."""
+        """Wait until the duration is over, `stopped` is set, or a task in this process fails."""
         waiting = self._nursery.start(self.stopped.wait(), "until stopped")
         done = asyncio.ensure_future(self._nursery.wait())
         try:
@@ -329,19 +329,19 @@ class RunSession(Started):
             done.cancel()
 
     async def _judge_invariants(self, invariants: InvariantWatch) -> None:
-        """Look at the invariants of the system file until the gateway or the PLC is gone, or the run is stopped."""
+        """Check the invariants of the system file until the gateway or the PLC ends, or the run is stopped."""
         from fieldtwin.running.control_bench import ControlBench, Where
 
         where = Where(self.instance.dir, plant=True, allowed=Danger.OBSERVE)
         try:
             async with ControlBench(self.system, where, Trace(1), target="real", names=invariants.names) as bench:
                 await invariants.run(bench, INVARIANTS_S)
-        except FieldtwinError as e:  # the processes' own watch tells of one that is gone
+        except FieldtwinError as e:  # the monitoring of the processes reports the one that ended
             invariants.end(str(e))
             self.note_error(f"the invariants were not judged to the end: {e}")
 
     async def _settle(self) -> None:
-        """The time is over; a command that is still under way may arrive, for `SETTLE_S` seconds at most."""
+        """Wait at the end for a command in progress, for `SETTLE_S` seconds at most."""
         deadline_s = self.elapsed_s + SETTLE_S
         while self.shore is not None and self.elapsed_s < deadline_s and not self.stopped.is_set():
             expected = expected_states(self.shore.commands_sent)
@@ -369,12 +369,12 @@ class RunSession(Started):
                 self.note_error(str(failed))
 
     def note_error(self, text: str) -> None:
-        """Something went wrong; each text once."""
+        """Record an error; each text once."""
         if text not in self.errors:
             self.errors.append(text)
 
     async def _ask(self) -> None:
-        """Refresh the three statuses twice a second and let the oracle judge once a second."""
+        """Refresh the three statuses twice a second and run the check of values once a second."""
         next_oracle = 0.0
         while True:
             await self.refresh()
@@ -397,7 +397,7 @@ class RunSession(Started):
                 self.note_error(f"the thread's log lost events: {thread['store_trouble'] or 'they came too fast'}")
 
     async def _refresh_field(self) -> None:
-        """Its status; where a scenario made its devices anew (`start: fresh`), their journals and counters begin again."""
+        """Refresh the field simulator's status; after `start: fresh` its journals and counters begin again."""
         self.field_status = await self._get(self._field_client, "" if self.field_return is not None else "field")
         if self._field is None or self.field_status is None or self.field_status["life"] == self._field.life:
             return
@@ -420,7 +420,7 @@ class RunSession(Started):
         return answer
 
     def _stood_still(self) -> bool:
-        """Whether this very process was stopped, or got no processor: then it cannot tell whether others answered."""
+        """Return whether this process itself was stopped, or got no processor time: then it cannot tell if others answered."""
         gap_s = (self.clock.monotonic_ns() - self._looked_ns) / NS_PER_S
         if self._looked_ns and gap_s > STILL_S:
             self._still_ns = self.clock.monotonic_ns()

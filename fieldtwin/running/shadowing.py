@@ -35,11 +35,11 @@ from fieldtwin.whatif.known import recall
 STEP_MS = 50
 ABOUT_THE_PLANT = (Kind.VALUE, Kind.STATE, Kind.PAYLOAD)
 STALE_AFTER_MS = 30_000
-"""Three times as long as a plant is silent about what does not change."""
+"""Three times the period in which a plant repeats unchanged values."""
 
 
 def limits_of(system: System) -> dict[str, Limits]:
-    """The limits of every tag whose profile states some."""
+    """Return the limits of every tag whose profile states some."""
     return {
         f"{d.name}.{t.name}": t.limits
         for d in system.devices.values()
@@ -70,7 +70,7 @@ class Shadowing:
         self.receiving = ReceivingEnd("from the plant")
         self.shadow = self._make(system)
         self.prototypes: set[str] = set()
-        """Origins that say that their field side is emulated (ruling 15)."""
+        """Origins whose field is emulated (ruling 15)."""
         self.origins: set[str] = set()
         self._system = system
         self._place = place
@@ -78,10 +78,10 @@ class Shadowing:
         self._store = store or str(Path(instance.dir) / "knowledge.sqlite")
         self._on_verdict = on_verdict
         self.on_trouble: Callable[[str, str], None] = lambda where, text: None
-        """Told what is wrong with the thread or the store, and with an empty text when that is over."""
+        """Called with each problem of the thread or the store, and with an empty text when it is over."""
         self._troubles: dict[str, str] = {}
         self._recalled = ""
-        """Whose log it began with, of those in the store."""
+        """The origin of the log in the store with which the shadow began."""
         self._end: ThreadEnd | None = None
 
     def _make(self, system: System) -> DigitalShadow:
@@ -157,7 +157,7 @@ class Shadowing:
         await to_receivers(self.receiving)(origin, events)
 
     async def _beside(self, nursery: Nursery, store: KnowledgeStore) -> None:
-        """What else works as long as the shadow does: nothing."""
+        """Run additional tasks for the lifetime of the shadow. A shadow has none."""
 
     def _give_up(self) -> None:
         """Stop without waiting for unfinished work. A shadow has none."""
@@ -196,7 +196,7 @@ class Shadowing:
                 writer.observe(event)
 
     def _kept(self, event: Event) -> None:
-        """This is knowledge of our own, and is about to be kept."""
+        """Handle an event of this side's own knowledge before it is stored."""
 
     def describe(self) -> dict[str, Any]:
         """Return the shadow's knowledge and the status of its thread."""

@@ -28,7 +28,7 @@ from fieldtwin.gateway.runtime.tags import TagTable
 from fieldtwin.twin.site.system import System
 
 TICK_NS = 20 * NS_PER_MS
-"""How often an exchange that is under way is looked after."""
+"""Period in seconds of the checks of an exchange in progress."""
 IDLE_S = 60.0
 KEPT_RESPONSES = 1000
 DEFAULT_SCRIPT = (1, 2, 0, -1)
@@ -52,7 +52,7 @@ def script(periods: tuple[int, ...], duration_s: float) -> list[Scripted]:
 
 
 def parse_periods(text: str) -> tuple[int, ...]:
-    """``1,2,0,-1`` or ``none``. Raises `UsageError`."""
+    """Parse ``1,2,0,-1`` or ``none``. Raises `UsageError`."""
     if text.strip().lower() in ("", "none"):
         return ()
     try:
@@ -67,7 +67,7 @@ def parse_periods(text: str) -> tuple[int, ...]:
 
 
 class Shore:
-    """The far end of one transmitter of `system`, reached at `endpoint`."""
+    """The remote end of one transmitter of `system`, reached at `endpoint`."""
 
     def __init__(
         self, system: System, device: str, endpoint: Endpoint, clock: Clock, connector: Connector | None = None
@@ -95,14 +95,14 @@ class Shore:
         """Called with each period when it is commanded."""
 
     async def run(self, commands: list[Scripted]) -> None:
-        """Serve the far end until cancelled, sending each command at its time."""
+        """Serve the remote end until cancelled, sending each command at its time."""
         async with Nursery() as nursery:
             nursery.start(self._bus.run(), "far transmitter")
             nursery.start(self._cycle(deque(commands)), "far end")
             await nursery.wait()
 
     async def halt(self) -> None:
-        """Send and ask nothing more."""
+        """Stop sending and polling."""
         self._halted = True
         await self._bus.halt(0.5)
 
@@ -112,7 +112,7 @@ class Shore:
             now_ns = self._clock.monotonic_ns()
             while commands and now_ns - start_ns >= round(
                 commands[0].at_s * NS_PER_S
-            ):  # else less than 1 ns may be left
+            ):  # without rounding, less than 1 ns could remain
                 self.send(commands.popleft().period_s)
             for response in self._inbox.drain():
                 self.responses_received += 1

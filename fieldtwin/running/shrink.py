@@ -1,4 +1,4 @@
-"""Which of many faults does it take to make a run fail: delta debugging (Zeller and Hildebrandt, 2002) over a schedule."""
+"""Find the faults that make a run fail: delta debugging (Zeller and Hildebrandt, 2002) over a schedule."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ _NUMBER = re.compile(r"\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 def smallest(
     items: Sequence[T], fails: Callable[[Sequence[T]], bool], most_runs: int = MOST_RUNS
 ) -> tuple[list[T], bool]:
-    """Return a part of `items` that still `fails`, and whether no single item can be left out of it.
+    """Return a part of `items` that still `fails`, and whether all its items are necessary.
 
-    The first question is about no items at all: a failure that needs none of them must not be blamed on one. After `most_runs`
-    questions the smallest part that was found by then is returned. `items` as a whole must fail.
+    The first test is without any item: a failure that needs none of them must not be blamed on one. After `most_runs`
+    tests the smallest part found so far is returned. `items` as a whole must fail.
     """
     left, parts, runs = list(items), 2, 0
     if left and most_runs > 0:
@@ -52,8 +52,9 @@ def smallest(
 def shrunk_run(
     items: Sequence[T], run: Callable[[Sequence[T]], RESULT], fails: Callable[[RESULT], bool]
 ) -> tuple[list[T], bool, RESULT, RESULT]:
-    """Return the `smallest` part of `items` whose `run` still `fails`, whether no single item can be left out of it, and the
-    results of the runs with that part and without any item. Each part is run once.
+    """Return the `smallest` part of `items` whose `run` still `fails`, whether all its items are necessary, and two results.
+
+    They are the results of the run with that part and of the run without any item. Each part is run once.
     """
     seen: dict[str, RESULT] = {}
 
@@ -68,9 +69,9 @@ def shrunk_run(
 
 
 def kind_of(error: str) -> str:
-    """Return an error without its numbers: the same failure at another time, or with another value, has the same kind.
+    """Return an error without its numbers, so that the same failure at a different time or value has the same kind.
 
-    A rule that was broken is the same whatever was known of its tags then.
+    A broken rule is the same, whatever the values of its tags were.
     """
     return _NUMBER.sub("#", error.partition(BROKEN_AT)[0])
 
@@ -90,7 +91,7 @@ def as_scenario(
     acts: Sequence[tuple[float, Mapping[str, Any]]] = (),
     keys: Mapping[str, Any] | None = None,
 ) -> str:
-    """Return a scenario file: it puts the faults in, lets `duration_s` pass, and is judged by `keys`, as a run is by default.
+    """Return a scenario file that injects the faults, lets `duration_s` pass, and is checked by `keys`, by default as a run.
 
     `acts`: further steps, each with its time (s since the start).
     """

@@ -17,7 +17,7 @@ MAX_TRANSITIONS = 10_000
 
 
 def expected_states(periods_s: list[int]) -> list[str]:
-    """The states that a digital model goes through at these commands, from STANDBY; the same state twice is one."""
+    """Return the states that a digital model passes through at these commands, from STANDBY; repeated states count once."""
     model = DigitalModel()
     expected = [model.state.name]
     for period_s in periods_s:
@@ -28,13 +28,13 @@ def expected_states(periods_s: list[int]) -> list[str]:
 
 
 def state_words(layout: ImageLayout, programs: Iterable[str]) -> dict[str, dict[int, str]]:
-    """Of each program that shows a `state` with names: the name of each of its codes."""
+    """Return, for each program with a `state` that has names, the name of each code."""
     tags = {tag.name: tag for region in layout.regions for tag in region.tags}
     return {p: dict(tags[f"{p}.state"].words) for p in programs if f"{p}.state" in tags and tags[f"{p}.state"].words}
 
 
 class StateWatch:
-    """Looks at every program's exported `state` and keeps the transitions, with the time since the first look."""
+    """A watcher of every program's exported `state` that keeps the transitions, with the time since the first check."""
 
     def __init__(self, system: System) -> None:
         self._programs = list(system.plc.programs)
@@ -66,7 +66,7 @@ class StateWatch:
 
     @property
     def relays(self) -> list[str]:
-        """Programs seen that are the paper's state machine: it alone goes where the far end's commands say."""
+        """Return the programs that are the paper's state machine: only it follows the topside controller's commands."""
         return [p for p in self.current if list(self._words.get(p, {}).values()) == NAMES]
 
     def look(self, now_ns: int) -> None:

@@ -1,4 +1,4 @@
-"""How often faults struck, as a field simulator tells it (`fieldtwin.twin.prototype.fault_history`)."""
+"""How often faults took effect, as a field simulator reports it (`fieldtwin.twin.prototype.fault_history`)."""
 
 from __future__ import annotations
 

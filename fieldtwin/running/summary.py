@@ -28,7 +28,7 @@ class Named(Protocol):
 
 
 class Oracle(Protocol):
-    """What compared published values with held ones."""
+    """The comparison of published with held values."""
 
     checked: int
     wrong_count: int
@@ -38,7 +38,7 @@ class Oracle(Protocol):
 
 
 class Invariants(Protocol):
-    """What judged the invariants of the system file."""
+    """The check of the system file's invariants."""
 
     def results(self) -> list[dict[str, Any]]: ...
 
@@ -50,7 +50,7 @@ class Run(Protocol):
 
     @property
     def invariants(self) -> Invariants | None:
-        """What judged the invariants of the system file; None where the run judged none."""
+        """The check of the system file's invariants; None if the run had none."""
         ...
 
     @property
@@ -100,12 +100,12 @@ class Run(Protocol):
 
     @property
     def disturbed(self) -> bool:
-        """Whether faults were put in: then both sides need not count alike."""
+        """Return whether faults were injected: then the counts of both sides may differ."""
         ...
 
     @property
     def calm(self) -> bool:
-        """Whether the last fault was over for so long that all must be well again."""
+        """Return whether the last fault has been over for long enough that the system must have recovered."""
         ...
 
 
@@ -184,7 +184,7 @@ def summarise(run: Run) -> dict[str, Any]:
 
 
 def _devices(gateway: dict[str, Any], field: dict[str, Any]) -> dict[str, Any]:
-    """How each device was, and what stood in for it, where something did."""
+    """Return the state of each device, and the model or recording that replaced it, if any."""
     emulated = field.get("devices", {})
     return {
         name: {"state": "good" if d["online"] else "bad", "error": d["error"]}
@@ -269,8 +269,8 @@ def _others(
 def exchange_checks(exchanges: dict[str, Any]) -> list[str]:
     """Compare the counts of both sides of each bus; return one sentence for each difference.
 
-    A reply that came too late, was damaged, or was under way when the gateway stopped counts on the emulators' side only.
-    A device that the digital thread also uses is not compared.
+    A reply that was late, damaged, or still in transit when the gateway stopped counts on the emulators' side only. A
+    device that the digital thread also uses is not compared.
     """
     failed = []
     for bus, row in exchanges.items():
@@ -338,7 +338,7 @@ def _refusal_checks(refusals: dict[str, Any], expected: Collection[str], *, dist
 def _plc_checks(plc: dict[str, Any]) -> list[str]:
     if not plc:
         return []  # its death is in the run's errors already
-    # A PLC that was stopped still lists the programs that never ran.
+    # A stopped PLC still lists the programs that never ran.
     failed = [
         f"PLC: program {program} has not started: it waits for {start['reason']}"
         for program, start in plc.get("waiting", {}).items()
@@ -374,7 +374,7 @@ def _oracle_checks(run: Run) -> list[str]:
 
 
 def _state_checks(run: Run) -> list[str]:
-    """The states must be those that the commands of the far end ask for, in order, beginning with STANDBY."""
+    """Check that the states are those that the topside controller's commands require, in order, beginning with STANDBY."""
     if run.shore is None:
         return []
     expected = expected_states(run.shore.commands_sent)

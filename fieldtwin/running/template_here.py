@@ -41,12 +41,12 @@ def system_file(
     prototype_file: Path | None = None,
     profiles: Iterable[Path] = (),
 ) -> str:
-    """`name` as it is, unless it is a template: then the system file in it, verified, and in a folder on this computer.
+    """Return `name` unchanged, unless it is a template: then the verified system file in it, in a folder on this computer.
 
-    A zip is unpacked once, into the folder where runs live, under its id. A `plant` has no use for the prototype in it, and in
-    `virtual` time nothing is opened. A file inside of an unpacked template is asked about as the template is, and not verified:
-    its owner may be at work on it. So is a prototype file that is inside of one. Raises `NotAllowed` when `ask` says no,
-    `FileInvalid` when it is not what was packed.
+    A zip is unpacked once, into the folder of the runs, under its ID. A `plant` does not use the prototype in it, and
+    in `virtual` time no endpoint is opened. A file inside an unpacked template needs the same consent as the template,
+    but is not verified: its owner may be editing it. The same applies to a prototype file inside one. Raises
+    `NotAllowed` when `ask` denies, `FileInvalid` when the content differs from what was packed.
     """
     path, profiles = Path(name), tuple(profiles)
     if not is_template(path):
@@ -62,7 +62,7 @@ def system_file(
     here = FolderPackage(folder)
     here.verify()
     from fieldtwin.twin.template.check import (
-        examine,  # where a template is there to examine, what reads it is installed
+        examine,  # a template can only exist where its reader is installed
     )
 
     system = examine(folder, here.manifest, plant=plant, shown=path)
@@ -148,7 +148,7 @@ def _beside(system: System) -> Path | None:
 
 
 def _of_prototype(system: System, file: Path, folders: Iterable[Path]) -> tuple[list[str], tuple[str, ...]]:
-    """Simulations in Python from outside of the templates, and what of this computer the prototype uses."""
+    """Return the Python simulations from outside the templates, and the resources of this computer that the prototype uses."""
     from fieldtwin.twin.prototype.file import load_prototype
     from fieldtwin.twin.template.reach import reach
 

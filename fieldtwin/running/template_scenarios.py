@@ -1,6 +1,6 @@
-"""Scenarios that are a stranger's, or are about a stranger's system: who runs them is asked first, as about a template.
+"""Ask the user before running a foreign scenario, or a scenario of a foreign system, as for a template.
 
-It looks at what a scenario names and no further: reading it whole puts the process image of its system together, and that
+Only the names in the scenario are examined: reading it completely assembles the process image of its system, which
 imports programs.
 """
 

@@ -16,7 +16,7 @@ from fieldtwin.running.children import Child
 
 FIRST_S, LIMIT_S = 0.5, 60.0
 LASTED_S = 60.0
-"""Who lasted so long had no reason to die at once again."""
+"""Run time in seconds after which a death does not delay the restart."""
 LOOK_S = 0.1
 
 
@@ -55,7 +55,7 @@ class ThreadReturn:
             await self._another()
 
     async def _another(self) -> None:
-        """One that works until it ends by itself, if it comes up at all."""
+        """Run a new child until it ends, if it starts at all."""
         self._child = self._start()
         client: ControlClient | None = None
         try:
@@ -71,5 +71,5 @@ class ThreadReturn:
                 await client.aclose()
 
     async def end(self) -> None:
-        """In order, as any child."""
+        """End the current child in order."""
         await self._child.end()

@@ -50,7 +50,7 @@ class QuestionForm(Strict):
 
 
 class RuleForm(Strict):
-    """What to command when something is found."""
+    """The command for a finding."""
 
     when: Finding
     of: str = Field(default="", description="a tag or a program; empty: whatever it is found of")
@@ -114,7 +114,7 @@ def load_planner(source: str, system: System) -> Plans:
 
 
 def questions_of(planner: Planner) -> list[Question]:
-    """What rules ask of their own."""
+    """Return the rules' own queries to a prototype."""
     rules = planner.rules if isinstance(planner, RulePlanner) else ()
     return list(dict.fromkeys(rule.ask for rule in rules if isinstance(rule.ask, Question)))
 
@@ -142,7 +142,7 @@ class PythonPlanner:
                 sys.path.insert(0, folder)
         try:
             self._made: Any = getattr(importlib.import_module(module), kind)()
-        except Exception as e:  # a user's module can raise anything; translated here, once
+        except Exception as e:  # a user's module can raise any exception; it is translated only here
             raise FileInvalid(f"the planner {source!r} cannot be made: {type(e).__name__}: {e}") from e
         if not callable(getattr(self._made, "plan", None)):
             raise FileInvalid("not a planner", expected="a class with plan(data, model)", got=source)

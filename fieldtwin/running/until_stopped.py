@@ -1,4 +1,4 @@
-"""Waiting for the end of what runs in this terminal: a signal, or a failure of what is running."""
+"""Wait for the end of a program in this terminal: a signal, or a failure of one of its tasks."""
 
 from __future__ import annotations
 

@@ -43,10 +43,10 @@ _FRAME, _TAG, _SENT = Kind.FRAME, Kind.TAG, Direction.SENT  # an Enum's members 
 
 
 class VirtualBench(Started):
-    """``async with VirtualBench(system, prototype, loop, run_dir, trace, seed=7) as bench``, inside `loop`.
+    """A bench: ``async with VirtualBench(system, prototype, loop, run_dir, trace, seed=7) as bench``, inside `loop`.
 
-    `commands` is what the far end commands by itself; a scenario does that with `send`. `far_end` False leaves it out.
-    `water`: the ends of transmitters that are in a network's.
+    `commands` are those that the remote client sends by itself; a scenario uses `send` instead. `far_end` False omits
+    the client. `water`: the ends of transmitters that belong to a network's acoustic channel.
     """
 
     def __init__(
@@ -82,11 +82,11 @@ class VirtualBench(Started):
         self._commands = commands or []
         self._far_end = far_end
         self._probe = probes
-        if probes and all(probe.serve for probe in probes):  # nothing else is in memory
+        if probes and all(probe.serve for probe in probes):  # memory contains no other endpoints
             self.can = self.can | {Can.PROBE}
         self._probes: Probes | None = None
         self.asked_ns: dict[str, deque[int]] = {bus: deque(maxlen=ASKED_KEPT) for bus in system.buses}
-        """By bus: when the gateway last sent something, on the loop's clock, the latest last."""
+        """By bus: the times when the gateway sent frames, on the loop's clock, the latest last."""
         self._updates: dict[str, int] = {}
         self._words = {
             f"{p}.state": words for p, words in state_words(self.run.twin.ecs.layout, system.plc.programs).items()
@@ -124,19 +124,20 @@ class VirtualBench(Started):
             nursery.start(self._probes.run(), "probes")
 
     async def _all_served(self) -> None:
-        """Until the gateway serves what probes ask for, at most a second."""
+        """Wait until the gateway serves the endpoints of the probes, at most a second."""
         until_ns = self.loop.now_ns + NS_PER_S
         while any(server.front.bound is None for server in self.run.gateway.servers) and self.loop.now_ns < until_ns:
             await self.run.clock.sleep_until_ns(self.loop.now_ns + NS_PER_MS)
 
     def _served(self, name: str) -> Endpoint:
-        """Where the gateway serves what the system file calls `name`."""
+        """Return the endpoint at which the gateway serves `name` of the system file."""
         for server in self.run.gateway.servers:
             if server.config.name == name and server.front.bound is not None:
                 return server.front.bound
         raise Unreachable(f"the gateway does not serve {name!r}")
 
-    # -- what happens ---------------------------------------------------------------------------------------------------
+    # -- events
+    # ---------------------------------------------------------------------------------------------------------
 
     @property
     def now_ns(self) -> int:
@@ -179,7 +180,7 @@ class VirtualBench(Started):
         return self.now_ns / NS_PER_S
 
     async def sleep_until_s(self, t_s: float) -> None:
-        """Raises what a part of the system failed with meanwhile."""
+        """Sleep until `t_s`. Raises the error of a part of the system that has failed."""
         await self.run.clock.sleep_until_ns(self.run.started_ns + round(t_s * NS_PER_S))
         failure = self.run.failure()
         if failure is not None:
@@ -195,7 +196,7 @@ class VirtualBench(Started):
         outputs = self.run.plc.outputs.last()
         if name in outputs and name not in self.run.gateway.tags:
             value = self._named(name, outputs[name])
-            runs = self.run.plc.stop_reason is StopReason.NONE  # else nothing may be made of its variables any more
+            runs = self.run.plc.stop_reason is StopReason.NONE  # a stopped PLC's variables must not be interpreted
             return None if value is None else variable(value, runs=runs)
         if name not in self.run.gateway.tags:
             raise UsageError(f"no tag or variable {name!r}", expected="DEVICE.TAG or PROGRAM.VARIABLE")
@@ -290,7 +291,7 @@ class _FrameTap:
         self._note(endpoint, direction, t_ns, data)
 
     def _note(self, endpoint: Endpoint, direction: Direction, t_ns: int, data: dict[str, Any]) -> None:
-        known = self._known.get(id(endpoint))  # writing an endpoint out takes longer than all else here
+        known = self._known.get(id(endpoint))  # formatting an endpoint takes longer than everything else here
         if known is None or known[0] is not endpoint:
             known = self._known[id(endpoint)] = endpoint, self._bus.get(str(endpoint), str(endpoint))
         bus, bench = known[1], self._bench

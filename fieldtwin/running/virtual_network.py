@@ -24,13 +24,14 @@ from fieldtwin.twin.network.ship import Ship
 from fieldtwin.twin.network.water_faults import WaterFaults
 
 SEEDS_APART = 1_000_003
-"""Between the systems of a run: none plays another one's chances."""
+"""Distance between the seeds of a run's systems, so that none repeats the random numbers of another."""
 
 
 class VirtualNetwork(Started):
-    """``async with VirtualNetwork(network, loop, folder, trace, seed=7) as it``, inside `loop`; `it.bench` is a scenario's.
+    """A network: ``async with VirtualNetwork(network, loop, folder, trace, seed=7) as it``, inside `loop`.
 
-    `folder` takes each system's audit log. `commands` is what the ship commands by itself; a scenario does that with `send`.
+    `it.bench` is a scenario's bench. `folder` takes each system's audit log. `commands` are those that the topside
+    modem sends by itself; a scenario uses `send` instead.
     """
 
     def __init__(
@@ -78,11 +79,11 @@ class VirtualNetwork(Started):
             await self._board()
 
     def _later(self, name: str) -> Callable[[], int]:
-        """By how much a system began later than the first."""
+        """Return how much later than the first a system began."""
         return lambda: self.systems[name].run.started_ns - next(iter(self.systems.values())).run.started_ns
 
     async def _board(self) -> None:
-        """The ship, and who commands from it."""
+        """Open the topside modem and its controller."""
         clock, net = VirtualClock(self._loop), MemoryNet(self._loop)
         ship = Ship(self.network, self.medium, clock)
         endpoint = await ship.open(net)

@@ -90,7 +90,7 @@ class VirtualNetworkRun(DrivenRun):
             for name, run in self.runs.items():
                 run.attach(whole.systems[name])
             self._judged = True
-            for fault in self.faults:  # each knows its time
+            for fault in self.faults:  # each has its own start time
                 await whole.bench.inject(fault)
             async with Nursery() as nursery:
                 for name, run in self.runs.items():

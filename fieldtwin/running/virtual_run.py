@@ -37,14 +37,14 @@ from fieldtwin.twin.prototype.field import FieldSide
 from fieldtwin.twin.prototype.field_process import FieldConfig, resolve
 
 SETTLE_S = 10.0
-"""How long a command that is still under way may take after the run's time is over."""
+"""Time in seconds for a command in progress after the end of the run."""
 LAST_REPLIES_S = 0.5
 CALM_S = 60.0
-"""How long after the last fault all must be well again."""
+"""Time in seconds after the last fault in which the system must recover."""
 CAN_WIRE_NS = 10 * NS_PER_MS
 """The time that a frame may need on a CAN bus: several attempts, after other frames."""
 STALE_CHECK_NS = 100 * NS_PER_MS
-"""How often, at most, the oracle looks for values that are still good although they are older than they may be."""
+"""Minimum time between two checks for values that are still good although they exceed their maximum age."""
 _GOOD = Quality.GOOD  # an Enum's members are slow to look up
 
 
@@ -104,9 +104,9 @@ class VirtualRun(DrivenRun):
         self.states = StateWatch(self.system)
         self.oracle = AgeOracle()
         self.messages = MessageOracle()
-        """Compares the commands that reached the gateway through a mailbox with those that the far end sent."""
+        """Compares the commands that reached the gateway through a mailbox with those that the remote client sent."""
         self.invariants: InvariantWatch | None = None
-        """What this run judges; a scenario judges the invariants itself."""
+        """The invariants that this run checks; a scenario checks the invariants itself."""
         self._stated = InvariantWatch(self.system)
         self.gateway_status: dict[str, Any] | None = None
         self.plc_status: dict[str, Any] | None = None
@@ -134,7 +134,7 @@ class VirtualRun(DrivenRun):
 
     @property
     def calm(self) -> bool:
-        """Whether every fault was over for `CALM_S` at the end."""
+        """Return whether every fault had been over for `CALM_S` at the end."""
         ends = (fault.get("until") for fault in self.faults)
         return all(end is not None and seconds(end) <= self.elapsed_s - CALM_S for end in ends)
 
@@ -156,7 +156,7 @@ class VirtualRun(DrivenRun):
             far_end=bool(commands),
         ) as bench:
             self.attach(bench)
-            for fault in self.faults:  # each knows its time
+            for fault in self.faults:  # each has its own start time
                 await bench.inject(fault)
             async with Nursery() as nursery:
                 self.watch_invariants(bench, nursery)
@@ -173,7 +173,7 @@ class VirtualRun(DrivenRun):
             nursery.start(self._stated.run(bench, TICK_S), "invariants")
 
     def attach(self, bench: VirtualBench) -> None:
-        """From now on what happens on `bench` is judged."""
+        """Begin to check the events on `bench`."""
         self._judged = True
         self.mapping, self.far, self.shore = bench.run.mapping, bench.run.field.far, bench.shore
         self._emulated = frozenset(bench.run.field.devices)
@@ -195,9 +195,7 @@ class VirtualRun(DrivenRun):
     async def finish(self, bench: VirtualBench) -> None:
         """Stop the gateway in order and take the last figures; then `summary`."""
         self.outputs_confirmed_safe = await bench.run.stop_gateway()
-        outputs = describe(bench.run.gateway, bench.loop.now_ns)[
-            "outputs"
-        ]  # a node that was stopped holds nothing for sure
+        outputs = describe(bench.run.gateway, bench.loop.now_ns)["outputs"]  # a stopped node has no certain values
         await bench.sleep_until_s(bench.now_s() + LAST_REPLIES_S)
         self._judge(bench.run.field)
         if self.shore is not None:
@@ -205,7 +203,7 @@ class VirtualRun(DrivenRun):
         self._take_status(bench, outputs)
 
     async def _settle(self, bench: VirtualBench) -> None:
-        """A command that is still under way may arrive."""
+        """Wait for a command in progress."""
         deadline_s = bench.now_s() + SETTLE_S
         while self.shore is not None and bench.now_s() < deadline_s:
             expected = expected_states(self.shore.commands_sent)
@@ -213,7 +211,8 @@ class VirtualRun(DrivenRun):
                 return
             await bench.sleep_until_s(bench.now_s() + 0.1)
 
-    # -- what is judged -------------------------------------------------------------------------------------------------
+    # -- checks
+    # ---------------------------------------------------------------------------------------------------------
 
     def _watched(self, bench: VirtualBench) -> Callable[[str, TagValue], None]:
         told, loop = bench.run.gateway.tags.on_put, bench.loop
@@ -224,7 +223,7 @@ class VirtualRun(DrivenRun):
         }
         check_ages = self._age_check(bench)
         asked_of: dict[str, deque[int] | None] = {}
-        """By tag: when its bus was asked; None for what a node sends unasked."""
+        """By tag: the times of requests on its bus; None for a message that a node sends by itself."""
 
         def put(name: str, value: TagValue) -> None:
             if told is not None:
@@ -250,10 +249,10 @@ class VirtualRun(DrivenRun):
         return put
 
     def _age_check(self, bench: VirtualBench) -> Callable[[], None]:
-        """Return a function that tells the oracle which values the gateway still calls good, whether they are new or not.
+        """Return a function that reports to the check which values the gateway still considers good, whether new or not.
 
-        The device must have held such a value within the value's maximum age, plus the time of one exchange. The function does so
-        at most every `STALE_CHECK_NS`.
+        The device must have held such a value within the value's maximum age, plus the time of one exchange. The
+        function does so at most every `STALE_CHECK_NS`.
         """
         tags, loop = bench.run.gateway.tags, bench.loop
         limits_ns = {
@@ -277,7 +276,7 @@ class VirtualRun(DrivenRun):
         return check
 
     def _exchange_ns(self, bus: str) -> int:
-        """Return how much older than its last refresh a value may be: the device held it before its reply came, in ns."""
+        """Return in ns how much older than its last refresh a value may be, because the device held it before its reply came."""
         config = self.system.buses[bus]
         return CAN_WIRE_NS if config.endpoint.is_can else round(config.timeout_s * NS_PER_S)
 
@@ -305,7 +304,7 @@ class VirtualRun(DrivenRun):
         self.field_status = bench.run.field.status()
 
     def summary(self) -> dict[str, Any]:
-        """As of a run on this computer, with seed and trace; nothing in it depends on how fast it was."""
+        """Return the summary of a run on this computer, with seed and trace; it does not depend on the speed of the run."""
         return {
             **summarise(self),
             "virtual": True,

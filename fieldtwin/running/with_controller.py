@@ -1,6 +1,6 @@
-"""A scenario's simulated field devices, and a control program of the user: both are started for that scenario alone.
+"""Start a scenario's simulated field devices and a user's control program, for that scenario alone.
 
-What `fieldtwin test --with -- CMD` runs. The program finds the devices in its environment, as under `fieldtwin with`. Its
+`fieldtwin test --with -- CMD` uses it. The program finds the devices in its environment, as under `fieldtwin with`. Its
 standard output goes to standard error, because results go to standard output.
 """
 
@@ -34,13 +34,14 @@ STANDARD_ERROR = 2
 
 
 class ControllerEnded(FieldtwinError):
-    """The user's control program ended while it was being judged."""
+    """The user's control program ended during the test."""
 
 
 class WithController(Started):
-    """``async with WithController(system, config, argv, name) as both``. `name` is the run directory's; it is removed at the end.
+    """Both processes: ``async with WithController(system, config, argv, name) as both``.
 
-    Raises `UsageError` for a program that does not exist, before anything starts.
+    `name` is the run directory's; it is removed at the end. Raises `UsageError` for a program that does not exist,
+    before anything starts.
     """
 
     def __init__(self, system: System, config: FieldConfig, argv: Sequence[str], name: str) -> None:
@@ -83,13 +84,13 @@ class WithController(Started):
                 stdin=subprocess.DEVNULL,
                 stdout=STANDARD_ERROR,
                 start_new_session=True,
-                preexec_fn=partial(end_with_parent, os.getpid()),  # it does not outlive a judge that is killed
+                preexec_fn=partial(end_with_parent, os.getpid()),  # it ends with a killed parent
             )
         except OSError as e:
             raise UsageError(f"cannot start {self._argv[0]!r}: {e.strerror or e}") from e
 
     def failure(self) -> FieldtwinError | None:
-        """Why the field side or the program is not there any more, or None while both run."""
+        """Return the reason why the field simulator or the program has ended, or None while both run."""
         assert self._child is not None
         assert self._process is not None
         if (failed := self._child.failure()) is not None:
@@ -119,5 +120,5 @@ class WithController(Started):
 
 
 def _remove(home: Path, kind: type[BaseException] | None, error: BaseException | None, at: object) -> None:
-    if kind is None or not issubclass(kind, ChildFailed):  # else its log is what tells why
+    if kind is None or not issubclass(kind, ChildFailed):  # else its log contains the reason
         shutil.rmtree(home, ignore_errors=True)

@@ -31,9 +31,9 @@ from fieldtwin.twin.site.system import System, load_system
 
 FIELD_LINGER_S = 0.5
 END_WITHIN_S = 5.0
-"""After SIGTERM to us the program has so long to end before it is killed."""
+"""Time in seconds in which the program has to end after SIGTERM to this process, before it is killed."""
 OURS = ("RUN", "PROFILES", "TOKEN", "TRACEBACK", "JSON", "SYSTEM", "CONTROL", "FIELD")
-"""FIELDTWIN_ names that mean something else already: a bus of such a name has the longer variables only."""
+"""FIELDTWIN_ names with another meaning: a bus with such a name has only the longer variables."""
 
 Tell = Callable[[dict[str, str]], None]
 
@@ -179,7 +179,7 @@ async def _run_program(argv: list[str], env: Mapping[str, str]) -> int:
             process.send_signal(number)
 
     def interrupted() -> None:
-        if process is None or not _has_terminal():  # else the terminal told the program, too
+        if process is None or not _has_terminal():  # else the terminal sent it to the program, too
             pass_on(signal.SIGINT)
 
     def to_end() -> None:
@@ -215,7 +215,7 @@ async def _run_program(argv: list[str], env: Mapping[str, str]) -> int:
 
 
 def _has_terminal() -> bool:
-    """Whether Ctrl-C in our terminal reaches the program as well: both are in the terminal's foreground group."""
+    """Return whether Ctrl-C in this terminal reaches the program too: both are in its foreground process group."""
     try:
         return os.isatty(sys.stdin.fileno()) and os.tcgetpgrp(sys.stdin.fileno()) == os.getpgrp()
     except (OSError, ValueError, AttributeError):

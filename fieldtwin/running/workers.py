@@ -1,6 +1,7 @@
-"""Processes of this computer that share out work, and end with it: after Ctrl-C none goes on, and none prints a traceback.
+"""Worker processes that share a task and end with it: after Ctrl-C none continues, and none prints a traceback.
 
-A worker that Ctrl-C finds while it still imports would print one. SIGINT is therefore held back in it until it knows what to do.
+A worker that receives Ctrl-C while it still imports would print one. SIGINT is therefore blocked in it until it can
+handle it.
 """
 
 from __future__ import annotations
@@ -19,7 +20,10 @@ T = TypeVar("T")
 
 
 class Workers:
-    """At most `jobs` processes. Use it as a context manager; when an error or Ctrl-C ends the block, they are ended at once."""
+    """At most `jobs` processes.
+
+    Use it as a context manager; when an error or Ctrl-C ends the block, they are ended at once.
+    """
 
     def __init__(self, jobs: int) -> None:
         self._pool = ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"), initializer=_ends_quietly)
@@ -42,9 +46,9 @@ class Workers:
 def each(
     jobs: int, work: Callable[[A], T], items: Sequence[A], on_result: Callable[[T], None] | None = None
 ) -> list[T]:
-    """Return what `work` makes of each item, in the order of the items; `jobs` processes at a time.
+    """Return the result of `work` for each item, in the order of the items; `jobs` processes at a time.
 
-    `on_result` is called with each result as it is ready. Memory: at most two items a process are under way.
+    `on_result` is called with each result as it is ready. Memory: at most two items per process are in progress.
     """
     heard = on_result or (lambda result: None)
     if jobs <= 1:
@@ -79,7 +83,7 @@ def _ends_quietly() -> None:
 
 @contextmanager
 def _sigint_held_back() -> Iterator[None]:
-    """In this thread, and so in a process that it starts meanwhile. Here it is not lost: it comes behind this block."""
+    """Block SIGINT in this thread and in processes started in the block. Here it is delivered after the block."""
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield
         return

@@ -1,8 +1,8 @@
 """Formulas of a simulation: ``speed + (demand - speed) * dt / 0.8``, ``sine(11.5, 0.4, 600) + noise(0.01)``.
 
-A small part of Python's expressions, read with its parser, made into functions of what is known by name; no code of the file
-is ever executed. Everything is a float; a comparison is 1.0 or 0.0. Times are seconds. What cannot be computed (a division by
-zero, the root of a negative number) is NaN, which is "no value".
+They use a small part of Python's expressions. Python's parser reads them, and they are converted to functions of named
+values; no code of the file is ever executed. Everything is a float; a comparison is 1.0 or 0.0. Times are in seconds. A
+result that cannot be computed (a division by zero, the root of a negative number) is NaN, which means "no value".
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from fieldtwin.gateway.core.nearest import did_you_mean
 
 Values = Mapping[str, float]
 Compute = Callable[[Values], float]
-"""The value of a formula, of what stands under each name."""
+"""Returns the value of a formula for the values of its names."""
 
 TIME, STEP = "t", "dt"
-"""Seconds since the simulation began; seconds since the step before."""
+"""Seconds since the simulation began; seconds since the previous step."""
 LONGEST, DEEPEST = 1000, 50
 
 _ARITHMETIC: dict[type[ast.operator], Callable[[float, float], float]] = {
@@ -67,7 +67,7 @@ PLAIN: dict[str, tuple[int, Callable[..., float]]] = {
     "sqrt": (1, math.sqrt),
     "tan": (1, math.tan),
 }
-"""Functions of their arguments: how many, and which. Angles are radians."""
+"""Functions of their arguments: number of arguments and function. Angles are in radians."""
 
 
 def _ramp(t: float, start: float, end: float, over_s: float) -> float:
@@ -102,16 +102,17 @@ OF_TIME: dict[str, tuple[int, Callable[..., float]]] = {
     "square": (3, _square),
     "triangle": (3, _triangle),
 }
-"""Functions of time: ``ramp(START, END, OVER_S)``, ``sine(MEAN, AMPLITUDE, PERIOD_S)``, ``square(LOW, HIGH, PERIOD_S)``..."""
+"""Functions of time: ``ramp(START, END, OVER_S)``, ``sine(MEAN, AMPLITUDE, PERIOD_S)``, ``square(LOW, HIGH, PERIOD_S)``...
+"""
 
 CONSTANTS = {"pi": math.pi, "nan": math.nan, "true": 1.0, "false": 0.0}
 FUNCTIONS = (*sorted([*PLAIN, *OF_TIME]), "noise")
 
 
 class Formula:
-    """`text`, read once. `names`: what it needs besides time. Raises `UsageError` for what it is not.
+    """A formula, parsed once from `text`. `names`: the names that it uses. Raises `UsageError` for an invalid formula.
 
-    `known` are the names that there are; `noise(SIGMA)` draws from `random`, one draw each time that it is evaluated.
+    `known` are the names that may be used; `noise(SIGMA)` draws from `random`, once for each evaluation.
     """
 
     def __init__(self, text: str, known: Collection[str], random: Random) -> None:
@@ -128,7 +129,7 @@ class Formula:
         self._compute = self._made(tree, 0)
 
     def __call__(self, values: Values) -> float:
-        """Its value now; NaN where there is none."""
+        """Return the present value; NaN if it cannot be computed."""
         try:
             return float(self._compute(values))
         except (ArithmeticError, ValueError):

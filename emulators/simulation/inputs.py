@@ -1,4 +1,4 @@
-"""What a device was written, as a number for a simulation: the raw bytes of a journal by the profile's tag."""
+"""Converts a value written to a device into a number for a simulation, from the raw bytes in the journal and the tag."""
 
 from __future__ import annotations
 
@@ -12,8 +12,10 @@ _FLOATS = {"float32": "<f", "float64": "<d"}
 
 
 def number_of(tag: Tag, raw: bytes) -> float:
-    """The engineering value of `raw`: register bytes in the order of their addresses, a byte a bit, or a CANopen object's bytes
-    (little-endian, CiA 301, 7.1.4). Scale factors in registers of their own are left out. Text has no number.
+    """Return the engineering value of `raw`.
+
+    `raw` holds register bytes in the order of their addresses, one byte per bit, or a CANopen object's bytes
+    (little-endian, CiA 301, 7.1.4). Scale factors in separate registers are not applied. Text has no number.
     """
     return _plain(tag, raw) * tag.scale + tag.offset
 

@@ -1,4 +1,4 @@
-"""A simulation written in Python: a class in a file beside the prototype's, stepped like a formula.
+"""A simulation written in Python: a class in a file next to the prototype file, stepped like a formula.
 
 ::
 
@@ -10,7 +10,7 @@
             self.level += (inputs["inflow"] - 0.1 * self.level) * dt_s
             return {"level": self.level}
 
-It is the user's code and runs with the emulator's rights: what comes with a stranger's prototype is read before it is run.
+It is the user's code and runs with the emulator's rights: read a third party's model before you run it.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ from fieldtwin.gateway.core.errors import FileInvalid
 
 
 class Model(Protocol):
-    """What a class for a simulation has."""
+    """The interface of a simulation class."""
 
     def step(self, t_s: float, dt_s: float, inputs: Mapping[str, float]) -> Mapping[str, float]:
-        """The values at `t_s`, `dt_s` after the last; at the first step `dt_s` is 0."""
+        """Return the values at `t_s`, `dt_s` after the previous step; at the first step `dt_s` is 0."""
         ...
 
 
 class PythonModel:
-    """The class `name` of `path`, made with `start`. Whatever it raises leaves here as `FileInvalid` that says so."""
+    """The class `name` of `path`, created with `start`. Any exception of the class is reported as `FileInvalid`."""
 
     def __init__(self, path: Path, name: str, start: Mapping[str, float]) -> None:
         self.where = f"{path}:{name}"
@@ -47,11 +47,11 @@ class PythonModel:
             )
         try:
             self._model: Model = made(dict(start))
-        except Exception as e:  # theirs: told as such
+        except Exception as e:  # an error in the user's code, reported as such
             raise FileInvalid(f"{name}(start) failed: {type(e).__name__}: {e}", path=str(path)) from e
 
     def step(self, t_s: float, dt_s: float, inputs: Mapping[str, float]) -> dict[str, float]:
-        """One step of theirs. Raises `FileInvalid`."""
+        """Perform one step of the user's class. Raises `FileInvalid`."""
         try:
             values = self._model.step(t_s, dt_s, inputs)
         except Exception as e:

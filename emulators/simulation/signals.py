@@ -1,4 +1,4 @@
-"""What a device plays of a simulation: its tags' values, as if a recording held them."""
+"""Signals of a device that come from a simulation: the values of its tags, as if a recording held them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,10 @@ from fieldtwin.gateway.core.errors import FileInvalid
 
 
 class SimulatedSignals(Signals):
-    """`plays`: signal -> name in the simulation. A signal that is not simulated is not there. `path` is shown in messages."""
+    """`plays`: signal -> name in the simulation.
+
+    Signals that are not simulated do not exist. `path` is used in messages.
+    """
 
     def __init__(self, simulation: Simulation, plays: Mapping[str, str], path: str) -> None:
         self.names = tuple(plays)
@@ -21,7 +24,7 @@ class SimulatedSignals(Signals):
         self._plays = dict(plays)
 
     def __len__(self) -> int:
-        """Nothing is used up: a simulation has no rows."""
+        """Return 0: a simulation has no rows and is never used up."""
         return 0
 
     def position_s(self, now_ns: int) -> float:
@@ -35,7 +38,7 @@ class SimulatedSignals(Signals):
         return self.values(self.start_ns + round(position_s * NS_PER_S))
 
     def begin_with(self, values: Mapping[str, float], now_ns: int) -> bool:
-        """Only formulas can: a model in Python has its state to itself."""
+        """Set values to continue from. Only formulas support it: a Python model keeps its own state."""
         return self._simulation.begin_with({self._plays[s]: value for s, value in values.items() if s in self._plays})
 
     def at(self, now_ns: int, name: str) -> float:

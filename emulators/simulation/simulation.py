@@ -1,7 +1,7 @@
-"""A simulation: named values that change by fixed steps of the emulator's clock, and inputs that devices were written.
+"""A simulation: named values that change in fixed steps of the emulator's clock, and inputs that were written to devices.
 
-A function of time and of what was written when: nothing here waits, steps that fell due are taken when somebody looks, each
-with the inputs that held at its own time. So the same run gives the same values, in virtual time as well.
+A function of time and of the times of writes: nothing here waits. Steps that are due are taken at the next access, each
+with the inputs that were valid at its own time. The same run therefore gives the same values, in virtual time too.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 
 MAX_STEPS = 100_000
-"""Steps taken at once after nobody looked for long. What is older is left out, and counted."""
+"""Most steps taken at one access after a long time without one. Older steps are skipped and counted."""
 
 Step = Callable[[float, float, Mapping[str, float]], Mapping[str, float]]
-"""``step(t_s, dt_s, values)``: the new values, of those that were."""
+"""``step(t_s, dt_s, values)``: returns the new values for the previous ones."""
 
 
 class Simulation:
-    """Values by name from `start_ns` on, a step every `step_ns`; the first is at `start_ns` itself, with dt 0.
+    """Values by name from `start_ns` on, with a step every `step_ns`; the first step is at `start_ns` itself, with dt 0.
 
-    `start`: what the values are before the first step, NaN where only the step knows. `inputs` are the names that `put` may
-    set; they are 0 before. Between two steps values stand still.
+    `start`: the values before the first step, NaN if only the step knows them. `inputs` are the names that `put` may
+    set; they are 0 before. Values are constant between two steps.
     """
 
     def __init__(
@@ -37,7 +37,7 @@ class Simulation:
         self.names = tuple(start)
         self.start_ns = start_ns
         self.skipped = 0
-        """Steps that were left out because nobody had looked for so long."""
+        """Steps that were skipped after a long time without an access."""
         self._step = step
         self._own_state = any(math.isnan(value) for value in start.values())
         self._step_ns = step_ns
@@ -47,20 +47,20 @@ class Simulation:
         self._t_s = 0.0
 
     def put(self, name: str, value: float, now_ns: int) -> None:
-        """An input is `value` from now on: what came before is computed with what it was before."""
+        """Set an input to `value` from now on; earlier steps are computed with its earlier value."""
         if name not in self._inputs:
             raise UsageError(f"no input {name!r}", expected=", ".join(sorted(self._inputs)))
         self._advance(now_ns - 1)
         self._values[name] = value
 
     def begin_with(self, values: Mapping[str, float]) -> bool:
-        """Other values for the next step to begin with; False where the step has its state to itself."""
+        """Set values for the next step to start with. Return False if the step keeps its own state."""
         known = {name: value for name, value in values.items() if name in self.names}
         self._values.update(known)
         return bool(known) and not self._own_state
 
     def values(self, now_ns: int) -> Mapping[str, float]:
-        """All values now. To be read, not kept: it changes with the next step."""
+        """Return all present values. Do not keep the mapping: it changes with the next step."""
         self._advance(now_ns)
         return self._values
 
@@ -81,8 +81,10 @@ class Simulation:
 def by_formulas(
     formulas: Mapping[str, str], start: Mapping[str, float], inputs: Sequence[str], seed: str
 ) -> tuple[Step, dict[str, float]]:
-    """A step that evaluates `formulas` in their order: each sees the new values of those before it, and its own and later
-    ones as they were; and what they are before the first step: `start`, 0 where not said. Raises `UsageError`, with the name.
+    """Return a step that evaluates `formulas`, and the values before the first step (`start`, 0 by default).
+
+    The formulas are evaluated in order: each sees the new values of the earlier ones, and the old values of itself and
+    of later ones. Raises `UsageError` with the name.
     """
     known = (*formulas, *inputs)
     for name in start:
@@ -104,8 +106,10 @@ def by_formulas(
 
 
 def by_model(model: PythonModel, inputs: Sequence[str]) -> tuple[Step, dict[str, float]]:
-    """A step of a Python model, and what it computes, as no value: the names of a step at time 0 of length 0, taken here, with
-    all inputs 0. The step raises `FileInvalid` when other names come: a device that plays one would have no value.
+    """Return a step of a Python model, and NaN as the initial value of each of its names.
+
+    The names are those of a step of length 0 at time 0, taken here with all inputs 0. The step raises `FileInvalid` if
+    it returns different names, because a device that plays one of them would have no value.
     """
     names = tuple(model.step(0.0, 0.0, dict.fromkeys(inputs, 0.0)))
     for name in names:

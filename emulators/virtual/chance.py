@@ -1,7 +1,7 @@
-"""The chance that belongs to nobody: Python's `random`, and numpy's where it is loaded, with a run's seed while the run lasts.
+"""Seeds the shared random generators, Python's `random` and numpy's if it is loaded, for the duration of a run.
 
-The parts of fieldtwin have generators of their own. A program or a model of the user's may take noise from where everybody takes
-it, and has it the same again with the same seed.
+The parts of fieldtwin have their own generators. A user's program or model may take noise from the shared generators,
+and gets the same noise again with the same seed.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from contextlib import contextmanager
 
 @contextmanager
 def seeded(seed: int) -> Iterator[None]:
-    """Until the end; then it goes on as if nothing had been."""
+    """Seed the shared generators until the end of the context; then restore their earlier state."""
     before = random.getstate()
     random.seed(seed)
     numpy = sys.modules.get("numpy")

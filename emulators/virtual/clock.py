@@ -10,16 +10,16 @@ from fieldtwin.emulators.virtual.loop import VirtualLoop
 from fieldtwin.gateway.core.clock import NS_PER_S
 
 EPOCH_UTC_NS = 1_767_225_600 * NS_PER_S
-"""2026-01-01T00:00:00Z: the day on which every virtual run begins, so that its trace names the same moments."""
+"""2026-01-01T00:00:00Z: the start of every virtual run, so that the times in its trace are reproducible."""
 
 
 class VirtualClock:
-    """Monotonic time is the loop's; UTC runs beside it from `EPOCH_UTC_NS`."""
+    """Monotonic time is the loop's; UTC starts at `EPOCH_UTC_NS` and advances with it."""
 
     def __init__(self, loop: VirtualLoop, epoch_utc_ns: int = EPOCH_UTC_NS) -> None:
         self._loop = loop
         self.monotonic_ns: Callable[[], int] = partial(attrgetter("now_ns"), loop)
-        """The loop's time. Asked for at every step of everybody, so without a frame of Python's."""
+        """Return the loop's time. Called on every step of every task, so it avoids a Python call."""
         self._offset_ns = epoch_utc_ns - loop.now_ns
 
     def utc_ns(self) -> int:

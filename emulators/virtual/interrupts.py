@@ -1,8 +1,9 @@
-"""Signals between two callbacks of a virtual loop, and not in the midst of one.
+"""Delivers signals between two callbacks of a virtual loop, and not during one.
 
-What a signal's handler raises comes out of whatever line runs at that moment. Where that is a line that asyncio called to wake a
-task, the task is never woken, and nothing can end it in order any more. So SIGINT and SIGTERM wait until the callback is
-over. A second one does not wait: it may never be. Nor does the first one wait longer than `PATIENCE_S` of computing.
+A signal handler raises its exception in whatever line runs at that moment. If asyncio called that line to wake a task,
+the task is never woken and cannot be ended in order any more. SIGINT and SIGTERM therefore wait until the callback is
+over. A second signal does not wait, because the callback may never end. The first one waits for at most `PATIENCE_S` of
+computing.
 """
 
 from __future__ import annotations
@@ -15,15 +16,15 @@ from typing import Any, Self
 
 HELD_BACK = (signal.SIGINT, signal.SIGTERM)
 PATIENCE_S = 1.0
-"""Processor time that a callback may still take after a signal came. A loop without an end takes more."""
+"""Processor time that a callback may still take after a signal came. An endless loop takes more."""
 
 Handler = Callable[[int, FrameType | None], object]
 
 
 class Interrupts:
-    """While entered, `stop` is called at once for a signal that has a handler of Python's, and the handler by `deliver`.
+    """While entered, `stop` is called immediately for a signal that has a Python handler; `deliver` then calls the handler.
 
-    Outside of the main thread, which is the only one that signals come to, it does nothing.
+    Outside of the main thread, the only one that receives signals, it does nothing.
     """
 
     def __init__(self, stop: Callable[[], None]) -> None:
@@ -50,7 +51,7 @@ class Interrupts:
             signal.setitimer(signal.ITIMER_VIRTUAL, 0)
             signal.signal(signal.SIGVTALRM, self._alarm_before)
         if exc_info[0] is None:
-            self.deliver()  # it came with the last callback
+            self.deliver()  # the signal came with the last callback
 
     def _heard(self, number: int, frame: FrameType | None) -> None:
         if self._waiting is not None:
@@ -65,7 +66,7 @@ class Interrupts:
             self._handlers[self._waiting](self._waiting, frame)
 
     def deliver(self) -> None:
-        """Call the handler of a signal that came, if one did: it raises as a rule."""
+        """Call the handler of a signal that has arrived, if any; usually it raises."""
         number, self._waiting = self._waiting, None
         if number is not None:
             signal.setitimer(signal.ITIMER_VIRTUAL, 0)

@@ -1,8 +1,9 @@
-"""An event loop whose time is a number: nothing waits, and what is due next is due now.
+"""An event loop with simulated time: it does not wait, but advances its time to the next timer.
 
-The unmodified gateway, PLC and emulators run on it. Whatever would leave it (a socket, a thread, a process, a signal) raises
-`Escape` with the culprit's name: a run that touched the world could not be repeated. Callbacks of one instant run in the order
-in which they were asked for, timers by (when, sequence); no set of tasks is ever iterated.
+The unmodified gateway, PLC and emulators run on it. Every operation that would leave it (a socket, a thread, a process,
+a signal) raises `Escape` with the place of the call, because a run that depends on the outside could not be repeated.
+Callbacks of one instant run in the order in which they were scheduled, timers by (when, sequence); no set of tasks is
+ever iterated.
 """
 
 from __future__ import annotations
@@ -28,26 +29,26 @@ T = TypeVar("T")
 Ts = TypeVarTuple("Ts")
 
 START_NS = 1_000 * NS_PER_S
-"""Where monotonic time begins: not at 0, which reads as "never" in many places."""
+"""Start of monotonic time: not 0, which means "never" in many places."""
 STUCK_AFTER = 1_000_000
-"""Callbacks at one instant before the loop says that time stands still."""
+"""Callbacks at one instant before the loop reports that time does not advance."""
 ENDING_INSTANTS = 10_000
-"""What a task may take to end once its loop is closed."""
+"""Instants within which a task must end after its loop is closed."""
 _WAITING_SHOWN = 20
 _COMPACT_AFTER = 1_000
-"""Timers that are set before those that nobody waits for any more are looked for."""
+"""Timers that are set before the loop searches for timers that are no longer needed."""
 
 
 class Escape(Bug):
-    """Something under virtual time reached for the world: a thread, a socket, a process or a wall clock."""
+    """Code under virtual time used a thread, a socket, a process or a wall clock."""
 
 
 class Deadlock(Bug):
-    """Nothing is ready and no timer is set, or callbacks call each other for ever at one instant."""
+    """Nothing is ready and no timer is set, or callbacks call each other without end at one instant."""
 
 
 class _Call(asyncio.Handle):
-    """A handle made in fewer steps (`call_soon`): on a virtual loop they are most of what is made, and it has no debug mode."""
+    """A handle that is created in fewer steps (`call_soon`): a virtual loop creates very many. It has no debug mode."""
 
     __slots__ = ()
     _callback: Callable[..., object]
@@ -55,11 +56,11 @@ class _Call(asyncio.Handle):
     _context: Context
     _cancelled: bool
     _loop: VirtualLoop
-    _repr = _source_traceback = None  # of the debug mode
+    _repr = _source_traceback = None  # used in debug mode
 
 
 class _Timer(asyncio.TimerHandle):
-    """As `_Call`, with a time."""
+    """Like `_Call`, with a time."""
 
     __slots__ = ()
     _when: float
@@ -68,21 +69,21 @@ class _Timer(asyncio.TimerHandle):
     _context: Context
     _cancelled: bool
     _loop: VirtualLoop
-    _repr = _source_traceback = None  # of the debug mode
+    _repr = _source_traceback = None  # used in debug mode
 
     def cancel(self) -> None:
-        """It stays among the loop's timers until its time comes, or until they are looked through."""
+        """Cancel the timer, which stays in the loop's heap until its time comes or the heap is compacted."""
         self._cancelled = True
-        self._callback = _nothing  # what it held is let go
+        self._callback = _nothing  # release the callback's objects
         self._args = ()
 
 
 _new = object.__new__
-"""The constructors of asyncio's handles look for its debug mode; `call_soon` and `call_at_ns` do the rest."""
+"""The constructors of asyncio's handles check its debug mode; `call_soon` and `call_at_ns` do the rest."""
 
 
 def _nothing() -> None:
-    """What is left of a timer that was cancelled."""
+    """Do nothing: the callback of a cancelled timer."""
 
 
 def _way_out(name: str) -> Callable[..., NoReturn]:
@@ -94,12 +95,12 @@ def _way_out(name: str) -> Callable[..., NoReturn]:
 
 
 class VirtualLoop(asyncio.AbstractEventLoop):
-    """`now_ns` is its time. Not thread-safe, and it says so."""
+    """A virtual event loop; `now_ns` is its time. Not thread-safe: a call from a different thread raises `Escape`."""
 
     def __init__(self, start_ns: int = START_NS) -> None:
         self.now_ns = start_ns
         self.callbacks = 0
-        """How many were run."""
+        """Number of callbacks that have run."""
         self._ready: deque[_Call | _Timer] = deque()
         self._timers: list[tuple[int, int, _Timer | asyncio.Future[None]]] = []
         self._sequence = 0
@@ -108,7 +109,7 @@ class VirtualLoop(asyncio.AbstractEventLoop):
         self._running = self._stopping = self._stopped = self._closed = False
         self._handler: Callable[[asyncio.AbstractEventLoop, dict[str, Any]], object] | None = None
         self.unhandled: list[dict[str, Any]] = []
-        """What nobody caught, in order: told when the loop's run ends."""
+        """Unhandled errors in order, reported when the loop's run ends."""
 
     # -- time and callbacks -------------------------------------------------------------------------------------------
 
@@ -140,7 +141,7 @@ class VirtualLoop(asyncio.AbstractEventLoop):
     def call_at_ns(
         self, when_ns: int, callback: Callable[[*Ts], object], *args: *Ts, context: Context | None = None
     ) -> asyncio.TimerHandle:
-        """As `call_at`, to the nanosecond. What is past is due at this instant, behind what is ready."""
+        """Do the same as `call_at`, to the nanosecond. A time in the past is due at this instant, after what is ready."""
         timer = _new(_Timer)
         timer._callback = callback
         timer._args = args
@@ -156,7 +157,7 @@ class VirtualLoop(asyncio.AbstractEventLoop):
         return timer
 
     def sleeper(self, when_ns: int) -> asyncio.Future[None]:
-        """A future that is done at `when_ns`: what a clock's sleep awaits, in fewer steps than by `call_at_ns`."""
+        """Return a future that is done at `when_ns`, in fewer steps than with `call_at_ns`. A clock's sleep awaits it."""
         future: asyncio.Future[None] = asyncio.Future(loop=self)
         self._sequence = sequence = self._sequence + 1
         now_ns = self.now_ns
@@ -166,11 +167,14 @@ class VirtualLoop(asyncio.AbstractEventLoop):
         return future
 
     def alarm(self, delay_s: float) -> asyncio.Future[None]:
-        """As `sleeper`, in seconds from now (`fieldtwin.gateway.core.alarm`). Whoever has it may set it before."""
+        """Do the same as `sleeper`, in seconds from now (`fieldtwin.gateway.core.alarm`).
+
+        The caller may set the future earlier.
+        """
         return self.sleeper(self.now_ns + round(delay_s * NS_PER_S))
 
     def _compact(self) -> None:
-        """Let go of the timers that nobody waits for any more; again when half as many as are left could be over."""
+        """Remove the timers that are no longer needed; do so again when half as many as remain could be over."""
         self._timers = [entry for entry in self._timers if not _is_over(entry[2])]
         heapify(self._timers)
         self._compact_at = self._sequence + max(_COMPACT_AFTER, len(self._timers) // 2)
@@ -188,22 +192,22 @@ class VirtualLoop(asyncio.AbstractEventLoop):
         return asyncio.Task(coro, loop=self, name=str(name) if name else f"task {self._tasks}", **more)
 
     def set_task_factory(self, factory: Any) -> None:
-        """Raises `Bug`: tasks are made in one way."""
+        """Raise `Bug`: a virtual loop has only one way of creating tasks."""
         raise Bug("a task factory on a virtual loop")
 
     def get_task_factory(self) -> None:
         return None
 
     get_debug: Any = bool
-    """False, and said without a frame of Python's: each future that is made asks."""
+    """Returns False without a Python call, because each new future calls it."""
 
     def set_debug(self, enabled: bool) -> None:
-        """Nothing: asyncio's debugging measures on the wall clock."""
+        """Do nothing: asyncio's debug mode measures with the wall clock."""
 
     # -- running ------------------------------------------------------------------------------------------------------
 
     def run_until_complete(self, future: Generator[Any, None, T] | Awaitable[T]) -> T:
-        """Run until `future` is done. Raises `Deadlock` when it never will be."""
+        """Run until `future` is done. Raises `Deadlock` if it never will be."""
         main: asyncio.Future[T] = asyncio.ensure_future(future, loop=self)  # type: ignore[arg-type]  # a generator too
         main.add_done_callback(self._on_done)
         try:
@@ -218,7 +222,7 @@ class VirtualLoop(asyncio.AbstractEventLoop):
         self.stop()
 
     def run_forever(self) -> None:
-        """Run until `stop`. Raises `Deadlock` when nothing is left that could happen."""
+        """Run until `stop`. Raises `Deadlock` if nothing can happen any more."""
         if self._running or events._get_running_loop() is not None:
             raise Bug("a virtual loop inside another loop")
         self._running = True
@@ -235,7 +239,7 @@ class VirtualLoop(asyncio.AbstractEventLoop):
             events._set_running_loop(None)
 
     def _run_instant(self) -> None:
-        """All that is ready, and what that makes ready, then on to the next timer's instant."""
+        """Run all ready callbacks and those that they schedule, then advance to the next timer's instant."""
         ready, pop, run = self._ready, self._ready.popleft, 0
         while ready and not self._stopping:
             handle = pop()
@@ -245,7 +249,7 @@ class VirtualLoop(asyncio.AbstractEventLoop):
                 handle._context.run(handle._callback, *handle._args)
             except (SystemExit, KeyboardInterrupt):
                 raise
-            except BaseException as e:  # as asyncio does: nobody else is there to catch it
+            except BaseException as e:  # as in asyncio, because no caller can catch it
                 self.call_exception_handler({"message": f"in {handle}", "exception": e, "handle": handle})
             run += 1
             if run == STUCK_AFTER:
@@ -281,7 +285,7 @@ class VirtualLoop(asyncio.AbstractEventLoop):
         self._stopping = self._stopped = True
 
     def _pause(self) -> None:
-        """Between this callback and the next, look who wants something."""
+        """Stop after this callback, to deliver a signal."""
         self._stopping = True
 
     def is_running(self) -> bool:
@@ -291,7 +295,7 @@ class VirtualLoop(asyncio.AbstractEventLoop):
         return self._closed
 
     def close(self) -> None:
-        """End the tasks that an error or Ctrl-C left, and drop what was scheduled."""
+        """End the tasks that an error or Ctrl-C left, and drop all scheduled callbacks."""
         if self._running:
             raise Bug("a running loop cannot be closed")
         self._end_tasks()
@@ -300,7 +304,7 @@ class VirtualLoop(asyncio.AbstractEventLoop):
         self._timers.clear()
 
     def _end_tasks(self) -> None:
-        """As `asyncio.run` does. What is said meanwhile, and a task that will not end, are nobody's business any more."""
+        """End the remaining tasks, as `asyncio.run` does. Their errors, and a task that does not end, are ignored."""
         tasks = sorted(asyncio.all_tasks(self), key=lambda task: task.get_name())
         if not tasks or events._get_running_loop() is not None:
             return
@@ -314,19 +318,21 @@ class VirtualLoop(asyncio.AbstractEventLoop):
                     if all(task.done() for task in tasks):
                         break
                     self._stopping = False
-                    with suppress(KeyboardInterrupt, SystemExit):  # what ended the run ends each task that it passes
+                    with suppress(
+                        KeyboardInterrupt, SystemExit
+                    ):  # what ended the run also ends each task that it reaches
                         self._run_instant()
         finally:
             self._stopping = self._stopped = self._running = False
             events._set_running_loop(None)
 
     async def shutdown_asyncgens(self) -> None:
-        """None are tracked."""
+        """Do nothing: asynchronous generators are not tracked."""
 
     async def shutdown_default_executor(self, timeout: float | None = None) -> None:
-        """There is none."""
+        """Do nothing: the loop has no executor."""
 
-    # -- what nobody caught -------------------------------------------------------------------------------------------
+    # -- unhandled errors ---------------------------------------------------------------------------------------------
 
     def get_exception_handler(self) -> Callable[[asyncio.AbstractEventLoop, dict[str, Any]], object] | None:
         return self._handler
@@ -383,12 +389,12 @@ class VirtualLoop(asyncio.AbstractEventLoop):
 
 
 def _is_over(due: _Timer | asyncio.Future[None]) -> bool:
-    """Whether nobody waits for it any more."""
+    """Return whether the timer is no longer needed."""
     return due._cancelled if isinstance(due, _Timer) else due.done()
 
 
 def culprit() -> str:
-    """Who called: the innermost frame that is neither this package's nor the standard library's, and the task it runs in."""
+    """Return the caller: the innermost frame outside of this package and the standard library, and its task."""
     frame: FrameType | None = sys._getframe(1)
     while frame is not None and _is_plumbing(frame):
         frame = frame.f_back
@@ -411,7 +417,7 @@ def _is_plumbing(frame: FrameType) -> bool:
 
 
 def escape(what: str) -> Escape:
-    """The error that names who reached for `what`."""
+    """Return the error for a use of `what`, with the place of the call."""
     return Escape(
         f"{what} under virtual time", where=culprit(), hint="time and wires come from the clock and the connector"
     )

@@ -1,6 +1,7 @@
-"""Ports and connector in memory: where a field side listens, and how a gateway reaches it, on one virtual loop.
+"""Ports and connector in memory: where simulated field devices listen, and how a gateway connects to them, on one
+virtual loop.
 
-An endpoint is as on the real thing, ports of 0 become numbers in order; only nothing is opened.
+Endpoints are the same as with real ports, and port 0 becomes consecutive numbers, but nothing is opened.
 """
 
 from __future__ import annotations
@@ -24,19 +25,19 @@ FIRST_PORT = 50_000
 
 
 class MemoryNet:
-    """`fieldtwin.emulators.endpoints.ports.Ports` for the field side and `Connector` for the gateway."""
+    """`fieldtwin.emulators.endpoints.ports.Ports` for the simulated field devices and `Connector` for the gateway."""
 
     def __init__(self, loop: VirtualLoop) -> None:
         self.loop = loop
         self.wires: list[MemoryWire] = []
-        """All that are open, in the order of their opening."""
+        """All open wires, in the order of their opening."""
         self._listeners: dict[str, _Listener | MemoryDatagrams] = {}
         self._serial: dict[str, _SerialPort] = {}
         self._buses: dict[str, MemoryBus] = {}
         self._refused: set[str] = set()
         self._next_port = FIRST_PORT
 
-    # -- the field's side ---------------------------------------------------------------------------------------------
+    # -- field devices ------------------------------------------------------------------------------------------------
 
     async def serial(self, link: Path, plant: Endpoint, pace: SerialSettings | None) -> tuple[ByteConnection, Endpoint]:
         named = Endpoint("pty", path=str(link))
@@ -74,10 +75,10 @@ class MemoryNet:
         self._next_port += 1
         return self._next_port - 1
 
-    # -- the gateway's side -------------------------------------------------------------------------------------------
+    # -- gateway ------------------------------------------------------------------------------------------------------
 
     async def open_bytes(self, endpoint: Endpoint) -> ByteConnection:
-        """As `OsConnector`: who is not there, or refuses, is `Unreachable`."""
+        """Do the same as `OsConnector`; an endpoint that does not exist or refuses raises `Unreachable`."""
         key = _key(endpoint)
         if endpoint.is_serial:
             port = self._serial.get(endpoint.path)
@@ -107,8 +108,10 @@ class MemoryNet:
         admits: Callable[[str], bool],
         idle_s: float,
     ) -> _Listener:
-        """`fieldtwin.gateway.core.connection.Listen`: what the gateway serves to others, in memory. Everybody is admitted, and
-        may be silent for as long as they like."""
+        """Listen for the gateway's own clients in memory (`fieldtwin.gateway.core.connection.Listen`).
+
+        Every client is admitted, and may be silent for any length of time.
+        """
         bound = self._bound(endpoint)
         listener = _Listener(self, bound, on_client, max_clients)
         self._listeners[_key(bound)] = listener
@@ -117,11 +120,11 @@ class MemoryNet:
     # -- wires --------------------------------------------------------------------------------------------------------
 
     def runner(self, listening: Endpoint) -> BusRunner:
-        """The bus at `listening`."""
+        """Return the bus at `listening`."""
         return self._buses[str(listening)]._runner
 
     def refuse(self, listening: Endpoint, *, refused: bool = True) -> None:
-        """Whether who connects to `listening` is refused from now on."""
+        """Set whether connections to `listening` are refused from now on."""
         (self._refused.add if refused else self._refused.discard)(_key(listening))
 
     def _wire(
@@ -134,14 +137,14 @@ class MemoryNet:
 
 
 def _key(endpoint: Endpoint) -> str:
-    """What an endpoint is found by: a path, or host and port."""
+    """Return the key by which an endpoint is found: a path, or host and port."""
     if endpoint.is_can:
         return str(endpoint)
     return endpoint.path or f"{endpoint.host}:{endpoint.port}"
 
 
 class _SerialPort:
-    """A line that stays: the field's end is the same one, however often the gateway's is opened and closed."""
+    """A permanent line: the field device's end stays the same, however often the gateway's end is opened and closed."""
 
     def __init__(self, net: MemoryNet, plant: Endpoint, pace: SerialSettings | None) -> None:
         self._net = net
@@ -152,7 +155,7 @@ class _SerialPort:
         self.field: MemoryEnd = self._wire.far
 
     def plug_in(self) -> MemoryEnd:
-        """The gateway's end, anew. One program holds a port."""
+        """Open the gateway's end again. Only one program can hold a port."""
         if self._wire.near.lost is None:
             raise EndpointBusy("another program holds the port", where=str(self._plant))
         self._wire.near = MemoryEnd.again(self._wire.near)
@@ -160,7 +163,7 @@ class _SerialPort:
 
 
 class _Listener:
-    """The field's listeners, and the gateway's own (`fieldtwin.gateway.core.connection.Clients`)."""
+    """A listener of field devices, or of the gateway (`fieldtwin.gateway.core.connection.Clients`)."""
 
     def __init__(
         self, net: MemoryNet, bound: Endpoint, on_client: Callable[[Client], Awaitable[None]], max_clients: int
@@ -174,7 +177,7 @@ class _Listener:
         self._nursery = Nursery()
 
     def connected(self, wire: MemoryWire) -> None:
-        """A client; where there is no room, the one that came first goes."""
+        """Accept a client; if there is no room, close the oldest one."""
         self._clients = [client for client in self._clients if client.lost is None]
         self.accepted += 1
         if len(self._clients) >= self.max_clients:
@@ -186,7 +189,7 @@ class _Listener:
 
     @property
     def clients(self) -> tuple[MemoryEnd, ...]:
-        """Who is connected, oldest first."""
+        """The connected clients, oldest first."""
         return tuple(client for client in self._clients if client.lost is None)
 
     async def _serve(self, client: MemoryEnd) -> None:
@@ -198,13 +201,13 @@ class _Listener:
             await client.aclose()
 
     async def aclose(self) -> None:
-        """Nobody is served any more."""
+        """Stop serving clients."""
         self._net._listeners.pop(_key(self.bound), None)
         await self._nursery.__aexit__(None, None, None)
 
 
 class MemoryDatagrams:
-    """`fieldtwin.emulators.endpoints.ports.Datagrams` in memory: what a client writes is one datagram."""
+    """`fieldtwin.emulators.endpoints.ports.Datagrams` in memory: each write of a client is one datagram."""
 
     def __init__(self, net: MemoryNet, bound: Endpoint) -> None:
         self.bound = bound

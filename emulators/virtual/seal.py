@@ -1,8 +1,9 @@
-"""What lies outside a virtual run is sealed off while it runs: clocks, sleep, sockets, threads, processes.
+"""Seals a virtual run from the outside while it runs: clocks, sleep, sockets, threads, processes.
 
-The loop itself refuses what asyncio offers; here is what any code can reach past it. Clocks are attributes of ``time`` and
-``datetime``, which are replaced, also where a module has taken them by name (`taken_clocks`); the rest are audit events of the
-interpreter (PEP 578), which cannot be evaded. Only the sealed thread is watched.
+The loop itself refuses asyncio's operations; this module covers what code can reach without the loop. Clocks are
+attributes of ``time`` and ``datetime``, which are replaced, also in modules that imported them by name
+(`taken_clocks`). The rest is detected by audit events of the interpreter (PEP 578), which cannot be evaded. Only the
+sealed thread is checked.
 """
 
 from __future__ import annotations
@@ -23,9 +24,9 @@ _CLOCKS = (
     *("process_time", "process_time_ns", "thread_time", "thread_time_ns", "clock_gettime", "clock_gettime_ns"),
 )
 _NOW_BY_DEFAULT = {"localtime": 1, "gmtime": 1, "ctime": 1, "asctime": 1, "strftime": 2}
-"""They are told a time or take that of now: with how many arguments they are told."""
+"""Functions that take a time or use the present one: the number of arguments with which the time is given."""
 _LOGGING = "logging"
-"""A log record is stamped with the wall clock; nothing of a run depends on it."""
+"""A log record is stamped with the wall clock; nothing in a run depends on it."""
 _EVENTS = {
     "socket.__new__": "a socket",
     "socket.connect": "a connection",
@@ -38,10 +39,10 @@ _EVENTS = {
     "os.system": "a process",
 }
 _sealed: set[int] = set()
-"""Identities of the threads in which a virtual run is under way."""
+"""Identities of the threads in which a virtual run is in progress."""
 _hooked = False
 _guards: list[tuple[Any, str, Any, Any]] = []
-"""As `_made` tells: made once."""
+"""As returned by `_made`; created once."""
 
 
 def _audit(event: str, args: tuple[Any, ...]) -> None:
@@ -66,7 +67,7 @@ def _refuse(name: str) -> None:
 
 
 def _made() -> list[tuple[Any, str, Any, Any]]:
-    """What is replaced: the module, the name in it, what it is and what stands in for it."""
+    """Return the replaced attributes: the module, the name in it, the original and its replacement."""
     clocks = [(name, 1 << 30) for name in _CLOCKS] + list(_NOW_BY_DEFAULT.items())
     made = [(time, name, getattr(time, name), told_by) for name, told_by in clocks if hasattr(time, name)]
     return [(module, name, real, _guarded(real, told_by)) for module, name, real, told_by in made] + [
@@ -85,9 +86,9 @@ def _unstartable(real: Callable[[threading.Thread], None]) -> Callable[[threadin
 
 @contextmanager
 def sealed() -> Iterator[None]:
-    """In this thread, until the end: any escape raises `Escape`. May not be nested."""
+    """Seal this thread until the end of the context: any escape raises `Escape`. May not be nested."""
     global _hooked
-    if not _hooked:  # an audit hook cannot be taken away: it stays, and looks at a set
+    if not _hooked:  # an audit hook cannot be removed: it stays and checks a set
         sys.addaudithook(_audit)
         _hooked = True
     if not _guards:

@@ -1,7 +1,8 @@
-"""Clocks that a module has taken by name: ``from time import monotonic``, ``from datetime import datetime``.
+"""Clocks that a module has imported by name: ``from time import monotonic``, ``from datetime import datetime``.
 
-What `fieldtwin.emulators.virtual.seal` puts into ``time`` does not reach these. They are found in the globals of loaded modules
-that are neither Python's own nor installed beside it: the user's programs and models. A module is looked through once.
+The replacements that `fieldtwin.emulators.virtual.seal` puts into ``time`` do not reach these names. They are found in
+the globals of loaded modules that are neither part of Python nor installed packages: the user's programs and models.
+Each module is searched once.
 """
 
 from __future__ import annotations
@@ -12,20 +13,20 @@ from contextlib import contextmanager
 from typing import Any
 
 Guards = Mapping[int, tuple[Any, Any]]
-"""By the identity of what is guarded: that, and what stands in for it."""
+"""By the identity of a guarded object: the object and its replacement."""
 
 _INSTALLED = ("site-packages", "dist-packages")
 _newest: list[tuple[int, str]] = [(0, "")]
-"""How many modules there were at the last look, and the one that was loaded last."""
+"""The number of modules at the last search, and the module that was loaded last."""
 _seen: dict[str, int] = {}
-"""Modules that were looked through, with the identity of their globals: one that is loaded again is another one."""
+"""Modules that were searched, with the identity of their globals, because a reloaded module must be searched again."""
 _taken: dict[str, tuple[str, ...]] = {}
-"""Of those that took a clock: by which names."""
+"""The modules that imported a clock: the names in them."""
 
 
 @contextmanager
 def replaced(guards: Guards) -> Iterator[None]:
-    """Until the end, every name that stands for something guarded stands for its guard."""
+    """Replace every name that refers to a guarded object by its guard, until the end of the context."""
     _look_through(guards)
     put: list[tuple[dict[str, Any], str]] = []
     for module_name, names in _taken.items():
@@ -41,12 +42,12 @@ def replaced(guards: Guards) -> Iterator[None]:
         real_of = {id(guard): real for real, guard in guards.values()}
         for scope, name in put:
             real = real_of.get(id(scope.get(name)))
-            if real is not None:  # else the module has put something else there meanwhile
+            if real is not None:  # otherwise the module has changed the name meanwhile
                 scope[name] = real
 
 
 def _look_through(guards: Guards) -> None:
-    """A run is sealed many times a second: nothing is looked at while no module came."""
+    """Search new modules. Runs are sealed many times per second, so nothing is done while no module was loaded."""
     newest = (len(sys.modules), next(reversed(sys.modules)))
     if newest == _newest[0]:
         return
@@ -74,9 +75,10 @@ def _is_library(name: str, scope: Mapping[str, Any]) -> bool:
 
 
 def guarded_date(real: type, refuse: Callable[[str], None]) -> type:
-    """A stand-in for ``datetime.datetime`` or ``datetime.date``: the same, but that it asks before it says what time it is.
+    """Return a replacement for ``datetime.datetime`` or ``datetime.date`` that calls `refuse` before it reads the clock.
 
-    `refuse` is called with the name of what was asked, and raises or lets it pass. Objects that it makes are of the real type.
+    `refuse` is called with the name of the method, and raises or permits the call. Objects that it creates have the
+    real type.
     """
 
     class Kind(type):

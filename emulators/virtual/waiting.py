@@ -1,4 +1,7 @@
-"""Where a task waits, and for what, in words: for the error that a deadlock is. Nothing is known here of who the tasks are."""
+"""Describes where a task waits, and for what, for the message of a deadlock.
+
+It knows nothing about the tasks themselves.
+"""
 
 from __future__ import annotations
 
@@ -10,13 +13,15 @@ from types import FrameType
 from typing import Any
 
 _NAMED = 4
-"""How many of the tasks that one waits for are named."""
+"""How many of the tasks that a task waits for are named."""
 _STATE = re.compile(r"\[(?:locked|unlocked|set|unset)[^\]]*\]|\bmaxsize=.*(?=>)")
-"""What the repr of a lock, an event, a condition or a queue tells of it besides where it is in memory."""
+"""The part of the repr of a lock, an event, a condition or a queue that shows its state."""
 
 
 def waits_at(task: asyncio.Task[Any], is_plumbing: Callable[[FrameType], bool]) -> str:
-    """As ``Reader.turn (reader.py:40) for Queue.get maxsize=8``: the innermost line that is no plumbing, and what it awaits."""
+    """Return text such as ``Reader.turn (reader.py:40) for Queue.get maxsize=8``: the innermost user line and what it
+    awaits.
+    """
     chain = _chain(task.get_coro())
     if not chain:
         return repr(task.get_coro())
@@ -27,7 +32,7 @@ def waits_at(task: asyncio.Task[Any], is_plumbing: Callable[[FrameType], bool]) 
 
 
 def _chain(outermost: Any) -> list[Any]:
-    """Coroutines that await each other, the innermost last."""
+    """Return the coroutines that await each other, the innermost last."""
     chain = []
     inner = outermost
     while getattr(inner, "cr_frame", None) is not None:
@@ -37,7 +42,7 @@ def _chain(outermost: Any) -> list[Any]:
 
 
 def _call(coroutine: Any) -> str:
-    """What of the standard library is waited in, with the state of its object."""
+    """Return the standard-library call that waits, with the state of its object."""
     owner = coroutine.cr_frame.f_locals.get("self")
     state = _STATE.search(repr(owner)) if owner is not None else None
     return f"{coroutine.__qualname__} {state[0]}" if state is not None else str(coroutine.__qualname__)

@@ -1,6 +1,6 @@
-"""Wires in memory: two ends of a byte stream, with the time that bytes take on them.
+"""Connections in memory: two ends of a byte stream, with the time that bytes take between them.
 
-What is written on one end arrives at the other in order and whole, at once or after the line's character time.
+Bytes written at one end arrive at the other in order and complete, immediately or after the line's character time.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ SENT = Direction.SENT
 
 
 class MemoryWire:
-    """A wire with two ends. `settings`: of a serial line, whose baud rate is kept; None: bytes take no time."""
+    """A connection with two ends. `settings`: those of a serial line, whose baud rate applies; None: bytes take no time."""
 
     def __init__(
         self,
@@ -38,8 +38,11 @@ class MemoryWire:
         self._received = SerialPacer(settings) if settings is not None else None
 
     def write(self, direction: Direction, data: bytes) -> None:
-        """`data` is on the wire now, behind what is on it already. What comes as one piece is heard when it is whole; of one
-        that follows another without a pause the first character is heard by itself, or the line would seem to be silent."""
+        """Send `data` after the bytes that are already on the wire.
+
+        Bytes written in one piece are delivered when the piece is complete. If they follow earlier bytes without a
+        pause, the first character is delivered separately; otherwise the line would seem to be silent.
+        """
         if not data:
             return
         receiver, pacer = (self.far, self._sent) if direction is SENT else (self.near, self._received)
@@ -53,7 +56,7 @@ class MemoryWire:
         self.loop.call_at_ns(pacer.send(now_ns, len(data)), receiver.arrived, data)
 
     def ended(self, direction: Direction) -> None:
-        """The writer of `direction` hung up: behind what is on its way, the other side learns of it."""
+        """Close the writer's side of `direction`: after the bytes in transit, the peer is notified."""
         receiver, pacer = (self.far, self._sent) if direction is SENT else (self.near, self._received)
         lost = ConnectionLost("the other side ended the connection", where=str(receiver.endpoint))
         if pacer is None:
@@ -62,7 +65,7 @@ class MemoryWire:
             self.loop.call_at_ns(max(self.loop.now_ns, pacer.busy_until_ns), receiver.feed_lost, lost)
 
     def cut(self, error: FieldtwinError) -> None:
-        """The wire is gone for both."""
+        """Break the connection for both ends."""
         self.near.cut(error)
         self.far.cut(error)
 
@@ -81,11 +84,11 @@ class MemoryEnd(Client):
 
     @classmethod
     def again(cls, old: MemoryEnd) -> MemoryEnd:
-        """A new end in the place of one that was closed, as when a port is opened again."""
+        """Return a new end that replaces a closed one, as when a port is opened again."""
         return cls(old.wire, old.direction, type(old.inbound)(), old.endpoint)
 
     def arrived(self, data: bytes) -> None:
-        """Bytes from the other side; those that come to a closed end are nobody's."""
+        """Receive bytes from the peer; a closed end drops them."""
         if self._lost is None:
             self.feed(data)
 
@@ -108,7 +111,7 @@ class MemoryEnd(Client):
         self.on_room()
 
     async def aclose(self) -> None:
-        """Close. A serial line does not tell the other side."""
+        """Close the end. On a serial line the peer is not notified."""
         if self.lost is None and not self.wire.serial:
             self.wire.ended(self.direction)
         self.cut(closed_here(self.endpoint))

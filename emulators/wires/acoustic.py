@@ -1,11 +1,12 @@
-"""Water that modems speak through: one acoustic medium, every modem in it at a place of its own.
+"""An acoustic channel for modems: one medium, with each modem at its own position.
 
-Sound goes to whoever is near enough, at its speed, so a packet is heard later the farther away. A modem that speaks hears
-nothing (half duplex), two packets that are heard at once are both lost, and others are lost by chance. A modem that has something
-to say waits while it speaks or hears. Nothing is acknowledged and nothing sent again: that is for whoever speaks to care for.
+Sound reaches all modems within range, at its speed, so a packet is received later at a larger distance. A modem that
+transmits receives nothing (half duplex), two packets that overlap at a receiver are both lost, and others are lost at
+random. A modem with packets to send waits while it transmits or receives. There are no acknowledgements and no
+retransmissions; the users of the modems must handle losses.
 
-A function of time: what happens is worked out in its order when somebody looks, and the same seed gives the same losses. It knows
-no modem's registers, no sockets, and nothing of what is said.
+A function of time: events are computed in their order at the next access, and the same seed gives the same losses. It
+knows no modem registers, no sockets, and nothing of the content of packets.
 """
 
 from __future__ import annotations
@@ -21,17 +22,20 @@ from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
 from fieldtwin.gateway.core.errors import UsageError
 
 QUEUE = 4
-"""Packets that wait in a modem to be said; it takes no more."""
+"""Packets that wait in a modem to be sent; it accepts no more."""
 HEARD = 64
-"""Packets that were heard and not taken yet; the oldest are dropped, counted."""
+"""Packets that were received and not yet taken; the oldest are dropped and counted."""
 PAUSE_NS = 200 * NS_PER_MS
-"""How long a modem waits at most, besides, when it was kept from speaking."""
+"""The longest additional random wait of a modem that could not transmit."""
 
 
 @dataclass(frozen=True, slots=True)
 class Water:
-    """What all packets of a medium have in common. `overhead_bytes`: preamble, addresses and check sum of each. `loss`: the
-    share of the packets that each listener misses by chance."""
+    """Properties of the medium that all packets share.
+
+    `overhead_bytes`: preamble, addresses and checksum of each packet. `loss`: the share of the packets that each
+    receiver loses at random.
+    """
 
     range_m: float
     sound_m_per_s: float = 1500.0
@@ -40,13 +44,13 @@ class Water:
     loss: float = 0.0
 
     def airtime_ns(self, payload: bytes) -> int:
-        """How long a packet with `payload` sounds."""
+        """Return the transmission time of a packet with `payload`."""
         return round((len(payload) + self.overhead_bytes) / self.bytes_per_s * NS_PER_S)
 
 
 @dataclass(slots=True)
 class Reception:
-    """A packet as one modem hears it, from `begins_ns` to `ends_ns`. `spoilt`: why it is lost, if it is."""
+    """A packet as one modem receives it, from `begins_ns` to `ends_ns`. `spoilt`: the reason of its loss, if it is lost."""
 
     payload: bytes
     begins_ns: int
@@ -55,14 +59,17 @@ class Reception:
 
 
 Spoils = Callable[[int, int, bytes], bool]
-"""``spoils(t_ns, listener, payload)``: whether a fault takes a packet from the listener with that number (from 1)."""
+"""``spoils(t_ns, listener, payload)``: whether a fault removes a packet at the receiver with that number (from 1)."""
 
 LOSSES = ("collision", "speaking", "chance", "fault")
 
 
 @dataclass(slots=True)
 class Counters:
-    """Of one modem. `lost` by cause: ``collision``, ``speaking`` (it spoke itself), ``chance``, ``fault``."""
+    """Counters of one modem.
+
+    `lost` by cause: ``collision``, ``speaking`` (it transmitted itself), ``chance``, ``fault``.
+    """
 
     said: int = 0
     heard: int = 0
@@ -80,18 +87,21 @@ class _Modem:
         self.random = random
         self.counters = Counters()
         self.to_say: deque[tuple[int, bytes]] = deque()
-        """What waits, each with the time before which it is not said."""
+        """Waiting packets, each with the earliest time of its transmission."""
         self.heard: deque[bytes] = deque()
         self.hearing: list[Reception] = []
-        """What sounds here now or is on its way."""
+        """Packets that arrive here now or are on their way."""
         self.speaks_until_ns = 0
         self.spoke_from_ns = 0
         self.due_ns: int | None = None
-        """When it tries to speak next."""
+        """When it next tries to transmit."""
 
 
 class AcousticMedium:
-    """`places`: where each modem is, in metres, in two or three dimensions. `spoils`: the faults that are in, if any."""
+    """The medium.
+
+    `places`: the position of each modem in metres, in two or three dimensions. `spoils`: the faults, if any.
+    """
 
     def __init__(
         self, water: Water, places: Mapping[str, tuple[float, ...]], seed: int, spoils: Spoils | None = None
@@ -99,13 +109,13 @@ class AcousticMedium:
         self.water = water
         self.spoils = spoils
         self.on_say: Callable[[], None] | None = None
-        """Told that something begins in the water, by whoever speaks: `next_ns` is another one."""
+        """Called when a modem has a packet to send, because `next_ns` may have changed."""
         self._modems = {
             name: _Modem(number, at_m, Random(f"{seed} {name}"))
             for number, (name, at_m) in enumerate(places.items(), 1)
         }
         self._events: list[tuple[int, int, _Modem, Reception | None]] = []
-        """When, a running number, whose; the end of a reception, or None: the modem tries to speak."""
+        """Time, a sequence number, modem, and the reception that ends; None: the modem tries to transmit."""
         self._number = 0
 
     @property
@@ -114,16 +124,16 @@ class AcousticMedium:
 
     @property
     def next_ns(self) -> int | None:
-        """When something happens next; None: nothing until somebody speaks."""
+        """When the next event occurs; None: nothing happens until a modem sends."""
         return self._events[0][0] if self._events else None
 
     def neighbours(self, name: str) -> list[str]:
-        """Who hears `name`."""
+        """Return the modems within range of `name`."""
         here = self._modem(name)
         return [n for n, other in self._modems.items() if other is not here and self._way_m(here, other) is not None]
 
     def say(self, name: str, payload: bytes, now_ns: int, *, times: int = 1, every_ns: int = 0) -> bool:
-        """`name` shall say `payload`, so often; False while as much waits as it takes."""
+        """Queue `payload` at `name`, to be sent `times` times. Return False if the modem's queue is full."""
         self.advance(now_ns)
         modem = self._modem(name)
         if len(modem.to_say) >= QUEUE:
@@ -137,13 +147,13 @@ class AcousticMedium:
         return True
 
     def take(self, name: str, now_ns: int) -> bytes | None:
-        """The next packet that `name` has heard whole by `now_ns`, or None."""
+        """Return the next packet that `name` has received completely by `now_ns`, or None."""
         self.advance(now_ns)
         heard = self._modem(name).heard
         return heard.popleft() if heard else None
 
     def advance(self, now_ns: int) -> None:
-        """Work out what happened until `now_ns`."""
+        """Compute all events until `now_ns`."""
         while self._events and self._events[0][0] <= now_ns:
             t_ns, _, modem, reception = heappop(self._events)
             if reception is not None:
@@ -152,10 +162,10 @@ class AcousticMedium:
                 modem.due_ns = None
                 self._speak(modem, t_ns)
 
-    # -- speaking -------------------------------------------------------------------------------------------------------
+    # -- transmitting ---------------------------------------------------------------------------------------------------
 
     def _try(self, modem: _Modem, t_ns: int) -> None:
-        """Let the modem try at `t_ns`, or when its next packet may be said; once at a time."""
+        """Schedule the modem's next attempt at `t_ns`, or when its next packet may be sent; only one attempt is pending."""
         if modem.to_say:
             t_ns = max(t_ns, modem.to_say[0][0])
             if modem.due_ns is None or t_ns < modem.due_ns:
@@ -172,7 +182,7 @@ class AcousticMedium:
         modem.counters.said += 1
         ends_ns = t_ns + self.water.airtime_ns(payload)
         modem.spoke_from_ns, modem.speaks_until_ns = t_ns, ends_ns
-        for reception in modem.hearing:  # what comes in while it speaks
+        for reception in modem.hearing:  # packets that arrive while it transmits
             if reception.begins_ns < ends_ns:
                 reception.spoilt = reception.spoilt or "speaking"
         for other in self._modems.values():
@@ -192,7 +202,7 @@ class AcousticMedium:
         listener.hearing.append(new)
         self._at(new.ends_ns, listener, new)
 
-    # -- hearing --------------------------------------------------------------------------------------------------------
+    # -- receiving ------------------------------------------------------------------------------------------------------
 
     def _heard(self, modem: _Modem, reception: Reception, t_ns: int) -> None:
         modem.hearing.remove(reception)
@@ -216,7 +226,7 @@ class AcousticMedium:
         heappush(self._events, (t_ns, self._number, modem, reception))
 
     def _way_m(self, one: _Modem, other: _Modem) -> float | None:
-        """How far apart they are; None where it is too far to hear."""
+        """Return the distance between them; None if they are out of range."""
         way_m = dist(one.at_m, other.at_m)
         return way_m if way_m <= self.water.range_m else None
 

@@ -1,7 +1,8 @@
-"""What one attempt to send does to a modelled CAN bus: whether it is a frame or an error, and what all nodes make of it.
+"""The effect of one attempt to send on a modelled CAN bus: whether it is a frame or an error, and its effect on all nodes.
 
-Here are the nodes with their transmit queues and error counters, and when the bus is free again; `can_bus` says when an attempt
-is due and who takes part in its arbitration. Pure, and without any time but that of the attempts.
+This module holds the nodes with their transmit queues and error counters, and the time at which the bus is free again;
+`can_bus` determines when an attempt is due and which nodes take part in its arbitration. Pure; the only times are those
+of the attempts.
 """
 
 from __future__ import annotations
@@ -25,14 +26,14 @@ from fieldtwin.gateway.core.clock import NS_PER_S
 _ACTIVE = CanErrorState.ACTIVE
 
 MAX_NOTICES = 4096
-"""Notices and errors kept until somebody takes them; older ones go first."""
+"""Notices and errors kept until the caller takes them; the oldest are dropped."""
 
 
 class Attempts:
-    """The nodes of one bus, and `attempt`. What happened is gathered in `done`, `notices` and `faults`, each in its order.
+    """The nodes of one bus, and `attempt`. The results are collected in `done`, `notices` and `faults`, each in its order.
 
-    `instant` and `monitored` are those of `CanBus`. `waiting` are the nodes with something to send that are on the bus, `off`
-    those in bus-off; `free_ns` is when the interframe space of the last attempt ends.
+    `instant` and `monitored` are those of `CanBus`. `waiting` are the nodes on the bus that have something to send,
+    `off` those in bus-off; `free_ns` is when the interframe space of the last attempt ends.
     """
 
     def __init__(self, bitrate: int, *, instant: bool, monitored: bool, data_bitrate: int = 0) -> None:
@@ -52,27 +53,27 @@ class Attempts:
         self.notices: deque[Notice] = deque(maxlen=MAX_NOTICES)
         self.faults: deque[WireFault] = deque(maxlen=MAX_NOTICES)
         self._others: dict[int, tuple[int, ...]] = {}
-        """Who receives what a node sends alone, while nobody joins, leaves or is in bus-off."""
+        """Receivers of the frames of each node, while no node joins, leaves or is in bus-off."""
         self._joined_ns = 0
-        """When the newest of the nodes came."""
+        """When the newest node joined."""
 
     def join(self, number: int, node: Node) -> None:
-        """One more node, from `node.joined_ns` on; they come in the order of time."""
+        """Add a node from `node.joined_ns` on; nodes are added in order of time."""
         self.nodes[number] = node
         self._joined_ns = node.joined_ns
         self._others.clear()
 
     def leave(self, number: int) -> None:
-        """The node receives nothing more."""
+        """Mark a node that receives nothing more."""
         self.nodes[number].left = True
         self._others.clear()
 
     def duration_ns(self, bits: int) -> int:
-        """How long so many bits take: nothing where frames are instant."""
+        """Return how long `bits` bits take: 0 if frames are instant."""
         return 0 if self.instant else (bits * NS_PER_S + self.bitrate // 2) // self.bitrate
 
     def frame_ns(self, frame: CanFrame, bits: int) -> int:
-        """How long the first `bits` of `frame` take, those of its data phase at the data bit rate."""
+        """Return how long the first `bits` of `frame` take, with those of its data phase at the data bit rate."""
         if not frame.brs or self.instant:
             return self.duration_ns(bits)
         first, end = data_phase(frame)
@@ -80,9 +81,10 @@ class Attempts:
         return self.duration_ns(bits - fast) + (fast * NS_PER_S + self.data_bitrate // 2) // self.data_bitrate
 
     def busy(self, frame: CanFrame, bits: int, rest: int) -> tuple[int, int]:
-        """How long `bits` of `frame` and `rest` more take, and how many bits at the nominal bit rate that is.
+        """Return how long `bits` of `frame` and `rest` more take, and the equivalent number of bits at the nominal bit
+        rate.
 
-        What follows a frame, or an error in it, is always sent at the nominal bit rate.
+        The bits after a frame, or after an error in it, are always sent at the nominal bit rate.
         """
         if not frame.brs or self.instant:
             return self.duration_ns(bits + rest), bits + rest
@@ -90,12 +92,12 @@ class Attempts:
         return ns, -(-ns * self.bitrate // NS_PER_S)
 
     def attempt(self, start: Start) -> None:
-        """An attempt's regular end has come: it was a frame, or an error. Who is in bus-off by it counts from its end on."""
+        """Complete an attempt as a frame or an error. A node that enters bus-off counts from the end of the attempt on."""
         self._judge(start)
         for number in start.rivals:
             node = self.nodes.get(number)
             if node is None or node.faults.state is _ACTIVE:
-                continue  # as a rule
+                continue  # the usual case
             if node.faults.state is CanErrorState.BUS_OFF:
                 self._go_off(number)
             elif node.faults.state is CanErrorState.PASSIVE:
@@ -132,7 +134,10 @@ class Attempts:
         return [number for number in there if number not in self.off] if self.off else there
 
     def _contend(self, start: Start) -> tuple[CanFrame, list[int]] | None:
-        """Several nodes won the arbitration together. The frame that stays and who sends it; None: it came to an error."""
+        """Resolve an arbitration that several nodes won.
+
+        Return the remaining frame and its senders; None if it ended in an error.
+        """
         heads = {number: self.waiting[number].queue[0] for number in start.rivals}
         by_age = sorted(start.rivals, key=lambda number: heads[number].sequence)
         content = start.winner.frame.key()
@@ -152,7 +157,7 @@ class Attempts:
             self._fail(verdict, frame, start, by_age, self._receivers(start, by_age))
             return None
         at_ns = start.start_ns + self.frame_ns(frame, outcome.lost_bit + 1)
-        for number in outcome.losers:  # error-passive: they give way without spoiling the frame
+        for number in outcome.losers:  # error-passive: they give way without destroying the frame
             node = self.nodes[number]
             self.change(number, at_ns, node.faults.send_failed)
             node.errors += 1
@@ -167,7 +172,7 @@ class Attempts:
     def _spoilt(
         self, what: Disturbance, frame: CanFrame, start: Start, senders: Sequence[int], receivers: Sequence[int]
     ) -> bool:
-        """Whether the disturbance destroyed the frame; if not, some error-passive receivers went without it."""
+        """Return whether the disturbance destroyed the frame; otherwise some error-passive receivers did not receive it."""
         victims = what.seen_by & set(receivers)
         at_sender = not what.seen_by or bool(what.seen_by & set(senders))
         if not at_sender and not any(self.nodes[n].flags_are_dominant for n in victims):
@@ -183,7 +188,7 @@ class Attempts:
     def _unacknowledged(self, frame: CanFrame, start: Start, senders: Sequence[int]) -> None:
         self._fail(can_verdict.unacknowledged(frame), frame, start, senders, [])
         for number in senders:
-            if self.nodes[number].left:  # its process is gone: nobody tries for ever on its behalf
+            if self.nodes[number].left:  # its process has ended: do not retry for it
                 self.nodes[number].queue.clear()
                 self.stop_waiting(number)
                 self.forget_if_done(number)
@@ -191,7 +196,7 @@ class Attempts:
     def _fail(
         self, verdict: Verdict, frame: CanFrame, start: Start, senders: Sequence[int], receivers: Sequence[int]
     ) -> None:
-        """An error frame, that all who take part count; what was to be sent stays at the head of its queue."""
+        """Send an error frame, which all participants count; the frame stays at the head of its queue."""
         at_ns = start.start_ns + self.frame_ns(frame, verdict.flag_at)
         took_ns, bits = self.busy(frame, verdict.flag_at, verdict.bits - verdict.flag_at)
         self._pass(start.start_ns, took_ns)
@@ -211,7 +216,7 @@ class Attempts:
         self.faults.append(WireFault(at_ns, verdict.kind, frame, start.start_ns, bits, tuple(senders), tuple(counters)))
 
     def _deliver(self, frame: CanFrame, start: Start, senders: Sequence[int], receivers: Sequence[int]) -> None:
-        length = start.bits if len(start.rivals) == 1 else bits_to_end(frame)  # of one alone it is known already
+        length = start.bits if len(start.rivals) == 1 else bits_to_end(frame)  # already known for a single sender
         took_ns, bits = self.busy(frame, length, INTERFRAME_BITS)
         end_ns = start.end_ns if len(start.rivals) == 1 else start.start_ns + self.frame_ns(frame, length)
         self._pass(start.start_ns, took_ns)
@@ -244,7 +249,7 @@ class Attempts:
             self.notices.append(Notice(at_ns, number, before, faults.state, faults.tec, faults.rec))
 
     def _pass(self, start_ns: int, took_ns: int) -> None:
-        """An attempt took the bus: it is free again after `took_ns`. Nodes in bus-off count the recessive sequences."""
+        """Record that an attempt occupied the bus for `took_ns`. Nodes in bus-off count the recessive sequences."""
         if self.off:
             idle_bits = 0 if self.instant else (start_ns - self.free_ns) * self.bitrate // NS_PER_S
             self.off.attempt_passed(idle_bits)
@@ -258,11 +263,11 @@ class Attempts:
             self.forget_if_done(number)
 
     def stop_waiting(self, number: int) -> None:
-        """It takes part in no arbitration until it is put into `waiting` again."""
+        """Exclude a node from arbitration until it is put into `waiting` again."""
         self.waiting.pop(number, None)
 
     def forget_if_done(self, number: int) -> None:
-        """A node that left is kept until its queue is empty."""
+        """Remove a node that has left, once its queue is empty."""
         if self.nodes[number].left and not self.nodes[number].queue:
             del self.nodes[number]
             self._others.clear()

@@ -1,20 +1,22 @@
-"""A CAN bus as a model: who may send, when each frame ends, who receives it, and what errors do to it.
+"""A model of a CAN bus: which node may send, when each frame ends, which nodes receive it, and the effects of errors.
 
-Pure: nodes submit frames and time is passed in, deliveries and notices come out. It knows no sockets, tasks or clocks, so the
-same model runs behind a TCP server and under virtual time.
+Pure: nodes submit frames and the caller passes the time; the results are deliveries and notices. It knows no sockets,
+tasks or clocks, so the same model runs behind a TCP server and in virtual time.
 
-What is modelled: bitwise arbitration among the heads of the nodes' transmit queues, the exact stuffed length of each frame, the
-interframe space, broadcast to every other node at the end of the frame; error frames and retransmission, each node's error
-counters, error-passive with its suspended transmission, bus-off and recovery. A frame that is on the wire is never interrupted
-by another. The outcome depends only on what was submitted when, never on how often `advance` is called: an attempt is judged when
-the regular end of its frame has passed, and only frames that were there at its start took part in its arbitration.
+The model covers: bitwise arbitration among the heads of the nodes' transmit queues, the exact stuffed length of each
+frame, the interframe space, broadcast to every other node at the end of the frame; error frames and retransmission,
+each node's error counters, error-passive with its suspended transmission, bus-off and recovery. A frame on the wire is
+never interrupted by another frame. The outcome depends only on the times of submission, never on how often `advance` is
+called: an attempt is evaluated after the regular end of its frame, and only frames that were queued at its start take
+part in its arbitration.
 
-Two nodes that send the very same frame at the same start overlap bit by bit: one frame on the wire, both have sent it (CiA 305
-relies on that). The same arbitration field with other content is a bit error at the first bit that differs: an error frame and
-TEC + 8 for both, again and again, until the one that sends the recessive bit is error-passive and can object no longer.
+Two nodes that send identical frames at the same start overlap bit by bit: there is one frame on the wire, and both have
+sent it (CiA 305 relies on that). The same arbitration field with different content is a bit error at the first bit that
+differs: an error frame and TEC + 8 for both, repeatedly, until the node that sends the recessive bit is error-passive
+and cannot object any more.
 
-A frame that nobody acknowledges is sent again for ever; its sender becomes error-passive and never bus-off. By default the bus
-itself acknowledges every frame (`monitored`), as on a test bench where an analyser always listens.
+A frame without an acknowledgement is retransmitted without end; its sender becomes error-passive and never bus-off. By
+default the bus itself acknowledges every frame (`monitored`), as on a test bench where an analyser always listens.
 """
 
 from __future__ import annotations
@@ -38,10 +40,10 @@ MAX_BITRATE, MAX_DATA_BITRATE = 1_000_000, 8_000_000
 class CanBus:
     """The bus. `now_ns` is monotonic over all calls.
 
-    `queue_frames` bounds each node's transmit queue. `instant` makes frames take no time (they are still arbitrated and
-    counted), for tests and imports that should not wait for a wire: without bits there are no collisions, of two frames with one
-    arbitration field the older goes first. `data_bitrate` is that of CAN FD frames with the bit-rate switch, 0 for `bitrate`.
-    `monitored`: the bus acknowledges every frame; otherwise only other nodes do.
+    `queue_frames` limits each node's transmit queue. `instant` makes frames take no time (they are still arbitrated and
+    counted), for tests and imports that should not wait for a bus. Without bits there are no collisions: of two frames
+    with the same arbitration field the older is sent first. `data_bitrate` is that of CAN FD frames with the bit-rate
+    switch, 0 for `bitrate`. `monitored`: the bus acknowledges every frame; otherwise only other nodes do.
     """
 
     def __init__(
@@ -75,9 +77,10 @@ class CanBus:
     # -- nodes ----------------------------------------------------------------------------------------------------
 
     def join(self, now_ns: int, name: str = "", *, listen_only: bool = False) -> int:
-        """A new node's number. It receives frames that start from now on. Raises `EndpointBusy` when the bus is full.
+        """Add a node and return its number. It receives frames that start from now on. Raises `EndpointBusy` if the bus
+        is full.
 
-        With `listen_only` it never acknowledges nor objects, and may not send.
+        With `listen_only` it never acknowledges or objects, and may not send.
         """
         if len(self._wire.nodes) >= self.max_nodes:
             raise EndpointBusy("the CAN bus is full", expected=f"at most {self.max_nodes} nodes")
@@ -88,7 +91,10 @@ class CanBus:
         return node
 
     def leave(self, node: int, now_ns: int) -> None:
-        """The node receives nothing more. What it queued still goes out, as a kernel sends what a closed socket left."""
+        """Remove a node, which receives nothing more.
+
+        Its queued frames are still sent, as a kernel does for a closed socket.
+        """
         self._run(now_ns)
         leaving = self._node(node)
         self._wire.leave(node)
@@ -97,10 +103,10 @@ class CanBus:
         self._wire.forget_if_done(node)
 
     def submit(self, node: int, frame: CanFrame, now_ns: int, *, counted: bool = True) -> bool:
-        """Queue `frame` for transmission; False (and nothing queued) while the node's transmit queue is full. A refusal is
-        `counted` unless whoever asks comes again with this frame.
+        """Queue `frame` for transmission; return False (and queue nothing) while the node's transmit queue is full.
 
-        Frames of one node keep their order. In bus-off they wait. Error frames are the bus's own: `UsageError`.
+        A refusal is `counted` unless the caller retries this frame. Frames of one node keep their order. In bus-off
+        they wait. Only the bus itself sends error frames: `UsageError`.
         """
         if frame.error:
             raise UsageError("a node cannot send an error frame", got=str(frame))
@@ -108,7 +114,7 @@ class CanBus:
         if sender.listen_only:
             raise UsageError("a node that only listens cannot send", got=str(frame))
         if len(sender.queue) >= self.queue_frames:
-            self._run(now_ns)  # what ended by now no longer takes a place
+            self._run(now_ns)  # frames that have ended by now free their places
             if len(sender.queue) >= self.queue_frames:
                 sender.refused += counted
                 return False
@@ -121,8 +127,11 @@ class CanBus:
         return True
 
     def withdraw(self, node: int, can_ids: Collection[int], now_ns: int) -> list[CanFrame]:
-        """Take back the data frames under `can_ids` (11 bits) that wait in the node's transmit queue, as a controller aborts
-        its mailboxes: all but one that is on the wire. Returns them in order."""
+        """Withdraw data frames with `can_ids` (11 bits) from the node's transmit queue, as a controller aborts its
+        mailboxes.
+
+        A frame that is on the wire stays. Returns the withdrawn frames in order.
+        """
         self._run(now_ns)
         owner, start = self._node(node), self._upcoming()
         begun = start is not None and start.start_ns < now_ns
@@ -140,55 +149,58 @@ class CanBus:
         return [p.frame for p in taken]
 
     def queued(self, node: int) -> int:
-        """Frames that wait in the node's transmit queue, the one on the wire included."""
+        """Return the number of frames in the node's transmit queue, the one on the wire included."""
         return len(self._node(node).queue)
 
     def count_overrun(self, node: int) -> None:
-        """The node could not take a frame that was delivered to it."""
+        """Count a frame that the node could not take."""
         self.overruns += 1
         self._node(node).overruns += 1
 
     def error_state(self, node: int) -> tuple[CanErrorState, int, int]:
-        """The node's state, TEC and REC as of the last `advance`."""
+        """Return the node's state, TEC and REC as of the last `advance`."""
         faults = self._node(node).faults
         return faults.state, faults.tec, faults.rec
 
     def disturb(self, rule: Rule) -> None:
-        """Spoil attempts as `rule` says (`can_faults.spoil` makes one). The first rule that answers decides."""
+        """Destroy attempts as `rule` says (`can_faults.spoil` creates one).
+
+        The first rule that returns a disturbance decides.
+        """
         self._wire.rules.append(rule)
 
     def undisturb(self, rule: Rule) -> None:
-        """Take a rule away; one that is not there is no error."""
+        """Remove a rule; an unknown rule is ignored."""
         if rule in self._wire.rules:
             self._wire.rules.remove(rule)
 
     # -- time -----------------------------------------------------------------------------------------------------
 
     def advance(self, now_ns: int) -> list[Delivery]:
-        """The frames that ended up to `now_ns`, in the order of the wire; each is returned once."""
+        """Return the frames that ended up to `now_ns`, in the order of the wire; each is returned once."""
         self._run(now_ns)
         done, self._wire.done = self._wire.done, []
         return done
 
     @property
     def has_news(self) -> bool:
-        """Whether there are deliveries, notices or faults that nobody took yet."""
+        """Whether there are deliveries, notices or faults that have not been taken."""
         return bool(self._wire.done or self._wire.notices or self._wire.faults)
 
     def take_notices(self) -> list[Notice]:
-        """The changes of state up to the last `advance`, in order; each is returned once."""
+        """Return the changes of state up to the last `advance`, in order; each is returned once."""
         notices = list(self._wire.notices)
         self._wire.notices.clear()
         return notices
 
     def take_faults(self) -> list[WireFault]:
-        """The error frames up to the last `advance`, in order; each is returned once."""
+        """Return the error frames up to the last `advance`, in order; each is returned once."""
         faults = list(self._wire.faults)
         self._wire.faults.clear()
         return faults
 
     def next_event_ns(self) -> int | None:
-        """When `advance` will have something, as things stand; None while nothing will come of itself.
+        """Return when `advance` will next have a result, as things stand; None if nothing will happen without a submission.
 
         A frame submitted meanwhile can change it only if the bus is idle until then; an error brings it forward.
         """
@@ -213,7 +225,7 @@ class CanBus:
                 self._wire.attempt(start)
 
     def _upcoming(self) -> Start | None:
-        if self._next is None and len(self._wire.waiting) == 1:  # no arbitration, as a rule
+        if self._next is None and len(self._wire.waiting) == 1:  # the usual case: no arbitration
             ((number, node),) = self._wire.waiting.items()
             winner = node.queue[0]
             start_ns = max(self._wire.free_ns, winner.ready_ns, node.hold_ns)
@@ -225,7 +237,7 @@ class CanBus:
             contenders = [number for ready_ns, number in heads if ready_ns <= start_ns]
             winner = min((self._wire.waiting[n].queue[0] for n in contenders), key=lambda p: (p.key, p.sequence))
             rivals = tuple(n for n in contenders if self._wire.waiting[n].queue[0].key == winner.key)
-            frames = [self._wire.waiting[n].queue[0].frame for n in rivals]  # of a collision, any may stay
+            frames = [self._wire.waiting[n].queue[0].frame for n in rivals]  # in a collision, any of them may remain
             longest = max(bits_to_end(frame) for frame in frames)
             end_ns = start_ns + max(self._wire.frame_ns(frame, bits_to_end(frame)) for frame in frames)
             self._next = Start(start_ns, end_ns, longest, winner, rivals)
@@ -234,7 +246,7 @@ class CanBus:
     # -- bus-off, and attempts that change nothing ----------------------------------------------------------------
 
     def _recovery_ns(self) -> int | None:
-        """When the next node in bus-off is back, if nobody sends until then."""
+        """Return when the next node leaves bus-off, if no node sends until then."""
         if not self._wire.off:
             return None
         return self._wire.free_ns + self._wire.duration_ns(self._wire.off.bits_to_recovery())
@@ -249,7 +261,9 @@ class CanBus:
             self._next = None
 
     def _idles(self, start: Start) -> bool:
-        """Whether the attempt changes nothing: a lone error-passive node that nobody acknowledges tries for ever."""
+        """Return whether the attempt changes nothing: a lone error-passive node without acknowledgement retries without
+        end.
+        """
         if self.monitored or self.instant or self._wire.rules or len(start.rivals) != 1 or len(self._wire.waiting) != 1:
             return False
         lone = self._wire.nodes[start.rivals[0]]
@@ -260,7 +274,7 @@ class CanBus:
         )
 
     def _skip(self, start: Start, now_ns: int, recovery_ns: int | None) -> bool:
-        """Pass over attempts that change nothing, all that end before `now_ns` and before a node is back."""
+        """Skip attempts that change nothing and that end before `now_ns` and before a node leaves bus-off."""
         frame = start.winner.frame
         verdict = can_verdict.unacknowledged(frame)
         after = verdict.bits - verdict.flag_at + SUSPEND_BITS
@@ -291,24 +305,24 @@ class CanBus:
 
     @property
     def frames(self) -> int:
-        """Frames that went over the bus."""
+        """Frames that were sent on the bus."""
         return self._wire.load.frames
 
     @property
     def bits(self) -> int:
-        """Bits that kept it busy."""
+        """Bits for which the bus was busy."""
         return self._wire.load.bits
 
     def load(self, now_ns: int) -> float:
-        """Share of the last second's bits that carried something, 0 to 1 (more is possible where frames are instant)."""
+        """Return the share of the last second's bits that carried something, 0 to 1 (or more if frames are instant)."""
         return self._wire.load.total(now_ns)
 
     def stats(self, now_ns: int) -> dict[str, Any]:
-        """Totals, per node and per identifier (as candump writes it); JSON-able.
+        """Return totals, values per node and per identifier (as candump writes it); JSON-able.
 
         ``frames``, ``bits`` (stuffed, with interframe space and errors), ``load`` (0 to 1, last second), ``overruns``,
-        ``conflicts``, ``error_frames``, ``bitrate``, ``by_id`` (frames), ``load_by_id`` and ``nodes``: a list of node, name,
-        sent, received, overruns, refused, queued, load, errors, state, tec, rec.
+        ``conflicts``, ``error_frames``, ``bitrate``, ``by_id`` (frames), ``load_by_id`` and ``nodes``: a list of node,
+        name, sent, received, overruns, refused, queued, load, errors, state, tec, rec.
         """
         load_by_node = self._wire.load.by_node(now_ns)
         return {
@@ -324,7 +338,7 @@ class CanBus:
             "nodes": [node.as_dict(number, load_by_node.get(number, 0.0)) for number, node in self._wire.nodes.items()],
         }
 
-    # -- small things ---------------------------------------------------------------------------------------------
+    # -- helpers --------------------------------------------------------------------------------------------------
 
     def _node(self, node: int) -> Node:
         try:

@@ -1,4 +1,4 @@
-"""What a modelled CAN bus tells: frames that ended, controllers that changed their state, errors on the wire. Values only."""
+"""The events of a modelled CAN bus: frames that ended, state changes of controllers, errors on the bus. Values only."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from fieldtwin.gateway.core.canframe import CanFrame
 
 
 class Delivery(msgspec.Struct, frozen=True, gc=False):
-    """One frame that went over the bus. `frame.t_ns` is its end of frame.
+    """One frame that was sent on the bus. `frame.t_ns` is its end of frame.
 
-    `senders` have more than one node only where identical frames overlapped. `receivers` were on the bus at its start.
+    `senders` has more than one node only if identical frames overlapped. `receivers` were on the bus at its start.
     """
 
     frame: CanFrame
@@ -25,7 +25,7 @@ class Delivery(msgspec.Struct, frozen=True, gc=False):
 
 @dataclass(frozen=True, slots=True)
 class Notice:
-    """A node's controller changed its state, with the error counters that made it."""
+    """A state change of a node's controller, with the error counters that caused it."""
 
     t_ns: int
     node: int
@@ -37,10 +37,11 @@ class Notice:
 
 @dataclass(frozen=True, slots=True)
 class WireFault:
-    """An error frame: an attempt to send `frame` that came to nothing and is made again.
+    """An error frame: an attempt to send `frame` that failed and is repeated.
 
-    `kind` is ``bit`` (the sender read another level than it sent, a collision included), ``crc``, ``stuff`` (a receiver objected
-    there) or ``ack``. `t_ns` is when the first flag began, `bits` what the attempt cost until the bus was free.
+    `kind` is ``bit`` (the sender read a different level than it sent, including collisions), ``crc``, ``stuff`` (a
+    receiver objected there) or ``ack``. `t_ns` is when the first flag began, `bits` the length of the attempt until the
+    bus was free.
     """
 
     t_ns: int
@@ -50,4 +51,4 @@ class WireFault:
     bits: int
     senders: tuple[int, ...]
     counters: tuple[tuple[int, int, int], ...]
-    """Node, TEC and REC of all that took part, after it."""
+    """Node, TEC and REC of all participants, after the error."""

@@ -1,8 +1,8 @@
-"""Fault confinement of a CAN node, and how errors are put on the modelled wire (ISO 11898-1, 12.1.4).
+"""Fault confinement of a CAN node, and how errors are injected into the modelled bus (ISO 11898-1, 12.1.4).
 
-`Confinement` is one node's transmit and receive error counters and the state that follows from them. `Disturbance` and `Rule` are
-how a test or a fault file spoils frames: a rule is asked once for each attempt to send and tells what goes wrong with it. No bus
-and no time here.
+`Confinement` holds one node's transmit and receive error counters and the state that follows from them. With
+`Disturbance` and `Rule`, a test or a fault file destroys frames: a rule is called once for each attempt to send and
+returns the error. This module knows no bus and no time.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from fieldtwin.gateway.core.canframe import CanFrame
 
 WARNING_LIMIT, PASSIVE_LIMIT, BUS_OFF_LIMIT = 96, 128, 256
 RECOVERY_SEQUENCES, RECOVERY_BITS = 128, 11
-"""A node in bus-off is back after 128 occurrences of 11 recessive bits."""
+"""A node in bus-off recovers after 128 occurrences of 11 recessive bits."""
 
 SUSPEND_BITS = 8
-"""What an error-passive node waits after it was the transmitter, beyond the interframe space."""
+"""The additional wait of an error-passive node after it was the transmitter, beyond the interframe space."""
 
 _REC_MAX = 255
 _REC_AFTER_PASSIVE = 119
-"""A frame that is received well sets a passive receiver's counter to 119 to 127."""
+"""A correctly received frame sets a passive receiver's counter to 119 to 127."""
 
 
 class Confinement:
@@ -38,38 +38,41 @@ class Confinement:
 
     @property
     def flags_are_dominant(self) -> bool:
-        """Whether this node's error flag destroys a frame: an error-passive node's is recessive."""
+        """Whether this node's error flag destroys a frame: an error-passive node's flag is recessive."""
         return self.state in (CanErrorState.ACTIVE, CanErrorState.WARNING)
 
     def sent(self) -> None:
-        """A frame of this node was acknowledged and nobody objected."""
+        """Count a frame of this node that was acknowledged without an error."""
         if self.tec:
             self.tec -= 1
             self._judge()
 
     def received(self) -> None:
-        """A frame was received without error."""
+        """Count a frame that was received without error."""
         if self.rec:
             self.rec = self.rec - 1 if self.rec < PASSIVE_LIMIT else _REC_AFTER_PASSIVE
             self._judge()
 
     def send_failed(self) -> None:
-        """An error while it sent."""
+        """Count an error during transmission."""
         self.tec += 8
         self._judge()
 
     def not_acknowledged(self) -> None:
-        """Nobody acknowledged: counted until error-passive, never beyond (exception 1 of rule c)."""
+        """Count a missing acknowledgement: until error-passive, never beyond (exception 1 of rule c)."""
         if self.state is not CanErrorState.PASSIVE:
             self.send_failed()
 
     def receive_failed(self, *, first: bool) -> None:
-        """An error while it received. `first`: it objected before the others did, and saw their flags after its own."""
+        """Count an error during reception.
+
+        `first`: the node objected before the others, and saw their flags after its own.
+        """
         self.rec = min(self.rec + (9 if first else 1), _REC_MAX)
         self._judge()
 
     def recover(self) -> None:
-        """Back on the bus after bus-off."""
+        """Return to the bus after bus-off."""
         self.tec = self.rec = 0
         self.state = CanErrorState.ACTIVE
 
@@ -85,10 +88,11 @@ class Confinement:
 
 @dataclass(frozen=True, slots=True)
 class Disturbance:
-    """One error on the wire: bit `at_bit` (start of frame is 0, stuff bits count) is read wrongly by `seen_by`.
+    """One error on the bus: bit `at_bit` (start of frame is 0, stuff bits count) is read wrongly by `seen_by`.
 
-    `seen_by` are node numbers; empty: everybody, the sender too. Without `at_bit` the receivers find the check sum wrong, and
-    object after the acknowledge delimiter. A bit beyond the frame's end is taken as its last one that counts.
+    `seen_by` are node numbers; empty: all nodes, including the sender. Without `at_bit` the receivers find the checksum
+    wrong, and object after the acknowledge delimiter. A bit beyond the frame's end is replaced by the last bit that has
+    an effect.
     """
 
     at_bit: int | None = None
@@ -96,7 +100,7 @@ class Disturbance:
 
 
 class Rule(Protocol):
-    """Asked once for each attempt to send a frame that won its arbitration; None: nothing goes wrong."""
+    """Called once for each attempt to send a frame that won its arbitration; None: no error."""
 
     def __call__(self, frame: CanFrame, start_ns: int, senders: tuple[int, ...], /) -> Disturbance | None: ...
 
@@ -108,10 +112,11 @@ def spoil(
     skip: int = 0,
     times: int | None = 1,
 ) -> Rule:
-    """A rule that spoils attempts to send frames that `match`: after `skip` good ones, the next `times` (None: all).
+    """Return a rule that destroys attempts to send frames that `match`: after `skip` good ones, the next `times` (None:
+    all).
 
-    An attempt is not a frame: what was spoilt is sent again, and is asked about again. `times=32` takes a sender that was
-    free of errors to bus-off.
+    An attempt is not a frame: a destroyed frame is sent again, and the rule is called again. `times=32` takes a sender
+    without errors to bus-off.
     """
     disturbance = what or Disturbance()
     seen = 0

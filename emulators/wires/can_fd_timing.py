@@ -1,11 +1,12 @@
-"""How long a CAN FD frame is on the wire, bit by bit (ISO 11898-1:2015, 10.4.2 and 10.5).
+"""The duration of a CAN FD frame on the wire, bit by bit (ISO 11898-1:2015, 10.4.2 and 10.5).
 
-Pure arithmetic on one frame, like `can_timing` for classic frames. The differences: up to 64 bytes; the check sum is preceded by
-a count of the stuff bits and has a stuff bit at fixed places instead of where five equal bits ask for one; and with the
+Pure arithmetic on one frame, like `can_timing` for classic frames. The differences: up to 64 bytes; the checksum
+follows a count of the stuff bits and has stuff bits at fixed positions instead of after five equal bits; and with the
 bit-rate switch, the bits from ESI to the CRC delimiter are sent at the data bit rate.
 
-The rates change at the sample points of the bits BRS and CRC delimiter. With the same sample point in both phases, that takes
-exactly as long as a whole BRS bit at the nominal rate and a whole CRC delimiter at the data bit rate, which is what is counted.
+The rates change at the sample points of the bits BRS and CRC delimiter. With the same sample point in both phases, that
+takes exactly as long as a whole BRS bit at the nominal rate and a whole CRC delimiter at the data bit rate, which is
+what this module counts.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from functools import lru_cache
 from fieldtwin.gateway.core.canframe import CanFrame
 
 CRC17, CRC21 = (17, 0x1685B), (21, 0x102899)
-"""Length and polynomial without its highest term; up to 16 bytes of data take the first."""
+"""Length and polynomial without its highest term; frames with up to 16 bytes of data use the first."""
 _LENGTH_CODES = {12: 9, 16: 10, 20: 11, 24: 12, 32: 13, 48: 14, 64: 15}
 _STUFF_AFTER, _FIXED_EVERY = 5, 4
 
@@ -37,7 +38,7 @@ def data_phase(frame: CanFrame) -> tuple[int, int]:
 
 
 def _head(can_id: int, extended: bool, brs: bool) -> str:
-    """Start of frame to BRS."""
+    """Return the bits from start of frame to BRS."""
     if extended:  # SOF, base, SRR, IDE, extension, RRS, FDF, res, BRS
         return f"0{can_id >> 18:011b}11{can_id & 0x3FFFF:018b}010{int(brs)}"
     return f"0{can_id:011b}0010{int(brs)}"  # SOF, identifier, RRS, IDE, FDF, res, BRS
@@ -61,7 +62,7 @@ def _bits(can_id: int, data: bytes, extended: bool, brs: bool, esi: bool) -> str
 
 
 def _stuff(bits: str) -> tuple[str, int]:
-    """Return `bits` stuffed, and how many stuff bits that took; none after the last bit, where a fixed one follows."""
+    """Return `bits` stuffed, and the number of stuff bits; none is added after the last bit, where a fixed one follows."""
     out: list[str] = []
     run_of, run, count = "", 0, 0
     for at, bit in enumerate(bits):
@@ -76,7 +77,7 @@ def _stuff(bits: str) -> tuple[str, int]:
 
 
 def _crc(bits: str, length: int, polynomial: int) -> int:
-    """Return the check sum of `bits`, which begins with its highest bit set (10.4.2.6)."""
+    """Return the checksum of `bits`; its initial value has only the highest bit set (10.4.2.6)."""
     top, mask = length - 1, (1 << length) - 1
     crc = 1 << top
     for bit in bits:

@@ -1,7 +1,8 @@
-"""What a CAN bus carried: totals, and the load of the last second, per identifier and per node.
+"""Traffic of a CAN bus: totals, and the load of the last second, per identifier and per node.
 
-The load counts every bit that kept the bus busy: frames with their stuff bits and interframe space, and what errors cost. It is
-charged to the identifier and the node that were sending. Bounded: beyond `MAX_IDS_COUNTED` identifiers the rest is ``other``.
+The load counts every bit for which the bus was busy: frames with their stuff bits and interframe space, and errors. It
+is assigned to the identifier and the node that were sending. Bounded: beyond `MAX_IDS_COUNTED` identifiers the rest is
+``other``.
 """
 
 from __future__ import annotations
@@ -22,22 +23,24 @@ _OTHER = -1
 
 
 class BusLoad:
-    """Counts attempts of any outcome. An identifier is a number here, with a bit above it where it is extended; names and sums
-    are made when somebody asks."""
+    """Counts attempts of any outcome. An identifier is a number, with an additional bit if it is extended.
+
+    Names and sums are computed on access.
+    """
 
     def __init__(self, bitrate: int) -> None:
         self.bits = 0
         self._by_id: dict[int, int] = {}
         self._one_s_bits = bitrate * _SLOTS * _SLOT_NS / NS_PER_S
         self._slots: deque[tuple[int, dict[tuple[int, tuple[int, ...]], int]]] = deque(maxlen=_SLOTS)
-        """Of the last slots in which something was sent, the slot's number, and bits by identifier and senders."""
+        """For the last slots with traffic: the slot's number, and bits by identifier and senders."""
         self._number = -1
         self._slot: dict[tuple[int, tuple[int, ...]], int] = {}
-        """The newest of them."""
+        """The newest slot."""
 
     @property
     def frames(self) -> int:
-        """Whole frames."""
+        """Number of whole frames."""
         return sum(self._by_id.values())
 
     @property
@@ -46,13 +49,13 @@ class BusLoad:
         return {_name(key): frames for key, frames in self._by_id.items()}
 
     def count(self, frame: CanFrame, bits: int, end_ns: int, senders: tuple[int, ...], *, whole: bool) -> None:
-        """`bits` were on the wire until `end_ns`; `whole`: they were a frame, not an error."""
+        """Count `bits` that were on the wire until `end_ns`; `whole`: they were a frame, not an error."""
         key = frame.can_id | _EXTENDED if frame.extended else frame.can_id
         by_id = self._by_id
         if key not in by_id and len(by_id) >= MAX_IDS_COUNTED:
             key = _OTHER
         self.bits += bits
-        by_id[key] = by_id.get(key, 0) + whole  # an identifier that never got through is listed with 0
+        by_id[key] = by_id.get(key, 0) + whole  # an identifier that never succeeded is listed with 0
         number = end_ns // _SLOT_NS
         if self._number != number:
             self._number, self._slot = number, {}
@@ -61,18 +64,18 @@ class BusLoad:
         slot[by_sender] = slot.get(by_sender, 0) + bits
 
     def total(self, now_ns: int) -> float:
-        """Share of the last second's bits that carried something, 0 to 1 (more is possible where frames are instant)."""
+        """Return the share of the last second's bits that carried something, 0 to 1 (or more if frames are instant)."""
         return sum(bits for _, bits in self._last_second(now_ns)) / self._one_s_bits
 
     def by_identifier(self, now_ns: int) -> dict[str, float]:
-        """The same, by identifier."""
+        """Return the same, by identifier."""
         summed: Counter[str] = Counter()
         for (key, _), bits in self._last_second(now_ns):
             summed[_name(key)] += bits
         return {name: bits / self._one_s_bits for name, bits in summed.items()}
 
     def by_node(self, now_ns: int) -> dict[int, float]:
-        """The same, by node. Where nodes sent one frame together, it counts for each."""
+        """Return the same, by node. A frame that nodes sent together counts for each of them."""
         summed: Counter[int] = Counter()
         for (_, senders), bits in self._last_second(now_ns):
             for node in senders:

@@ -1,6 +1,6 @@
-"""The bookkeeping of a modelled CAN bus: its nodes, their transmit queues, and those of them that are in bus-off.
+"""The data of a modelled CAN bus: its nodes, their transmit queues, and the nodes in bus-off.
 
-Nothing is decided here; `can_bus` does that.
+It makes no decisions; `can_bus` does.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from fieldtwin.gateway.core.canframe import CanFrame
 
 
 class Pending(msgspec.Struct, frozen=True, gc=False):
-    """A frame in a transmit queue. `sequence` is its age among all that were submitted, `key` its priority."""
+    """A frame in a transmit queue. `sequence` is its age among all submitted frames, `key` its priority."""
 
     frame: CanFrame
     ready_ns: int
@@ -25,9 +25,10 @@ class Pending(msgspec.Struct, frozen=True, gc=False):
 
 
 class Start(msgspec.Struct, frozen=True, gc=False):
-    """The next attempt, if nobody else submits anything before its start. `rivals` have one arbitration field, the winning one.
+    """The next attempt, if no node submits a frame before its start. `rivals` share one arbitration field, the winning one.
 
-    `bits` go from its start to the end of the longest of their frames, `end_ns`: the attempt can be judged then.
+    `bits` is the length from its start to the end of the longest of their frames; at `end_ns` the attempt can be
+    evaluated.
     """
 
     start_ns: int
@@ -39,7 +40,10 @@ class Start(msgspec.Struct, frozen=True, gc=False):
 
 @dataclass(slots=True)
 class Node:
-    """What the bus knows of a node. `hold_ns`: it may not start before, being suspended or just back from bus-off."""
+    """The state of a node on the bus.
+
+    `hold_ns`: it may not start earlier, because it is suspended or has just left bus-off.
+    """
 
     name: str
     joined_ns: int
@@ -56,11 +60,11 @@ class Node:
 
     @property
     def flags_are_dominant(self) -> bool:
-        """Whether this node's objection destroys a frame."""
+        """Whether an error flag of this node destroys a frame."""
         return self.faults.flags_are_dominant and not self.listen_only
 
     def as_dict(self, number: int, load: float) -> dict[str, Any]:
-        """For `CanBus.stats`."""
+        """Return the values for `CanBus.stats`."""
         return {
             "node": number,
             "name": self.name,
@@ -78,27 +82,27 @@ class Node:
 
 
 class BusOff(dict[int, int]):
-    """The nodes in bus-off, each with the recessive sequences that it still waits for."""
+    """The nodes in bus-off, each with the number of recessive sequences that it still waits for."""
 
     def enter(self, number: int) -> None:
-        """The count begins when the error frame that took it off has passed."""
+        """Add a node, which counts from the end of the error frame that put it into bus-off."""
         self[number] = RECOVERY_SEQUENCES
 
     def attempt_passed(self, idle_bits: int) -> None:
-        """An attempt of any outcome ended, after `idle_bits` of idle bus: its end is one more recessive sequence."""
+        """Count an attempt of any outcome, after `idle_bits` of idle bus: its end is one more recessive sequence."""
         for number in self:
             self[number] = max(0, self[number] - idle_bits // RECOVERY_BITS - 1)
 
     def bits_to_recovery(self) -> int:
-        """Bits of idle bus until the first of them is back."""
+        """Return the bits of idle bus until the first node recovers."""
         return min(self.values()) * RECOVERY_BITS
 
     def take_recovered(self) -> int:
-        """The first of them; it is no longer here."""
+        """Remove and return the first node that recovers."""
         number = min(self, key=lambda n: (self[n], n))
         del self[number]
         return number
 
     def forget(self, number: int) -> None:
-        """It left for good."""
+        """Remove a node that has left for good."""
         self.pop(number, None)

@@ -1,12 +1,13 @@
-"""How long a CAN frame is on the wire, bit by bit (ISO 11898-1, 10.4 and 10.5); `can_fd_timing` has what is special in CAN FD.
+"""The duration of a CAN frame on the wire, bit by bit (ISO 11898-1, 10.4 and 10.5); `can_fd_timing` has the rules of
+CAN FD.
 
 Pure arithmetic on one frame: this module knows no bus, no time and no other frame.
 
 A data frame with an 11-bit identifier and n bytes takes 47 + 8n bits unstuffed and at most 55 + 10n; with a 29-bit
 identifier 67 + 8n to 80 + 10n. Both include the interframe space of 3 bits.
 
-An error costs what was sent before it, 6 to 12 bits of error flags, 8 of delimiter and the interframe space: 17 to 23 bits; an
-error-passive sender waits 8 more before it tries again, 31 in all.
+An error costs the bits sent before it, 6 to 12 bits of error flags, 8 of delimiter and the interframe space: 17 to 23
+bits. An error-passive sender waits 8 more bits before it retries, 31 in all.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ END_BITS = 10
 """CRC delimiter, acknowledge slot and delimiter, and the 7 bits of end of frame: never stuffed."""
 
 INTERFRAME_BITS = 3
-"""Intermission: the bus is busy for these after the end of a frame, then anybody may start."""
+"""Intermission: the bus is busy for these bits after the end of a frame, then every node may start."""
 
 ERROR_FLAG_BITS, ERROR_DELIMITER_BITS = 6, 8
 """An error frame: flags of six equal bits that overlap to at most twelve, then eight recessive bits."""
@@ -32,7 +33,7 @@ _STUFF_AFTER = 5
 
 
 def crc15(bits: str) -> int:
-    """CRC-15 of a string of ``0`` and ``1``: from start of frame to the last data bit, before stuffing."""
+    """Return the CRC-15 of a string of ``0`` and ``1``: from start of frame to the last data bit, before stuffing."""
     crc = 0
     for bit in bits:
         feedback = (crc >> 14) ^ (bit == "1")
@@ -43,7 +44,7 @@ def crc15(bits: str) -> int:
 
 
 def plain_bits(frame: CanFrame) -> str:
-    """The bits from start of frame to the end of the CRC sequence, dominant ``0``, before stuffing."""
+    """Return the bits from start of frame to the end of the CRC sequence, dominant ``0``, before stuffing."""
     rtr = "1" if frame.remote else "0"
     if frame.extended:
         base, extension = frame.can_id >> 18, frame.can_id & 0x3FFFF
@@ -70,31 +71,32 @@ def stuff(bits: str) -> str:
 
 
 def bits_to_end(frame: CanFrame) -> int:
-    """Bits from start of frame to the end of end-of-frame: when receivers have the frame and the sender its success."""
+    """Return the bits from start of frame to the end of end-of-frame, when the frame is valid for receivers and sender."""
     if frame.fd:
         return len(fd_bits(frame)) + END_BITS
     return _stuffed_length(frame.can_id, frame.data, frame.extended, frame.remote, frame.dlc) + END_BITS
 
 
 def bits_on_wire(frame: CanFrame) -> int:
-    """Bits that the frame keeps the bus busy: to the end of frame, and the interframe space."""
+    """Return the bits for which the frame keeps the bus busy: to the end of frame, and the interframe space."""
     return bits_to_end(frame) + INTERFRAME_BITS
 
 
 @lru_cache(maxsize=4096)
 def _stuffed_length(can_id: int, data: bytes, extended: bool, remote: bool, dlc: int) -> int:
-    # Cached by content: process data repeats, and the same frame is asked about when it wins and when it ends. By tables of
-    # bytes, since frames that do not repeat are asked about too: several times as fast as making the string of bits.
+    # Cached by content: process data repeats, and the length of a frame is needed when it wins and when it ends. It
+    # uses tables by byte, because frames that do not repeat occur too: several times as fast as building the string of
+    # bits.
     crc_of, stuffing = _tables()
     rtr = int(remote)
     if extended:
         head = (((can_id >> 18) << 2 | 0b11) << 18 | can_id & 0x3FFFF) << 3 | rtr << 2
-        length = 35  # start of frame, a leading zero, included
+        length = 35  # includes start of frame, a leading zero
     else:
         head, length = can_id << 3 | rtr << 2, 15
     covered, length = (head << 4 | dlc) << 8 * len(data) | int.from_bytes(data), length + 4 + 8 * len(data)
     crc = 0
-    for byte in covered.to_bytes((length + 7) // 8):  # zeros before the start change no check sum
+    for byte in covered.to_bytes((length + 7) // 8):  # zeros before the start do not change the checksum
         crc = (crc << 8 & 0x7FFF) ^ crc_of[crc >> 7 ^ byte]
     bits, length = covered << 15 | crc, length + 15
     odd = length % 8
@@ -109,13 +111,16 @@ def _stuffed_length(can_id: int, data: bytes, extended: bool, remote: bool, dlc:
 
 
 def _steps() -> dict[tuple[int, str], tuple[int, int]]:
-    """State and bit to state and stuff bits. A state is 0 (nothing yet), or ten times the level, the run's length, and one."""
+    """Return the transitions from state and bit to state and stuff bits.
+
+    A state is 0 (nothing yet), or ten times the level, plus the length of the run, plus one.
+    """
     steps = {}
     for state in (0, *(10 * level + run + 1 for level in (0, 1) for run in range(1, _STUFF_AFTER))):
         for bit in "01":
             level, run = divmod(state - 1, 10) if state else (-1, 0)
             run = run + 1 if level == int(bit) else 1
-            if run == _STUFF_AFTER:  # the complement is stuffed in, and begins a run
+            if run == _STUFF_AFTER:  # the complement is stuffed, and begins a run
                 steps[state, bit] = 10 * (1 - int(bit)) + 1 + 1, 1
             else:
                 steps[state, bit] = 10 * int(bit) + run + 1, 0
@@ -127,7 +132,7 @@ _STEP = _steps()
 
 @lru_cache(maxsize=1)
 def _tables() -> tuple[list[int], dict[int, list[tuple[int, int]]]]:
-    """The CRC of each byte, and for each state of the stuffing what each byte makes of it. Made when first asked for."""
+    """Return the CRC of each byte, and the effect of each byte on each stuffing state. Computed on first use."""
     stuffing: dict[int, list[tuple[int, int]]] = {}
     for state in {state for state, _ in _STEP}:
         stuffing[state] = []
@@ -141,10 +146,10 @@ def _tables() -> tuple[list[int], dict[int, list[tuple[int, int]]]]:
 
 
 def arbitration_key(frame: CanFrame) -> int:
-    """The arbitration field as a number, dominant bits low: of two frames that start together the lower key wins.
+    """Return the arbitration field as a number, dominant bits low: of two frames that start together the lower key wins.
 
-    11-bit data before 11-bit remote before any 29-bit frame of the same base identifier (RTR, SRR and IDE are
-    recessive there); then the extension, then 29-bit data before 29-bit remote.
+    11-bit data before 11-bit remote before any 29-bit frame of the same base identifier (RTR, SRR and IDE are recessive
+    there); then the extension, then 29-bit data before 29-bit remote.
     """
     if frame.extended:
         base, extension = frame.can_id >> 18, frame.can_id & 0x3FFFF
@@ -153,30 +158,32 @@ def arbitration_key(frame: CanFrame) -> int:
 
 
 def wire_bits(frame: CanFrame) -> str:
-    """All bits of an acknowledged frame as they stand on the wire, start to end of frame; stuffed up to the CRC's end."""
+    """Return all bits of an acknowledged frame as on the wire, start to end of frame; stuffed up to the CRC's end."""
     return (fd_bits(frame) if frame.fd else stuff(plain_bits(frame))) + "1" + "0" + "1" + "1" * 7
 
 
 def last_errant_bit(frame: CanFrame) -> int:
-    """The last bit whose error spoils the frame for all: the last but one of end of frame (ISO 11898-1, 10.4.2.6)."""
+    """Return the last bit whose error destroys the frame for all: the last but one of end of frame (ISO 11898-1, 10.4.2.6)."""
     return bits_to_end(frame) - 2
 
 
 def crc_objection_bit(frame: CanFrame) -> int:
-    """Where a receiver that found the CRC wrong starts its error flag: after the acknowledge delimiter."""
+    """Return where a receiver that found the CRC wrong starts its error flag: after the acknowledge delimiter."""
     return bits_to_end(frame) - 7
 
 
 def acknowledge_bit(frame: CanFrame) -> int:
-    """The acknowledge slot's place in the frame."""
+    """Return the position of the acknowledge slot in the frame."""
     return bits_to_end(frame) - 9
 
 
 def error_flag_bits(frame: CanFrame, seen: str) -> int:
-    """How long dominant error flags lie on the wire when the first begins after `seen`, the bits of `frame` up to there.
+    """Return how long dominant error flags are on the wire if the first begins after `seen`, the bits of `frame` up to
+    there.
 
-    The others notice when the first flag's six dominant bits break the stuffing or the fixed form, and answer with six of
-    their own: 6 bits where all notice at once (the last bit of `seen` broke the stuffing by itself), 7 to 12 otherwise.
+    The other nodes detect the error when the first flag's six dominant bits violate the stuffing or the fixed form, and
+    reply with six bits of their own: 6 bits if all nodes detect it at once (the last bit of `seen` violated the
+    stuffing), otherwise 7 to 12.
     """
     stuffed = bits_to_end(frame) - END_BITS
     tail = seen[-_STUFF_AFTER - 1 :]

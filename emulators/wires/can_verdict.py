@@ -1,8 +1,9 @@
-"""What becomes of one attempt to send, bit by bit (ISO 11898-1, 10.11 and 12.1). Pure: frames in, verdict out.
+"""The outcome of one attempt to send, bit by bit (ISO 11898-1, 10.11 and 12.1). Pure: from frames to a verdict.
 
-Collisions: nodes won the arbitration with one identifier and different content. All send until the first bit that differs; there
-the wire is dominant, and whoever sent the recessive bit has a bit error. An error-active node's flag destroys the frame for
-everybody. An error-passive one gives way, and the others go on to the next bit that differs among them.
+Collisions: several nodes won the arbitration with one identifier and different content. All send until the first bit
+that differs; there the bus is dominant, and each node that sent the recessive bit has a bit error. The flag of an
+error-active node destroys the frame for all nodes. An error-passive node gives way, and the others continue to the next
+bit that differs.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ from fieldtwin.gateway.core.canframe import CanFrame
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """Of a collision: `senders` are left, all with one frame. With `error_bit` it is destroyed, that bit being in error.
+    """The outcome of a collision: `senders` remain, all with one frame. With `error_bit` it is destroyed, by an error
+    in that bit.
 
     `losers` gave way, the last of them at `lost_bit`.
     """
@@ -39,9 +41,10 @@ class Outcome:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """An error frame. `kind` as in `WireFault`; the first flag begins at bit `flag_at`, all of it takes `bits` of the bus.
+    """An error frame. `kind` as in `WireFault`; the first flag begins at bit `flag_at`, and the attempt takes `bits` of
+    the bus.
 
-    `first` are receivers that objected before anybody else. Their counters rise by more.
+    `first` are receivers that objected before all others. Their counters rise by more.
     """
 
     kind: str
@@ -51,7 +54,9 @@ class Verdict:
 
 
 def collide(frames: Mapping[int, CanFrame], destroys: Callable[[int], bool]) -> Outcome:
-    """`frames` by node, with one arbitration field; `destroys`: whether a node's error flag is dominant."""
+    """Resolve a collision of `frames` by node, with one arbitration field; `destroys`: whether a node's error flag is
+    dominant.
+    """
     bits = {number: wire_bits(frame) for number, frame in frames.items()}
     left = dict(bits)
     losers: list[int] = []
@@ -71,18 +76,22 @@ def collide(frames: Mapping[int, CanFrame], destroys: Callable[[int], bool]) -> 
 
 
 def collided(frame: CanFrame, error_bit: int) -> Verdict:
-    """A sender of another frame read a dominant bit at `error_bit` of `frame`, where it sent a recessive one."""
+    """Return the verdict if a sender of a different frame read a dominant bit at `error_bit`, where it sent a recessive
+    one.
+    """
     return _flagged("bit", frame, wire_bits(frame)[: error_bit + 1])
 
 
 def unacknowledged(frame: CanFrame) -> Verdict:
-    """Nobody acknowledged: the sender's flag follows the acknowledge slot, and meets no other."""
+    """Return the verdict without an acknowledgement: the sender's flag follows the acknowledge slot, and overlaps no other."""
     at = acknowledge_bit(frame) + 1
     return Verdict("ack", at, at + ERROR_FLAG_BITS + ERROR_DELIMITER_BITS + INTERFRAME_BITS)
 
 
 def disturbed(what: Disturbance, frame: CanFrame, victims: Collection[int], *, at_sender: bool) -> Verdict:
-    """The frame is destroyed by `what`: at the sender (and everybody), or by the flags of `victims` among the receivers."""
+    """Return the verdict if `what` destroys the frame: at the sender (and all nodes), or by flags of `victims` among
+    receivers.
+    """
     wire = wire_bits(frame)
     first = frozenset() if at_sender else frozenset(victims)
     if what.at_bit is None:

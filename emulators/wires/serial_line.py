@@ -1,7 +1,7 @@
-"""A serial line as a model: when a character is on the far side.
+"""A model of a serial line: when a character has arrived at the receiver.
 
-Pure arithmetic over integer nanoseconds. It opens nothing, waits for nothing and never sees a byte's value. A pty or an
-in-memory wire asks it, because neither is slowed down by the baud rate that is set on it.
+Pure arithmetic in integer nanoseconds. It opens nothing, waits for nothing and never sees the value of a byte. A pty or
+an in-memory connection uses it, because the configured baud rate does not slow either of them down.
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ from fieldtwin.gateway.core.endpoint import SerialSettings
 
 FAST_BAUDRATE = 19200
 T1_5_FAST_NS, T3_5_FAST_NS = 750_000, 1_750_000
-"""Above 19200 baud the gaps no longer shrink with the character: fixed by SL 2.5.1.1."""
+"""Above 19200 baud the gaps no longer shrink with the character time: fixed by SL 2.5.1.1."""
 
 
 class SerialPacer:
-    """One direction of a line with `settings`. Characters go one after another, none is lost, none overtakes.
+    """One direction of a line with `settings`. Characters are sent one after the other; none is lost, none overtakes.
 
     All times are monotonic nanoseconds, rounded up: nothing ever arrives early.
     """
@@ -27,7 +27,7 @@ class SerialPacer:
             settings.baudrate,
         )  # as a fraction, so that nothing is rounded twice
         self.busy_until_ns = 0
-        """When the last character that was sent is on the far side; 0 if none was."""
+        """When the last character that was sent has arrived; 0 if none was sent."""
 
     @property
     def t1_5_ns(self) -> int:
@@ -40,17 +40,20 @@ class SerialPacer:
         return T3_5_FAST_NS if self.settings.baudrate > FAST_BAUDRATE else self._half_chars_ns(7)
 
     def duration_ns(self, nbytes: int) -> int:
-        """How long `nbytes` characters take back to back."""
+        """Return how long `nbytes` characters take without gaps."""
         numerator, denominator = self._char
         return -(-nbytes * numerator // denominator)
 
     def earliest_end(self, now_ns: int, nbytes: int) -> int:
-        """When `nbytes` handed over at `now_ns` would be on the far side, behind what is on its way. Books nothing."""
+        """Return when `nbytes` sent at `now_ns` would have arrived, after the characters in transit.
+
+        Does not occupy the line.
+        """
         busy_ns = self.busy_until_ns
         return (now_ns if now_ns > busy_ns else busy_ns) + self.duration_ns(nbytes)
 
     def send(self, now_ns: int, nbytes: int) -> int:
-        """Like `earliest_end`, and the line is taken until then."""
+        """Do the same as `earliest_end`, and occupy the line until then."""
         busy_ns = self.busy_until_ns
         numerator, denominator = self._char
         self.busy_until_ns = end_ns = (now_ns if now_ns > busy_ns else busy_ns) - (-nbytes * numerator // denominator)

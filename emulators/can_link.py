@@ -1,8 +1,8 @@
-"""Two CAN buses as one, with faults between them: masters on the near one, nodes on the far one, all of them programs of others.
+"""Joins two CAN buses with faults between them: third-party masters on the near bus, third-party nodes on the far bus.
 
-A frame that comes from the near side is a request, one from the far side a reply, of the node that its identifier names in the
-predefined connection set (CiA 301, 7.3.3). Frames keep their order but for those that a fault delays.
-What they mean is not known.
+A frame from the near side is a request and a frame from the far side a reply; the predefined connection set (CiA 301,
+7.3.3) gives the node from the identifier. Frames keep their order, except those that a fault delays. Frames are not
+interpreted.
 """
 
 from __future__ import annotations
@@ -22,18 +22,21 @@ from fieldtwin.gateway.core.connection import CanConnection
 from fieldtwin.gateway.core.errors import FieldtwinError, WireError
 
 MOST_WAITING = 10_000
-"""Frames that wait for their time; what is more is lost and counted."""
+"""Frames that wait for their time; further ones are lost and counted."""
 NMT, NO_NODE = 0x000, 0
 
 
 class CanLink:
-    """Runs from `start` to `aclose`, or until one of the two buses is gone: `ended` then gives why. Closes both ends."""
+    """Runs from `start` to `aclose`, or until one of the two buses is lost: `ended` then holds the reason.
+
+    Closes both ends.
+    """
 
     def __init__(self, near: CanConnection, far: CanConnection, faults: WireFaults) -> None:
         self.passed = dict.fromkeys(Way, 0)
-        """Frames that were sent on, by their way."""
+        """Frames that were forwarded, by direction."""
         self.lost = 0
-        """Frames that the other bus did not take, or that too many waited before."""
+        """Frames that the target bus did not accept, or for which there was no room in the queue."""
         self._near, self._far = near, far
         self._faults = faults
         self._loop = asyncio.get_running_loop()
@@ -42,7 +45,7 @@ class CanLink:
         self.ended: asyncio.Future[FieldtwinError] = self._loop.create_future()
 
     def start(self) -> None:
-        """Forward from now on; what a fault adds by itself comes at its time."""
+        """Start forwarding, and schedule the frames that faults add."""
         for way, source in ((Way.REQUEST, self._near), (Way.REPLY, self._far)):
             self._task(self._pump(source, way), f"CAN link, {way.value}")
         for active in self._faults.active.values():
@@ -65,7 +68,7 @@ class CanLink:
             while True:
                 frame = await source.recv()
                 if frame.error:
-                    continue  # it tells of one controller, not of a bus
+                    continue  # it concerns one controller, not a bus
                 for piece in self._become(frame, way):
                     if piece.delay_s <= 0:
                         await self._pass(piece.frame, way)
@@ -83,12 +86,12 @@ class CanLink:
         try:
             await (self._far if way is Way.REQUEST else self._near).send(frame)
         except WireError:
-            self.lost += 1  # a transmit queue that stays full; the next one may fit
+            self.lost += 1  # the transmit queue stays full; the next frame may fit
         else:
             self.passed[way] += 1
 
     def _appear(self, active: Active) -> None:
-        """What only the fault sends: the node that it aims at says it."""
+        """Schedule the frames that only the fault sends, on behalf of the node that it aims at."""
         if not isinstance(active.fault, CanFault) or active.aim.unit is None:
             return
         wait_s = max(0.0, (active.from_ns - self._now_ns()) / NS_PER_S)
@@ -121,7 +124,7 @@ class CanLink:
 
 
 def node_of(frame: CanFrame) -> int:
-    """The node that a frame is of, or to (CiA 301, 7.3.3); `NO_NODE` for SYNC, time stamps, and what is to all."""
+    """Return the node that a frame comes from or goes to (CiA 301, 7.3.3); `NO_NODE` for SYNC, time stamps and broadcasts."""
     if frame.extended:
         return NO_NODE
     if frame.can_id == NMT:

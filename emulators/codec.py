@@ -1,10 +1,10 @@
-"""How an emulated device lays its values into registers: the emulators' own codec.
+"""The encoding of an emulated device's values in registers: the emulators' own codec.
 
-It shares nothing with the one that drivers use. A bug in a codec that both sides shared would cancel itself out and stay
-unseen until the first real device. Pure; knows neither tables nor addresses.
+It shares no code with the codec of the drivers. A bug in a shared codec would cancel itself out and stay undetected until
+the first real device. Pure; it knows neither tables nor addresses.
 
-A register is 16 bits, sent high byte first (MODBUS Application Protocol V1.1b3, 4.2). How several registers make one value is the
-vendor's choice. `order` names it by where the bytes of the big-endian value end up:
+A register is 16 bits, sent high byte first (MODBUS Application Protocol V1.1b3, 4.2). The vendor chooses how several
+registers form one value. `order` names the choice by the positions of the bytes of the big-endian value:
 
 ====  ===========================================  ======================================
 ABCD  most significant register first              as most manuals say "big-endian"
@@ -32,16 +32,16 @@ NUMBERS = {
     "float32": ("f", 2),
     "float64": ("d", 4),
 }
-"""Type name to its struct code and number of registers."""
+"""Type name -> its struct code and number of registers."""
 
 BCD = {"bcd16": 1, "bcd32": 2}
-"""Binary-coded decimals, four digits a register: type name to its number of registers."""
+"""Binary-coded decimals, four digits per register: type name -> number of registers."""
 
 ORDERS = ("ABCD", "CDAB", "BADC", "DCBA")
 
 
 def register_count(type_name: str, registers: int = 0) -> int:
-    """How many registers a value of the type takes; a string takes the `registers` that its profile gives it."""
+    """Return how many registers a value of the type takes; a string takes the `registers` of its profile."""
     if type_name == "string":
         if registers < 1:
             raise Bug("a string of no registers")
@@ -50,11 +50,12 @@ def register_count(type_name: str, registers: int = 0) -> int:
 
 
 def encode(value: float | int | str, type_name: str, order: str = "ABCD", *, registers: int = 0) -> list[int]:
-    """`value` as registers, each 0 to 65535, in the order in which they are addressed.
+    """Return `value` as registers, each 0 to 65535, in the order of their addresses.
 
-    Integers are rounded to the nearest and held at the type's limits, as converters in devices do; NaN as an integer is
-    the type's limit that instruments use for "no value" (0x8000... signed, 0xFFFF... unsigned). A float32 too large
-    is an infinity. A string is ASCII, padded with NUL, cut at the end of its registers.
+    Integers are rounded to the nearest value and limited to the type's range, as converters in devices do; NaN as an
+    integer is the limit of the type that instruments use for "no value" (0x8000... signed, 0xFFFF... unsigned). A
+    float32 that is too large becomes infinite. A string is ASCII, padded with NUL, truncated at the end of its
+    registers.
     """
     if type_name == "string":
         raw = str(value).encode("ascii", "replace")
@@ -73,7 +74,7 @@ def encode(value: float | int | str, type_name: str, order: str = "ABCD", *, reg
 
 
 def decode(words: Sequence[int], type_name: str, order: str = "ABCD") -> float | int | str:
-    """The value that a master wrote into registers. A string ends at its first NUL."""
+    """Return the value that a client wrote into registers. A string ends at its first NUL."""
     if type_name == "string":
         raw = _join(words, order, reverse=False)
         return raw.split(b"\0", 1)[0].decode("ascii", "replace")
@@ -111,7 +112,9 @@ def _as_integer(value: float, code: str) -> int:
 
 
 def _as_digits(value: float, digits: int) -> bytes:
-    """`value` as decimal digits, two a byte, held within what they can show; NaN as all digits F, which are none."""
+    """Return `value` as decimal digits, two per byte, limited to the digits available; NaN as all digits F, which are
+    invalid.
+    """
     if math.isnan(value):
         return b"\xff" * (digits // 2)
     held = min(max(value, 0.0), 10.0**digits - 1)
@@ -128,7 +131,7 @@ def _digits_of(words: Sequence[int], type_name: str, order: str) -> int:
 
 
 def _split(raw: bytes, order: str, *, reverse: bool = True) -> list[int]:
-    """Big-endian bytes into registers. A string's registers are never reversed, only their bytes swapped."""
+    """Split big-endian bytes into registers. The registers of a string are never reversed; only their bytes are swapped."""
     _check(order)
     words = [raw[i : i + 2] for i in range(0, len(raw), 2)]
     if order in ("CDAB", "DCBA") and reverse:

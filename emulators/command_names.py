@@ -1,6 +1,6 @@
-"""Which command of its profile a Modbus request is: told by what it reads or writes.
+"""Determines which command of its profile a Modbus request is, from what it reads or writes.
 
-The names are those of the command list (SPEC ruling 12). Pure; decodes for itself, as everything on this side of the wire.
+The names are those of the command list (SPEC ruling 12). Pure; like all emulator code, it has its own decoder.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class CommandNames:
             self._writes += [(profile.inbox.ack, "acknowledge"), (profile.outbox.at, "send")]
 
     def of(self, pdu: bytes) -> str:
-        """The name of the command, the lowest addressed where a request touches several; empty where it is none."""
+        """Return the name of the command; that with the lowest address if there are several, empty if there is none."""
         request = parse_request(pdu)
         if request is None:
             return ""

@@ -1,8 +1,8 @@
 """The paper's virtual context: a collection of recordings from which an emulator answers (SPEC row Emulator).
 
-Ordered, time-stamped, duplicates kept, bounded (rulings 2 and 3): of what was recorded for a command, the oldest is
-returned first and removed. Pure; it knows neither protocols nor files. `fieldtwin.emulators.replay` stands on it and makes a
-command of each register that a request asks for.
+Ordered, time-stamped, bounded, with duplicates kept (rulings 2 and 3): the oldest recording of a command is returned
+first and removed. Pure; it knows neither protocols nor files. `fieldtwin.emulators.replay` uses it with one command for
+each register that a request reads.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ MAX_ENTRIES = 500_000
 
 
 class WhenUsedUp(Enum):
-    """What an emulator does when its recording has nothing left (SPEC ruling 3); named in the prototype file."""
+    """The behaviour of an emulator at the end of its recording (SPEC ruling 3); named in the prototype file."""
 
     HOLD = "hold"
     LOOP = "loop"
@@ -29,7 +29,7 @@ class WhenUsedUp(Enum):
 
     @classmethod
     def parse(cls, text: str) -> WhenUsedUp:
-        """The policy of that name; raises `UsageError`."""
+        """Return the policy of that name; raises `UsageError`."""
         try:
             return cls(text)
         except ValueError:
@@ -42,9 +42,9 @@ class UsedUp(FileInvalid):
 
 
 class Recorded(msgspec.Struct, frozen=True):
-    """A recorded response, when it was recorded (seconds since the recording's start) and how long it had taken.
+    """A recorded response, the time of recording (seconds since the recording's start) and its latency.
 
-    A struct and not a dataclass: for long recordings they are made when they are asked for.
+    A struct and not a dataclass, because in long recordings the objects are created on access.
     """
 
     t_s: float
@@ -53,14 +53,15 @@ class Recorded(msgspec.Struct, frozen=True):
 
 
 RELEASE_AT = 512
-"""Taken recordings of a command that are still in memory before they are let go together: removing each by itself from the
-head of a list would cost as many steps as there are behind it."""
+"""Number of taken recordings of a command that are kept before they are removed together: removing each one from the
+head of a list would take as many steps as there are recordings after it.
+"""
 
 
 class _Series:
-    """What was recorded for one command, how far it was taken, and the last one taken. The list may be another's, too.
+    """The recordings of one command, how many were taken, and the last one taken. The list may be shared.
 
-    `whole`: it was given as it is, and nothing is added to it or dropped from it.
+    `whole`: the series was added complete, and nothing is added to it or dropped from it.
     """
 
     __slots__ = ("at", "last", "recorded", "shared", "skip", "when_used_up", "whole")
@@ -73,7 +74,7 @@ class _Series:
         self.whole = whole
         self.at = 0
         self.last: Recorded | None = None
-        self.skip = 0  # taken since, and still in the context's order of arrival
+        self.skip = 0  # taken entries that are still in the context's order of arrival
         self.when_used_up = when_used_up
 
     @property
@@ -81,7 +82,7 @@ class _Series:
         return len(self.recorded) - self.at
 
     def take(self) -> Recorded:
-        """The oldest that is left, removed."""
+        """Remove and return the oldest remaining recording."""
         recorded = self.last = self.recorded[self.at]
         self.at += 1
         wanted_again = self.shared or self.when_used_up is WhenUsedUp.LOOP
@@ -92,18 +93,18 @@ class _Series:
 
 
 def _own(series: _Series) -> list[Recorded]:
-    """The list of a series that is nobody else's."""
+    """Return the list of a series that is not shared."""
     assert isinstance(series.recorded, list)
     return series.recorded
 
 
 class VirtualContext:
-    """Recordings by command. `taken` counts what was removed by being returned, `dropped` what had no room.
+    """Recordings by command. `taken` counts the removed (returned) recordings, `dropped` those for which there was no room.
 
-    With `commands`, that list is fixed and its items are what `take` accepts, with or without recordings. Without, it is
-    derived from what is added (ruling 12). A full context drops its oldest entry.
+    With `commands`, that list is fixed and `take` accepts exactly its items, with or without recordings. Without it,
+    the list is derived from the added recordings (ruling 12). A full context drops its oldest entry.
 
-    `copy` gives another one that begins where this one began; many devices of one recording have one each.
+    `copy` returns a context in the initial state of this one; each device of one recording has its own copy.
     """
 
     def __init__(
@@ -119,17 +120,20 @@ class VirtualContext:
         self.taken = 0
         self.dropped = 0
         self._left = 0
-        self._held = 0  # of those left the ones that were added one by one: their number is bounded
+        self._held = 0  # the remaining recordings that were added one by one; their number is limited
         self._fixed = commands is not None
         self._series: dict[bytes, _Series] = {command.data: _Series(when_used_up) for command in commands or ()}
-        self._order: deque[_Series] = deque()  # one entry for each added and not yet known to be gone
+        self._order: deque[_Series] = deque()  # one entry for each added recording that is not known to be gone
         self._origin: Mapping[bytes, _Series] | None = None
         for command, recorded in recordings:
             self.add(command, recorded)
 
     def copy(self) -> VirtualContext:
-        """A context with the same recordings, which nothing can be added to any more, here or there. This one must not
-        have been taken from. The recordings are in memory once, and a command costs some when it is first asked for."""
+        """Return a context with the same recordings. Afterwards nothing can be added to either of them.
+
+        Nothing may have been taken from this one. The recordings are shared in memory; a copy needs memory for each
+        command that is used.
+        """
         if self.taken:
             raise Bug("a context was copied after something was taken from it")
         other = VirtualContext(when_used_up=self.when_used_up, max_entries=self.max_entries)
@@ -140,16 +144,16 @@ class VirtualContext:
         return other
 
     def __len__(self) -> int:
-        """How many recordings are left."""
+        """Return how many recordings are left."""
         return self._left
 
     @property
     def command_list(self) -> tuple[COMMAND, ...]:
-        """The commands that `take` accepts, in the order in which they came."""
+        """The commands that `take` accepts, in the order in which they were added."""
         return tuple(COMMAND(data) for data in (self._series if self._origin is None else self._origin))
 
     def left(self, command: COMMAND) -> int:
-        """How many recordings are left for `command`."""
+        """Return how many recordings are left for `command`."""
         series = self._find(command)
         return series.left if series else 0
 
@@ -160,7 +164,7 @@ class VirtualContext:
         return series
 
     def add(self, command: COMMAND, recorded: Recorded) -> None:
-        """Append to what was recorded for `command`; raises `UnknownCommand` where the list is fixed."""
+        """Append a recording for `command`; raises `UnknownCommand` if the list is fixed."""
         if self._origin is not None:
             raise Bug("something was added to a copied context")
         series = self._series.get(command.data)
@@ -180,8 +184,11 @@ class VirtualContext:
         self._held += 1
 
     def add_series(self, command: COMMAND, recorded: Sequence[Recorded]) -> None:
-        """All that was recorded for a command of which nothing was added: whoever gives it bounds it, and it does not count
-        for `max_entries`. It may make its items when they are asked for."""
+        """Add all recordings of a command for which nothing was added yet.
+
+        The caller limits their number; they do not count for `max_entries`. The sequence may create its items on
+        access.
+        """
         if self._origin is not None or self._fixed or command.data in self._series:
             raise Bug("a series for a command that is there, or of a context that is fixed")
         if len(self._series) >= self.max_entries:
@@ -190,29 +197,29 @@ class VirtualContext:
         self._left += len(recorded)
 
     def set_policies(self, policies: Mapping[bytes, WhenUsedUp]) -> None:
-        """Other policies for single commands, which must be in the list."""
+        """Set different policies for single commands, which must be in the list."""
         for data, policy in policies.items():
             if data not in self._series:
                 raise self._unknown(COMMAND(data))
             self._series[data].when_used_up = policy
 
     def peek(self, command: COMMAND) -> Recorded | None:
-        """What was returned last for a command or, before that, what will be; None where there is nothing."""
+        """Return the last recording returned for a command, or else the next one; None if there is none."""
         series = self._find(command)
         if series is None:
             return None
         return series.last or (series.recorded[series.at] if series.left else None)
 
     def take(self, command: COMMAND) -> RECORDING:
-        """SPEC: the command must be in the list; a recording of the context is returned and removed.
+        """Return and remove a recording of the context; the command must be in the list (SPEC).
 
-        Used up: `HOLD` returns the last one again, `LOOP` starts over, `ERROR` raises `UsedUp`, and so do the
-        others where nothing was ever recorded. Raises `UnknownCommand`.
+        At the end, `HOLD` returns the last one again, `LOOP` starts over, and `ERROR` raises `UsedUp`, as do the others
+        if nothing was ever recorded. Raises `UnknownCommand`.
         """
         return self.take_recorded(command).response
 
     def take_recorded(self, command: COMMAND) -> Recorded:
-        """As `take`, with time and latency."""
+        """Do the same as `take`, and return time and latency too."""
         series = self._find(command)
         if series is None:
             raise self._unknown(command)
@@ -233,10 +240,10 @@ class VirtualContext:
         self._left -= 1
         self.taken += 1
         if self._origin is not None or series.whole:
-            return recorded  # nothing is added, so nobody asks for the order
+            return recorded  # nothing is added, so the order is not needed
         self._held -= 1
         series.skip += 1
-        while self._order and self._order[0].skip:  # forget the order of those that are gone
+        while self._order and self._order[0].skip:  # remove taken entries from the order
             self._order.popleft().skip -= 1
         return recorded
 

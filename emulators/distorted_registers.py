@@ -1,7 +1,7 @@
-"""Value faults of a Modbus device that is a model: its registers hold something else while a fault is in.
+"""Value faults of a Modbus device with a model: its registers hold different values while a fault is active.
 
-What lies beneath goes on as it would: masters write it, effects change it, and it is what is read again when the fault is over.
-Pure; a function of time only through what is asked.
+The undistorted values continue to change: clients write them, effects change them, and they are read again after the
+fault is over. Pure; it changes only with requests.
 """
 
 from __future__ import annotations
@@ -17,8 +17,10 @@ from fieldtwin.gateway.core.profile import DeviceProfile, Tag
 
 
 class DistortedRegisters(RegisterBank):
-    """`bank` of a device that `profile` describes; `peek` gives one of its cells without being a read. What is read instead is
-    noted in `journal` as held."""
+    """`bank` of a device that `profile` describes; `peek` returns a cell without the effects of a read.
+
+    The distorted values that are read are noted in `journal` as held.
+    """
 
     def __init__(
         self,
@@ -29,8 +31,11 @@ class DistortedRegisters(RegisterBank):
         tags: Iterable[Tag] | None = None,
         distortions: Distortions | None = None,
     ) -> None:
-        """`tags`: those that are distorted here, and then only by what names them; by default all are, by everything.
-        `distortions` may be shared with whoever distorts the others."""
+        """`tags`: the tags that are distorted here, and then only by faults that name them; by default all tags, by all
+        faults.
+
+        `distortions` may be shared with the object that distorts the other tags.
+        """
         self._named = tags is not None
         self.distortions = Distortions() if distortions is None else distortions
         self._peek = peek
@@ -58,7 +63,7 @@ class DistortedRegisters(RegisterBank):
                 for cell, content in zip(range(at.address, at.end), self._cells(tag, own, now_ns), strict=True):
                     if address <= cell < address + count:
                         held[cell - address] = merged(tag, held[cell - address], content)
-            elif tag.name in self._noted:  # it is over: what lies beneath is held again
+            elif tag.name in self._noted:  # the fault is over: the undistorted value is held again
                 self._noted.discard(tag.name)
                 self._journal.note(tag.name, bytes_of(tag, own), now_ns)
         return held
@@ -70,13 +75,13 @@ class DistortedRegisters(RegisterBank):
         self.bank.write(table, address, values, now_ns)
 
     def _cells(self, tag: Tag, own: list[int], now_ns: int) -> list[int]:
-        """The cells that the tag has instead of its `own`."""
+        """Return the distorted cells of the tag in place of its `own`."""
         by = self._scales.get(tag.name)
         exponent = 0 if by is None else int(raw_of(by, [self._peek(by.registers.table, by.registers.address)]))
         raw = raw_of(tag, own) * tag.scale * 10.0**exponent + tag.offset
         value = self.distortions.apply(tag.name, raw, now_ns, named=self._named)
         if math.isnan(value) and (tag.bits is not None or tag.registers.table in BIT_TABLES):
-            return own  # no bits say "no number"
+            return own  # bits cannot express "no number"
         cells = [merged(tag, a, b) for a, b in zip(own, cells_of(tag, value, exponent), strict=True)]
         self._noted.add(tag.name)
         self._journal.note(tag.name, bytes_of(tag, cells), now_ns)

@@ -1,9 +1,10 @@
-"""The paper's emulators: devices that answer from their virtual context instead of the world.
+"""The paper's emulators: devices that answer from their virtual context instead of the physical environment.
 
-An emulator is a Device and no Sensor: the real one is a black box, of which only the conversation is known. Between the frames
-of a line (fieldtwin.emulators.modbus.rtu, mbap) and what a unit does with a request (fieldtwin.emulators.modbus.unit,
-fieldtwin.emulators.replay), here is the device that the paper speaks of: it reads a command from its own end of a wire, requires
-it to be in its list, answers from its context and sends the response. It never knows its driver.
+An emulator is a Device and not a Sensor: the real device is a black box of which only the communication is known. This
+module is the device that the paper describes, between the frames of a line (fieldtwin.emulators.modbus.rtu, mbap) and
+the processing of a request by a unit (fieldtwin.emulators.modbus.unit, fieldtwin.emulators.replay). It reads a command
+from its own end of a connection, requires it to be in its list, answers from its context and sends the response. It
+never knows its driver.
 """
 
 from __future__ import annotations
@@ -24,14 +25,14 @@ from fieldtwin.gateway.core.profile import DeviceProfile
 from fieldtwin.gateway.core.values import COMMAND, RECORDING
 
 Answer = Callable[[bytes, int], bytes | None]
-"""``(request, now_ns) -> response``, None for silence: what a unit does with a request PDU."""
+"""``(request, now_ns) -> response``, None for silence: a unit's processing of a request PDU."""
 
 
 class Emulator(Device, ABC):
-    """SPEC row Emulator. `virtual_context` is a collection of recordings, empty where a simulation stands for it.
+    """SPEC row Emulator. `virtual_context` is a collection of recordings, empty if a simulation replaces it.
 
-    Recorded responses are returned in order and removed (`fieldtwin.emulators.context.VirtualContext`); recorded signals are
-    read at the emulator's clock and stay (SPEC ruling 3).
+    Recorded responses are returned in order and removed (`fieldtwin.emulators.context.VirtualContext`); recorded
+    signals are read at the emulator's clock and stay (SPEC ruling 3).
     """
 
     def __init__(self, connection: End[bytes], profile: DeviceProfile, virtual_context: Sized) -> None:
@@ -53,7 +54,7 @@ class UnitEmulator(Emulator):
         self._answer = answer
 
     def recognise(self, data: bytes) -> COMMAND:
-        return self._recognised(data)  # the same few polls come again and again, and a command is a value
+        return self._recognised(data)  # cached: the same few polls repeat, and a command is a value
 
     def _execute(self, command: COMMAND, now_ns: int) -> RECORDING:
         self.executed[command.name] += 1
@@ -61,29 +62,29 @@ class UnitEmulator(Emulator):
 
 
 class SensorEmulator(UnitEmulator):
-    """SPEC row SensorEmulator: on RS232, as the sensor that it stands for."""
+    """SPEC row SensorEmulator: on RS232, like the sensor that it emulates."""
 
     wire_types = frozenset({PROTOCOL.RS232})
 
 
 class TransmitterEmulator(UnitEmulator):
-    """What stands for a transmitter: on TCP."""
+    """The emulator of a transmitter: on TCP."""
 
     wire_types = frozenset({PROTOCOL.TCP})
 
 
 def emulator_kind(kind: PROTOCOL, profile: DeviceProfile) -> type[UnitEmulator]:
-    """The emulator that a profile on a kind of wire asks for; the counterpart of the gateway's choice of drivers."""
+    """Return the emulator class for a profile on a kind of connection; the counterpart of the gateway's choice of drivers."""
     if profile.inbox is not None:
         return TransmitterEmulator
     return SensorEmulator if kind is PROTOCOL.RS232 else UnitEmulator
 
 
 class EmulatedUnit(ModbusUnit):
-    """A unit of an emulated line whose requests go through the device's own connection.
+    """A unit of an emulated line whose requests pass through the device's own connection.
 
-    `kind` is the wire of the device that it stands for, whatever carries it now. A request that is no command of the list
-    gets the protocol's own answer (SPEC ruling 11), and is counted in `unlisted`.
+    `kind` is the connection type of the emulated device, whatever carries it now. A request that is not in the command
+    list gets the protocol's own answer (SPEC ruling 11), and is counted in `unlisted`.
     """
 
     def __init__(
@@ -113,8 +114,8 @@ class EmulatedUnit(ModbusUnit):
 
 @dataclass(frozen=True)
 class EmulatedCommunication(Communication):
-    """SPEC row EmulatedCommunication: the same agreement, with an emulator in the device's place.
+    """SPEC row EmulatedCommunication: the same agreement, with an emulator in place of the device.
 
-    What lies between the two is an EmulatedConnection (`fieldtwin.emulators.link`), which belongs to neither and is asked for
-    nothing here.
+    The connection between the two is an EmulatedConnection (`fieldtwin.emulators.link`), which belongs to neither and
+    is not used here.
     """

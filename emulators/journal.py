@@ -1,7 +1,7 @@
-"""What an emulated device really held: every raw value of every tag, in order. The oracle of a prototype run.
+"""The values that an emulated device really held: every raw value of every tag, in order. The reference of a prototype run.
 
-Whatever the gateway published as good must be found here (bytes as the device would send them). Bounded: the oldest entries
-fall off and are counted; whoever checks fetches often enough.
+Every value that the gateway published as good must occur here (bytes as the device would send them). Bounded: the
+oldest entries are dropped and counted, so a checker must fetch entries often enough.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ import msgspec
 
 CAPACITY = 200_000
 SHARED, LEAST = 1_000_000, 1_000
-"""Entries of all devices of a process together, some 60 bytes each; and what a device has of them at least."""
+"""Most entries of all devices in a process together, about 60 bytes each; and the minimum for one device."""
 
 
 class Held(msgspec.Struct, frozen=True, gc=False):
-    """From `t_ns` (the emulator's monotonic time) on, `tag` was `raw`."""
+    """From `t_ns` (the emulator's monotonic time) on, `tag` had the value `raw`."""
 
     number: int
     tag: str
@@ -26,8 +26,11 @@ class Held(msgspec.Struct, frozen=True, gc=False):
 
 
 class HeldJournal:
-    """One device's journal. Equal values in a row are one entry. Kept as columns, and numbered by where an entry stands: a
-    thousand devices in one process hold a million entries."""
+    """One device's journal. Consecutive equal values are one entry.
+
+    Entries are stored in columns, and numbered by position, because a thousand devices in one process hold a million
+    entries.
+    """
 
     def __init__(self, capacity: int = CAPACITY) -> None:
         self._tags: deque[str] = deque(maxlen=capacity)
@@ -36,7 +39,7 @@ class HeldJournal:
         self._last: dict[str, bytes] = {}
         self._watched: dict[str, Callable[[bytes, int], None]] = {}
         self.number = 0
-        """Of the latest entry; they count from 1."""
+        """Number of the latest entry; numbering starts at 1."""
 
     def keep(self, capacity: int) -> None:
         """Keep at most `capacity` entries from now on; the newest stay."""
@@ -46,11 +49,11 @@ class HeldJournal:
 
     @property
     def dropped(self) -> int:
-        """Entries that fell off."""
+        """Number of entries that were dropped."""
         return self.number - len(self._tags)
 
     def note(self, tag: str, raw: bytes, now_ns: int) -> None:
-        """`tag` is `raw` from now on."""
+        """Record that `tag` has the value `raw` from now on."""
         if self._last.get(tag) == raw:
             return
         self._last[tag] = raw
@@ -62,16 +65,16 @@ class HeldJournal:
         self._times.append(now_ns)
 
     def watch(self, tag: str, changed: Callable[[bytes, int], None]) -> None:
-        """Call ``changed(raw, t_ns)`` each time that `tag` becomes something else, and now where it is something already.
+        """Call ``changed(raw, t_ns)`` each time that the value of `tag` changes, and now if it already has one.
 
-        One watcher a tag. It may not write to the device.
+        One watcher per tag. It may not write to the device.
         """
         self._watched[tag] = changed
         if tag in self._last:
             changed(self._last[tag], 0)
 
     def since(self, number: int) -> list[Held]:
-        """The entries after entry `number`, as far as they are kept."""
+        """Return the entries after entry `number`, as far as they are kept."""
         count = min(self.number - number, len(self._tags))
         numbers = range(self.number, self.number - count, -1)
         newest = zip(numbers, reversed(self._tags), reversed(self._raws), reversed(self._times), strict=False)
@@ -79,5 +82,5 @@ class HeldJournal:
 
 
 def share_of(devices: int) -> int:
-    """How many entries each of so many devices in a process keeps."""
+    """Return how many entries each of `devices` devices in a process keeps."""
     return min(CAPACITY, max(LEAST, SHARED // max(1, devices)))

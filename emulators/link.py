@@ -1,11 +1,12 @@
-"""The EmulatedConnection: a wire that is carried over TCP, belonging neither to the device nor to its driver.
+"""The EmulatedConnection: a serial line carried over TCP, which belongs neither to the device nor to its driver.
 
-A virtual serial port here and a TCP stream there (``fieldtwin link PTY tcp://HOST:PORT``), as ``socat
-pty,raw,echo=0,link=PTY tcp:HOST:PORT`` does it, and interoperable with that on either side. Bytes pass unchanged, in
-order and exactly once while the carrier stands. While it does not, what is said on the line is lost and counted, as on
-a cable that is cut: kept and delivered later, a request would be executed long after its sender gave it up.
+It connects a virtual serial port and a TCP stream (``fieldtwin link PTY tcp://HOST:PORT``), like ``socat
+pty,raw,echo=0,link=PTY tcp:HOST:PORT``, and interoperates with socat on either side. Bytes pass unchanged, in order and
+exactly once while the TCP connection (the carrier) exists. Without it, bytes sent on the line are lost and counted, as
+on a cable that is cut: if a request were kept and delivered later, it would be executed long after its sender gave it
+up.
 
-It must never know a protocol: no frame, no unit, no time-out of a request.
+It must never know a protocol: no frame, no unit, no timeout of a request.
 """
 
 from __future__ import annotations
@@ -30,23 +31,25 @@ CARRIERS = ("tcp", "rtu+tcp")
 
 @dataclass(frozen=True, slots=True)
 class LinkOptions:
-    """How a link behaves when its carrier does not."""
+    """The behaviour of a link when its carrier fails."""
 
     connect_timeout_s: float = 5.0
     backoff_s: float = 0.1
-    """First wait before trying again; doubles up to `backoff_max_s`, starts over once a session proved itself."""
+    """First wait before a retry; it doubles up to `backoff_max_s`, and starts over after a session of `proven_after_s`."""
     backoff_max_s: float = 5.0
     proven_after_s: float = 1.0
     half_close_s: float = 0.5
     """How long a side that finished sending may still receive (socat -t)."""
     stall_s: float = 2.0
-    """How long a serial line that takes no bytes is waited for, beyond its wire time; then they are lost."""
+    """How long the link waits for a serial line that accepts no bytes, beyond its transmission time; then the bytes are
+    lost.
+    """
 
 
 class EmulatedConnection(TCPConnection):
-    """SPEC row EmulatedConnection: a Connection, of type TCP for its whole life, that knows the original protocol.
+    """SPEC row EmulatedConnection: a Connection that is always of type TCP and knows the original protocol.
 
-    `emulate_write` and `emulate_read` are the identity: what comes in goes out, byte for byte. They count.
+    `emulate_write` and `emulate_read` are the identity: they return the bytes unchanged, and count them.
     """
 
     def __init__(self, protocol: PROTOCOL) -> None:
@@ -57,37 +60,37 @@ class EmulatedConnection(TCPConnection):
         self.written_bytes = 0
         self.read_bytes = 0
         self.dropped_write_bytes = 0
-        """Bytes of the near side that were lost: no carrier, or it broke with them."""
+        """Bytes from the near side that were lost: there was no carrier, or it broke while sending them."""
         self.dropped_read_bytes = 0
-        """Bytes of the far side that were lost: the near side did not take them."""
+        """Bytes from the far side that were lost because the near side did not accept them."""
 
     def emulate_write(self, data: bytes) -> bytes:
-        """Outgoing, from the near side to the carrier: the same bytes."""
+        """Pass outgoing bytes from the near side to the carrier unchanged."""
         self.written_bytes += len(data)
         return data
 
     def emulate_read(self, data: bytes) -> bytes:
-        """Incoming, from the carrier to the near side: the same bytes."""
+        """Pass incoming bytes from the carrier to the near side unchanged."""
         self.read_bytes += len(data)
         return data
 
 
 class _Plug(ABC):
-    """A side of the link: how it is prepared once and connected again and again."""
+    """A side of the link: how it is prepared once and connected repeatedly."""
 
     stays: bool
-    """Open across sessions: a serial port does not go away because the carrier did."""
+    """Whether it stays open across sessions: a serial port does not disappear when the carrier does."""
 
     def __init__(self, endpoint: Endpoint) -> None:
         self.endpoint = endpoint
         self.connection: ByteConnection | None = None
 
     async def prepare(self) -> None:  # noqa: B027  not abstract: most sides have nothing to prepare
-        """What must succeed before anything runs; raises when it does not."""
+        """Do what must succeed before the link runs; raises if it fails."""
 
     @abstractmethod
     async def connect(self) -> ByteConnection:
-        """The connection of this session; raises `Unreachable`."""
+        """Return the connection of this session; raises `Unreachable`."""
 
     async def disconnect(self) -> None:
         if self.connection is not None:
@@ -175,11 +178,11 @@ def _plug(endpoint: Endpoint, options: LinkOptions) -> _Plug:
 
 
 class Link:
-    """An emulated connection between `near` and `far`, running.
+    """A running emulated connection between `near` and `far`.
 
-    ``near -> far`` is `EmulatedConnection.emulate_write`, ``far -> near`` is `emulate_read`. At least one end is TCP, except
-    where there are `faults`: then two serial ports of this computer will do, with the masters at the near one.
-    `on_event` is told, in a line for a person, when the carrier comes, goes, or cannot be had.
+    ``near -> far`` is `EmulatedConnection.emulate_write`, ``far -> near`` is `emulate_read`. At least one end is TCP,
+    unless there are `faults`: then two serial ports of this computer are permitted, with the clients at the near one.
+    `on_event` is called with a line for the user when the carrier connects, disconnects, or cannot be reached.
     """
 
     def __init__(
@@ -201,20 +204,20 @@ class Link:
         serial = self._near.stays or self._far.stays
         self.connection = EmulatedConnection(PROTOCOL.RS232 if serial else PROTOCOL.TCP)
         self.sessions = 0
-        """How often the carrier came up."""
+        """How often the carrier was connected."""
         self.failed_attempts = 0
-        """How often it could not be had."""
+        """How often connecting it failed."""
         self.connected = False
         self._on_event = on_event
         self._last_event = ""
 
     @property
     def ends(self) -> tuple[Endpoint, Endpoint]:
-        """Near and far, with the real port where it listens."""
+        """Near and far endpoint, with the real port if it listens."""
         return self._near.endpoint, self._far.endpoint
 
     async def open(self) -> None:
-        """Make the virtual serial port and listen, whatever this link has of them; raises when that fails."""
+        """Create the virtual serial port and the listener that this link has; raises if that fails."""
         try:
             await self._near.prepare()
             await self._far.prepare()
@@ -223,7 +226,7 @@ class Link:
             raise
 
     async def serve(self) -> None:
-        """Forward until cancelled, connecting again with back-off whenever the carrier is gone."""
+        """Forward until cancelled, reconnecting with back-off whenever the carrier is lost."""
         loop = asyncio.get_running_loop()
         wait_s = self.options.backoff_s
         while True:
@@ -255,7 +258,7 @@ class Link:
         await self._far.aclose()
 
     def stats(self) -> dict[str, int]:
-        """Counters since the start."""
+        """Return the counters since the start."""
         c = self.connection
         return {
             "sessions": self.sessions,
@@ -267,7 +270,7 @@ class Link:
         }
 
     async def _connect(self) -> tuple[ByteConnection, ByteConnection]:
-        """Serial ports first, then whoever comes to us, and only then is anybody dialled."""
+        """Connect both sides: serial ports first, then incoming connections, and outgoing connections last."""
         order = sorted((self._near, self._far), key=lambda plug: (not plug.stays, isinstance(plug, _DialPlug)))
         first = await order[0].connect()
         async with self._line_cut():
@@ -276,7 +279,7 @@ class Link:
 
     @contextlib.asynccontextmanager
     async def _line_cut(self) -> AsyncIterator[None]:
-        """While there is no carrier, what a serial side says is lost, and counted."""
+        """While there is no carrier, drop and count the bytes from a serial side."""
         tasks = []
         for plug in (self._near, self._far):
             if plug.stays and plug.open_now is not None:
@@ -288,14 +291,14 @@ class Link:
 
     async def _discard(self, plug: _Plug) -> None:
         while (connection := plug.open_now) is not None:
-            with contextlib.suppress(Unreachable):  # lost: the next connect sees it
+            with contextlib.suppress(Unreachable):  # lost: the next connect detects it
                 self._dropped(plug is self._near, len(await connection.read()))
 
     async def _session(self, near: ByteConnection, far: ByteConnection) -> str:
-        """Forward both ways until one side ends; why it did."""
+        """Forward in both directions until one side ends; return the reason."""
         masters, devices = near, far
         behind: FaultyEnd | None = None
-        if self._faults is not None:  # the end at which masters ask: a port that was made, or where we listen
+        if self._faults is not None:  # the end with the clients: a port created here, or the listener
             asked_at_far = isinstance(self._far, _PtyPlug | _DoorPlug) and not self._serial_only
             behind = FaultyEnd(far if asked_at_far else near, self._faults)
             masters, devices = (behind, far) if behind.inner is near else (near, behind)
@@ -308,7 +311,7 @@ class Link:
             finished = isinstance(source, TcpEnd) and source.half_closed
             if finished and isinstance(target, TcpEnd):
                 target.finish()
-            # the other direction goes on where a side still listens, or where bytes of a side that is gone are here
+            # the other direction continues if a side still receives, or if bytes of a lost side are still here
             if still and (finished or target.lost is not None):
                 await asyncio.wait((other,), timeout=self.options.half_close_s)
             return str(ended.result())
@@ -318,7 +321,7 @@ class Link:
             await _cancel(outward, inward)
 
     async def _pump(self, source: ByteConnection, target: ByteConnection, outward: bool) -> FieldtwinError:
-        """One direction, a chunk at a time, so that a slow side holds the other back. Returns why it ended."""
+        """Forward one direction, one chunk at a time, so that a slow side holds the other back. Return why it ended."""
         forward = self.connection.emulate_write if outward else self.connection.emulate_read
         while True:
             try:
@@ -339,7 +342,7 @@ class Link:
                     self._dropped(outward, len(data))
 
     def _patience_s(self, target: ByteConnection, nbytes: int) -> float | None:
-        """TCP holds back its sender for as long as it takes; a serial line waits for nobody."""
+        """Return the time limit for a write: none for TCP, which holds back its sender; a serial line does not wait."""
         if isinstance(target, FaultyEnd):
             target = target.inner
         if isinstance(target, TcpEnd):
@@ -353,7 +356,7 @@ class Link:
             self.connection.dropped_read_bytes += nbytes
 
     def _event(self, text: str) -> None:
-        if self._on_event is not None and text != self._last_event:  # the same refusal every 5 s is said once
+        if self._on_event is not None and text != self._last_event:  # a repeated event is reported once
             self._last_event = text
             self._on_event(text)
 
@@ -373,10 +376,11 @@ async def run_link(
     on_ready: Callable[[Link], None] | None = None,
     faults: WireFaults | None = None,
 ) -> None:
-    """Run a link until cancelled. `on_ready` is called once its port and its listener exist. `faults` strike what passes.
+    """Run a link until cancelled. `on_ready` is called once its port and its listener exist. `faults` strike the
+    passing bytes.
 
-    Raises `UsageError` for endpoints that cannot be linked, `EndpointBusy` when the port to listen on is taken.
-    A far side that is not there yet is no error: it is tried again.
+    Raises `UsageError` for endpoints that cannot be linked, `EndpointBusy` if the port to listen on is taken. A far
+    side that cannot be reached yet is not an error: the link retries.
     """
     link = Link(near, far, options, on_event, faults)
     await link.open()

@@ -1,7 +1,7 @@
-"""A device known by a recording of exchanges, with what its profile says besides: counters, identity, its own functions.
+"""A device known from a recording of exchanges, with data from its profile: counters, identity, device-specific functions.
 
-It goes through the device's own connection, as every emulator does, and notes what it held: whatever it answered to a read.
-It never knows its driver, nor what carries its wire.
+Like every emulator, it uses the device's own connection, and it journals what it held: every value that it returned to
+a read. It never knows its driver, or the medium of its connection.
 """
 
 from __future__ import annotations
@@ -27,12 +27,14 @@ from fieldtwin.gateway.core.profile import DeviceProfile, Tag
 from fieldtwin.gateway.core.recording import RecordingReader
 
 MOST_COUNTED = 4
-"""Registers that a counter may have."""
+"""Most registers that a counter may have."""
 
 
 def load_replay(profile: DeviceProfile, path: Path, at_end: WhenUsedUp = WhenUsedUp.HOLD) -> tuple[ExchangeReplay, int]:
-    """A recording of exchanges with a device of `profile`, and its unit there: the factory's where that was recorded, else the
-    lowest. Raises `FileInvalid`."""
+    """Return a recording of exchanges with a device of `profile`, and its unit ID in the recording.
+
+    That is the factory's unit ID if it was recorded, else the lowest. Raises `FileInvalid`.
+    """
     with RecordingReader(path) as reader:
         exchanges = list(reader.exchanges())
     recorded = sorted({e.unit for e in exchanges})
@@ -48,9 +50,11 @@ def load_replay(profile: DeviceProfile, path: Path, at_end: WhenUsedUp = WhenUse
 
 
 class RecordedDevice(ProfiledReplay):
-    """One unit of an emulated line. `kind` is the wire of the device that it stands for. `identity` gives tags other values
-    than the recorded ones. A request that is no command of the profile's list is answered all the same, and counted in
-    `unlisted`."""
+    """One unit of an emulated line. `kind` is the connection type of the emulated device.
+
+    `identity` gives tags different values from the recorded ones. A request that is not in the profile's command list
+    is answered all the same, and counted in `unlisted`.
+    """
 
     def __init__(
         self,
@@ -66,7 +70,7 @@ class RecordedDevice(ProfiledReplay):
         self.emulator = emulator_kind(end.type, profile)(end, profile, replay.context, super().respond)
         self.journal = HeldJournal()
         self.distortions = Distortions()
-        """Of what it answers to reads."""
+        """Value faults of its answers to reads."""
         self.unlisted = 0
         self._readable = [t for t in profile.tags.values() if t.readable and t.at is not None]
         for tag, text in ((profile.tags[n], text) for n, text in identity.items()):
@@ -88,7 +92,7 @@ class RecordedDevice(ProfiledReplay):
         return reply
 
     def _distorted(self, pdu: bytes, reply: bytes, now_ns: int) -> bytes:
-        """The reply to a read of registers with other numbers in it."""
+        """Return the reply to a read of registers with the distorted values in it."""
         request = parse_request(pdu)
         if request is None or request.values is not None or request.table in ("coil", "discrete"):
             return reply
@@ -102,7 +106,7 @@ class RecordedDevice(ProfiledReplay):
             words = [int.from_bytes(data[i : i + 2]) for i in range(first, first + 2 * at.count, 2)]
             value = self.distortions.apply(tag.name, raw_of(tag, words) * tag.scale + tag.offset, now_ns)
             if math.isnan(value) and tag.bits is not None:
-                continue  # no bits mean "no number"
+                continue  # bits cannot express "no number"
             words = [merged(tag, own, cell) for own, cell in zip(words, cells_of(tag, value), strict=True)]
             data[first : first + 2 * at.count] = bytes_of(tag, words)
         return bytes(data)
@@ -118,7 +122,7 @@ class RecordedDevice(ProfiledReplay):
 
 
 def _raw(tag: Tag, offset: int, data: bytes) -> bytes:
-    """A tag's own bytes in the data of a reply; a bit is one byte."""
+    """Return a tag's own bytes from the data of a reply; a bit is one byte."""
     if tag.registers.table in ("coil", "discrete"):
         return bytes([data[offset // 8] >> offset % 8 & 1])
     return data[2 * offset : 2 * (offset + tag.registers.count)]

@@ -1,8 +1,8 @@
 """Time-keyed signals: a recorded cast or trajectory, read at the emulator's clock.
 
 A `SignalTrack` is the recording in memory (arrays of doubles: 65,158 rows of three signals take 2 MB); a `SignalPlayer`
-plays it from a start time, at a speed, and knows what comes after the end. Both are pure: time is passed in, and nothing
-here knows which register or object a signal ends up in.
+plays it from a start time, at a speed, and handles its end. Both are pure: the caller passes the time, and neither
+knows the register or object of a signal.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.gateway.core.recording import RecordingReader, SignalRow
 
 MAX_NUMBERS = 16_000_000
-"""Times and values of one track: 128 MB, or 46 hours of three signals at 24 Hz. More is refused, not swapped."""
+"""Most times and values of one track: 128 MB, or 46 hours of three signals at 24 Hz. A longer recording is refused."""
 
 
 class SignalTrack:
     """Signals over time, linear between rows. Seconds count from the recording's start.
 
-    NaN is "no value": between a row and a NaN there is none either. Two rows of the same time are a step.
+    NaN is "no value", which also applies between a row and a NaN. Two rows with the same time are a step.
     """
 
     def __init__(self, names: Iterable[str], rows: Iterable[SignalRow], *, units: Iterable[str] = (), path: str = ""):
@@ -54,7 +54,7 @@ class SignalTrack:
 
     @classmethod
     def load(cls, path: Path) -> SignalTrack:
-        """Read a recording of signals; raises `FileInvalid`. A cut-off last line is left out."""
+        """Read a recording of signals; raises `FileInvalid`. A truncated last line is left out."""
         with RecordingReader(path) as reader:
             signals = reader.header.signals
             units = [info.unit for info in signals.values()]
@@ -65,16 +65,18 @@ class SignalTrack:
 
     @property
     def nbytes(self) -> int:
-        """Memory that the numbers take."""
+        """Memory that the numbers take, in bytes."""
         return sum(numbers.buffer_info()[1] * numbers.itemsize for numbers in (self._times, *self._columns))
 
     def at(self, t_s: float, name: str) -> float:
-        """The signal `name` at `t_s`; before the first row that row's value, after the last one that one's."""
+        """Return the signal `name` at `t_s`; before the first row that row's value, after the last one that one's."""
         return self._interpolate(self._columns[self._column(name)], *self._locate(t_s))
 
     def nearest_s(self, values: Mapping[str, float]) -> float | None:
-        """The time of the row that is nearest to `values`, a signal's distance counted in parts of its own spread; None where
-        none of them is a signal of this track. Of rows that are equally near the earliest."""
+        """Return the time of the row nearest to `values`, each distance relative to the range of its signal.
+
+        Returns None if none of them is a signal of this track. Of equally near rows the earliest is used.
+        """
         distances = array("d", bytes(8 * len(self._times)))
         known = False
         for name, wanted in values.items():
@@ -91,7 +93,7 @@ class SignalTrack:
         return self._times[distances.index(min(distances))] if known else None
 
     def values(self, t_s: float) -> dict[str, float]:
-        """All signals at `t_s`, of one and the same instant."""
+        """Return all signals at `t_s`, all of the same instant."""
         row, fraction = self._locate(t_s)
         columns = self._columns
         if fraction == 0.0:
@@ -109,7 +111,7 @@ class SignalTrack:
             ) from None
 
     def _locate(self, t_s: float) -> tuple[int, float]:
-        """The row at or before `t_s`, and how far `t_s` is on its way to the next one, 0 to less than 1."""
+        """Return the row at or before `t_s`, and the fraction of the way to the next one, 0 to less than 1."""
         after = bisect_right(self._times, t_s)
         if after == 0:
             return 0, 0.0
@@ -125,7 +127,10 @@ class SignalTrack:
 
 
 class Signals(Protocol):
-    """What a device plays: values by name that follow from the emulator's time. A recording, or a simulation."""
+    """The signals that a device plays: values by name that follow from the emulator's time.
+
+    A recording, or a simulation.
+    """
 
     names: tuple[str, ...]
     path: str
@@ -134,31 +139,36 @@ class Signals(Protocol):
     def __len__(self) -> int: ...
 
     def position_s(self, now_ns: int) -> float:
-        """Where `now_ns` is, in the signals' own seconds."""
+        """Return the position of `now_ns`, in the signals' own seconds."""
         ...
 
     def values(self, now_ns: int) -> dict[str, float]:
-        """All signals now, of one instant."""
+        """Return all signals now, of one instant."""
         ...
 
     def values_at(self, position_s: float) -> dict[str, float]:
-        """All signals at a place that `position_s` told; of a simulation, no earlier than it was asked for before."""
+        """Return all signals at a position that `position_s` returned; for a simulation, no earlier than a position
+        used before.
+        """
         ...
 
     def begin_with(self, values: Mapping[str, float], now_ns: int) -> bool:
-        """Be now as near to `values` as can be, and go on from there; False where that is not possible."""
+        """Set the signals now as near to `values` as possible, and continue from there.
+
+        Return False if that is not possible.
+        """
         ...
 
     def at(self, now_ns: int, name: str) -> float:
-        """One of them now; NaN where there is no value. Raises `FileInvalid` for a name that there is not."""
+        """Return one signal now; NaN if it has no value. Raises `FileInvalid` for an unknown name."""
         ...
 
 
 class SignalPlayer(Signals):
     """A track played from `start_ns` on, `speed` times as fast as recorded. Reading never changes it.
 
-    After the last row: `HOLD` stays on it; `LOOP` goes on from the first row, the two being the same instant (a recording
-    meant for looping ends on the values with which it begins); `ERROR` raises `UsedUp`.
+    After the last row: `HOLD` stays on it; `LOOP` continues with the first row, the two being the same instant (a
+    recording made for looping ends with its first values); `ERROR` raises `UsedUp`.
     """
 
     def __init__(
@@ -174,7 +184,7 @@ class SignalPlayer(Signals):
         self.at_end = at_end
 
     def position_s(self, now_ns: int) -> float:
-        """Where in the recording `now_ns` is, in the recording's seconds; raises `UsedUp` under `ERROR`."""
+        """Return the position of `now_ns` in the recording, in the recording's seconds; raises `UsedUp` under `ERROR`."""
         t_s = (now_ns - self.start_ns) / NS_PER_S * self.speed
         first, last = self.track.first_s, self.track.last_s
         if t_s <= last:
@@ -186,15 +196,15 @@ class SignalPlayer(Signals):
         return last
 
     def ended(self, now_ns: int) -> bool:
-        """Whether `now_ns` is past the last row (under `LOOP`: past its first time)."""
+        """Return whether `now_ns` is after the last row (under `LOOP`: after its first pass)."""
         return (now_ns - self.start_ns) / NS_PER_S * self.speed > self.track.last_s
 
     def at(self, now_ns: int, name: str) -> float:
-        """The signal `name` now; NaN where the recording has no value."""
+        """Return the signal `name` now; NaN if the recording has no value."""
         return self.track.at(self.position_s(now_ns), name)
 
     def values(self, now_ns: int) -> dict[str, float]:
-        """All signals now, of one instant."""
+        """Return all signals now, of one instant."""
         return self.track.values(self.position_s(now_ns))
 
     def begin_with(self, values: Mapping[str, float], now_ns: int) -> bool:
@@ -205,7 +215,7 @@ class SignalPlayer(Signals):
         return True
 
     def values_at(self, position_s: float) -> dict[str, float]:
-        """All signals at a time of the recording."""
+        """Return all signals at a time of the recording."""
         return self.track.values(position_s)
 
     def __len__(self) -> int:

@@ -1,7 +1,7 @@
-"""What a profile states about an emulated device: which cells there are and how values lie in them, what reading or writing one
-does to others, and what functions without registers answer.
+"""The data that a profile states about an emulated device: the cells and the encoding of values in them, the effects of
+reads and writes, and the answers of functions without registers.
 
-Pure; encodes for itself, as everything on this side of the wire. It knows neither banks nor recordings.
+Pure; like all emulator code, it has its own encoder. It knows neither banks nor recordings.
 """
 
 from __future__ import annotations
@@ -22,8 +22,11 @@ Peek = Callable[[Table, int], int]
 
 
 def cells_of(tag: Tag, value: float | str, exponent: int = 0) -> list[int]:
-    """An engineering value as the cells that it fills. `exponent` is what the tag's scale-factor register holds. Of a tag that is
-    part of a register: that register with nothing in its other bits. What is too large or too small becomes the limit."""
+    """Return an engineering value as the cells that it fills; values out of range become the limit.
+
+    `exponent` is the value of the tag's scale-factor register. For a tag that is part of a register, the other bits of
+    that register are 0.
+    """
     at = tag.registers
     if isinstance(value, str):
         return encode(value, tag.type, tag.order, registers=at.count)
@@ -37,7 +40,7 @@ def cells_of(tag: Tag, value: float | str, exponent: int = 0) -> list[int]:
 
 
 def fits(tag: Tag, value: float | str, exponent: int = 0) -> bool:
-    """Whether the cells of `tag` can hold an engineering value to the nearest step, without being cut or limited."""
+    """Return whether the cells of `tag` can hold an engineering value to the nearest step, without truncation or limiting."""
     if isinstance(value, str):
         return len(value.encode("ascii", "replace")) <= 2 * tag.registers.count
     raw = (value - tag.offset) / (tag.scale * 10.0**exponent)
@@ -87,7 +90,7 @@ def bytes_of(tag: Tag, cells: Sequence[int]) -> bytes:
 
 
 def spans_of(profile: DeviceProfile) -> list[Span]:
-    """The cells that exist: those of the tags, each once. What several tags share can be whatever one of them can."""
+    """Return the cells that exist: those of the tags, each once. A cell of several tags has the access of all of them."""
     read: dict[tuple[Table, int], bool] = {}
     written: dict[tuple[Table, int], bool] = {}
     for tag in profile.tags.values():
@@ -103,7 +106,7 @@ def _access(read: bool, written: bool) -> Access:
 
 
 def parts_of(profile: DeviceProfile) -> UnitParts:
-    """The functions of a profile that carry no registers: 11h, 14h, 15h, 18h and 2Bh, with what they answer."""
+    """Return the functions of a profile without registers, with their answers: 11h, 14h, 15h, 18h and 2Bh."""
     form = profile.form
     fifos = FifoQueues(form.fifos, max((MOST_READ, *map(len, form.fifos.values())))) if form.fifos else None
     if fifos is not None:
@@ -120,7 +123,7 @@ def parts_of(profile: DeviceProfile) -> UnitParts:
 
 
 class Effects:
-    """A profile's `effects`. Each question gives what tags hold from now on: (tag, engineering value), in the profile's order."""
+    """A profile's `effects`. `of` returns new values of tags: (tag, engineering value), in the profile's order."""
 
     def __init__(self, effects: Iterable[Effect]) -> None:
         self._on_read = [e for e in effects if e.on_read]
@@ -130,8 +133,11 @@ class Effects:
         return bool(self._on_read or self._on_write)
 
     def of(self, table: Table, addresses: range, written: Sequence[int] | None) -> list[tuple[Tag, float]]:
-        """Of a request that reads (`written` is None) or writes cells. Any cell of a tag is the tag; only where the effect is
-        that of one value, that must have been written whole."""
+        """Return the effects of a request that reads (`written` is None) or writes cells.
+
+        Any cell of a tag triggers its effect. If the effect is bound to one value, that value must have been written as
+        a whole.
+        """
         effects = self._on_read if written is None else self._on_write
         return [
             pair

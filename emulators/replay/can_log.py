@@ -1,6 +1,6 @@
-"""A CAN log as candump writes it with -L: ``(1436509052.249713) can0 585#4B06200034120000``. Text in, frames with times out.
+"""A CAN log as candump -L writes it: ``(1436509052.249713) can0 585#4B06200034120000``. It returns frames with times.
 
-`CanLog` is such a file as a node's recording: where it is and how it is to be played. It is read when frames are asked for.
+`CanLog` is such a file as a node's recording: its path and how it is played. It is read when frames are requested.
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ _LINE = re.compile(
 )
 _ERROR = 0x20000000
 MAX_LINE_BYTES = 1024
-"""A line of candump has at most 60 characters, and the name of its interface."""
+"""A line of candump has at most 60 characters, plus the name of its interface."""
 
 SUFFIX = ".log"
-"""By which a file is known as a log of candump, among recordings."""
+"""File name suffix by which a log of candump is recognised among recordings."""
 
 
 @dataclass(frozen=True, slots=True)
 class CanLog:
-    """A log file, played `speed` times as fast as it was written, and what comes after its end."""
+    """A log file, played `speed` times as fast as it was recorded, and the behaviour after its end."""
 
     path: Path
     speed: float = 1.0
     at_end: WhenUsedUp = WhenUsedUp.HOLD
 
     def frames(self) -> Iterator[tuple[float, CanFrame]]:
-        """`read_can_log` of the file. Raises `FileInvalid`, also where it cannot be read."""
+        """Yield the frames of the file (`read_can_log`). Raises `FileInvalid`, also if the file cannot be read."""
         try:
             with open_input(self.path) as file:
                 yield from read_can_log(_lines(file, str(self.path)), str(self.path))
@@ -56,7 +56,10 @@ def _lines(file: BinaryIO, path: str) -> Iterator[str]:
 
 
 def read_can_log(lines: Iterable[str], path: str = "") -> Iterator[tuple[float, CanFrame]]:
-    """Seconds as the log has them, and the frame; error frames are left out. Raises `FileInvalid` with the line."""
+    """Yield the time in the log in seconds, and the frame; error frames are left out.
+
+    Raises `FileInvalid` with the line.
+    """
     for number, line in enumerate(lines, start=1):
         if not line.strip():
             continue

@@ -1,8 +1,9 @@
-"""What was recorded of one read, again and again: kept in columns, and taken apart when it is asked for.
+"""The recorded results of one repeated read: kept in columns, and decoded on access.
 
-A recording of a day holds the same few reads a million times over. A `Column` has the replies to one of them, in one situation,
-as bytes behind each other; `Outcomes` are these as a virtual context has them, `CellValues` those of one cell, from all
-columns that hold it, in recorded order. So a recording costs its bytes in memory, and is ready when it is read. Pure.
+A recording of a day contains the same few reads a million times. A `Column` holds the replies to one of them, in one
+situation, as consecutive bytes. `Outcomes` presents them in the form of a virtual context, `CellValues` presents the
+values of one cell from all columns that contain it, in recorded order. A recording therefore needs only its bytes in
+memory, and is usable as soon as it has been read. Pure.
 """
 
 from __future__ import annotations
@@ -18,17 +19,17 @@ from fieldtwin.gateway.core.recording import Exchange
 from fieldtwin.gateway.core.values import RECORDING
 
 BESIDE = 32
-"""Bytes that an exchange costs besides its reply."""
+"""Bytes that an exchange needs in addition to its reply."""
 
 _WORDS: dict[bytes, RECORDING] = {}
-"""One object for each content of a cell that was ever asked for: at most 65,536."""
+"""One object for each content of a cell that was ever requested: at most 65,536."""
 
 
 class Column:
     """The outcomes of `request` while the unit was in `situation`.
 
-    `odd` are the outcomes that are no normal reply (b"" for none), by their place; every other one has `stride` bytes in
-    `replies`. `orders` are the places in the recording as a whole.
+    `odd` are the outcomes that are not a normal reply (b"" for silence), by position; every other one has `stride`
+    bytes in `replies`. `orders` are the positions in the whole recording.
     """
 
     __slots__ = ("head", "latencies", "odd", "orders", "replies", "request", "situation", "stride", "times")
@@ -49,7 +50,7 @@ class Column:
         return len(self.orders)
 
     def add(self, order: int, exchange: Exchange) -> bool:
-        """One more outcome. Returns whether it is a normal reply."""
+        """Add an outcome. Return whether it is a normal reply."""
         reply = exchange.reply
         normal = reply is not None and len(reply) == self.stride and reply.startswith(self.head)
         if normal:
@@ -64,25 +65,25 @@ class Column:
 
     @property
     def normal(self) -> Sequence[int]:
-        """The places of normal replies."""
+        """The positions of normal replies."""
         return [i for i in range(len(self.orders)) if i not in self.odd] if self.odd else range(len(self.orders))
 
     def drop_before(self, order: int) -> int:
-        """Forget what was recorded before that place in the recording; how many that were."""
+        """Drop what was recorded before that position in the recording, and return the number of dropped outcomes."""
         count = next((i for i, o in enumerate(self.orders) if o >= order), len(self.orders))
         del self.replies[: count * self.stride], self.orders[:count], self.times[:count], self.latencies[:count]
         self.odd = {i - count: reply for i, reply in self.odd.items() if i >= count}
         return count
 
     def outcome(self, i: int) -> Recorded:
-        """The whole reply of place `i`, with its time and latency."""
+        """Return the whole reply at position `i`, with its time and latency."""
         reply = self.odd.get(i)
         if reply is None:
             reply = RECORDING(bytes(self.replies[i * self.stride : (i + 1) * self.stride]))
         return Recorded(self.times[i], reply, self.latencies[i])
 
     def cell(self, i: int, offset: int) -> Recorded:
-        """The value of the cell `offset` cells behind the first, of place `i`: two bytes."""
+        """Return the value of the cell at `offset` from the first one, at position `i`: two bytes."""
         at = i * self.stride + 2
         if self.request.function <= 2:
             word = bytes((0, self.replies[at + offset // 8] >> offset % 8 & 1))
@@ -96,7 +97,7 @@ class Column:
 
 
 class _View(Sequence[Recorded], ABC):
-    """Recorded things that are made when they are asked for, by their place."""
+    """Recorded items that are created on access, by position."""
 
     @overload
     def __getitem__(self, i: int) -> Recorded: ...
@@ -109,7 +110,7 @@ class _View(Sequence[Recorded], ABC):
 
     @abstractmethod
     def _at(self, i: int) -> Recorded:
-        """The one at place `i`, which is there."""
+        """Return the item at position `i`, which exists."""
 
 
 class Outcomes(_View):
@@ -126,8 +127,10 @@ class Outcomes(_View):
 
 
 class Merged:
-    """Normal replies of several columns in recorded order: (column, place) by number. Made when it is first looked into, for all
-    cells that these columns share."""
+    """Normal replies of several columns in recorded order, as (column, position) by number.
+
+    The order is computed on first access, once for all cells that these columns share.
+    """
 
     def __init__(self, columns: Sequence[Column]) -> None:
         self.columns = columns
@@ -136,7 +139,7 @@ class Merged:
         self._places: Sequence[int] = ()
 
     def at(self, i: int) -> tuple[int, int]:
-        """The number of the column and the place in it of the normal reply number `i`."""
+        """Return the number of the column and the position in it of the normal reply number `i`."""
         which = self._which
         if which is None:
             which = self._sort()
@@ -153,7 +156,7 @@ class Merged:
 
 
 class CellValues(_View):
-    """The values of one cell; `offsets` say where it is in each of the columns."""
+    """The values of one cell; `offsets` gives its offset in each of the columns."""
 
     def __init__(self, merged: Merged, offsets: Sequence[int]) -> None:
         self._merged = merged

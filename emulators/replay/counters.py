@@ -1,9 +1,9 @@
-"""Recorded counters: values of several registers that must never be torn apart, and never run backwards.
+"""Recorded counters: values in several registers that must never be mixed from different moments, and never run backwards.
 
-Two registers of a counter that were answered from different moments make a number that never was. So a counter's registers move
-together: a read gets the value in turn, and the next value only when it asks again for a register that it has
-already had of this one. Reading it whole, or in parts, gives the same numbers. What was written before is no matter to a
-counter, and when its recording is used up it stays where it is, whatever the policy (SPEC ruling 3).
+Registers of a counter that come from different moments form a number that never existed. A counter's registers
+therefore advance together: a read gets the present value, and the next value only when it reads a register of the
+present value again. Reading it whole or in parts gives the same numbers. Earlier writes do not affect a counter, and at
+the end of its recording it keeps its value, whatever the policy (SPEC ruling 3).
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class Counters:
                 self._by_cell[span.unit, (span.table, span.address + i)] = (counter, i)
 
     def copy(self, context: VirtualContext) -> Counters:
-        """The same counters over a copy of the context, before anything was read."""
+        """Return the same counters on a copy of the context, in their initial state."""
         other = Counters((), context)
         other.torn = self.torn
         made: dict[int, _Counter] = {}
@@ -65,11 +65,11 @@ class Counters:
         return other
 
     def counts(self, unit: int, cell: Cell) -> bool:
-        """Whether the register is one of a counter."""
+        """Return whether the register belongs to a counter."""
         return (unit, cell) in self._by_cell
 
     def learn(self, unit: int, cell: Cell, value: int, t_s: float) -> bool:
-        """A register was recorded. Returns whether it is one of a counter."""
+        """Learn a recorded register. Return whether it belongs to a counter."""
         found = self._by_cell.get((unit, cell))
         if found is None:
             return False
@@ -84,19 +84,19 @@ class Counters:
         return True
 
     def knows(self, unit: int, cell: Cell) -> bool:
-        """Whether the register is one of a counter of which something whole was recorded."""
+        """Return whether the register belongs to a counter of which a whole value was recorded."""
         found = self._by_cell.get((unit, cell))
         return found is not None and (found[0].shown is not None or self._context.left(found[0].command) > 0)
 
     def begin(self, unit: int, table: Table, addresses: range) -> None:
-        """A request for these registers starts: a counter of which it wants one again moves on, before any is read."""
+        """Begin a request for these registers: a counter advances if a register that was already read is read again."""
         for address in addresses:
             counter, i = self._by_cell.get((unit, (table, address)), (None, 0))
             if counter is not None and (counter.shown is None or i in counter.seen):
                 self._move_on(counter)
 
     def read(self, unit: int, cell: Cell) -> int:
-        """The register's word; the caller asked `knows`, and called `begin` for the whole request."""
+        """Return the register's value. The caller must have called `knows`, and `begin` for the whole request."""
         counter, i = self._by_cell[unit, cell]
         if counter.shown is None:
             raise Bug("a counter was read before its request began")
@@ -107,6 +107,6 @@ class Counters:
         try:
             words = self._context.take(counter.command).data
         except (UnknownCommand, UsedUp):
-            return  # nothing whole was recorded: `knows` says so
+            return  # no whole value was recorded: `knows` reports that
         counter.shown = struct.unpack(f">{counter.span.count}H", words)
         counter.seen.clear()

@@ -1,7 +1,7 @@
-"""What a recording tells of its units: reads in columns, writes and what changed with them, refusals, limits, latency.
+"""What a recording reveals about its units: reads in columns, writes and their effects, refusals, limits, latency.
 
-A `Learner` goes through the exchanges once. What it leaves is a virtual context whose commands are cells and shapes of requests,
-and a `LearntUnit` for each unit; `replay` answers from these. Pure.
+A `Learner` processes the exchanges once. The result is a virtual context whose commands are cells and shapes of
+requests, and a `LearntUnit` for each unit; `replay` answers from these. Pure.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from fieldtwin.gateway.core.values import COMMAND, RECORDING
 TABLE_CODES: dict[Table, int] = {"coil": 0, "discrete": 1, "holding": 3, "input": 4}
 _SHAPE_CODE = 0xFF
 CELL_KEY = 4
-"""Bytes of a cell's key; those of a shape's are more, or have another second byte."""
+"""Bytes of a cell's key; the key of a shape is longer, or has a different second byte."""
 MAX_BYTES = 512_000_000
-"""What the replies to recorded reads may take in memory; then the older half is dropped, and counted."""
+"""Memory limit for the replies to recorded reads; beyond it the older half is dropped and counted."""
 
 
 @dataclass(slots=True)
 class ReplayCounters:
-    """What a replay did. All but `misfits` count answers; `misfits` recorded replies that fit no request cell by cell."""
+    """Counters of a replay. All except `misfits` count answers; `misfits` counts recorded replies that fit no request."""
 
     answered: int = 0
     exceptions: int = 0
@@ -43,32 +43,32 @@ class ReplayCounters:
 
 
 class LearntUnit:
-    """What is known of one unit besides the recordings themselves."""
+    """The knowledge about one unit besides the recordings themselves."""
 
     def __init__(self) -> None:
         self.situations = Situations()
         self.recorded_in: dict[bytes, list[int]] = {}  # cell or shape -> situations, in recorded order
-        self.alike: dict[bytes, int] = {}  # the same -> the one to use in the present situation
+        self.alike: dict[bytes, int] = {}  # cell or shape -> the situation to use now
         self.functions: set[int] = set()
-        self.put: dict[Cell, int] = {}  # what the unit itself changed
-        self.request_lengths: dict[int, set[int]] = {}  # function that no standard knows -> recorded lengths
+        self.put: dict[Cell, int] = {}  # cells that the unit itself changed
+        self.request_lengths: dict[int, set[int]] = {}  # non-standard function -> recorded lengths
         self.writable: set[Cell] = set()
         self.refused_writes: dict[tuple[int, int, int], Recorded] = {}
         self.most_read: dict[int, int] = {}  # function -> most cells ever answered
         self.least_refused: dict[int, int] = {}  # function -> fewest cells ever refused with 03
-        self.latency: dict[int, tuple[int, float]] = {}  # function -> how many, sum
+        self.latency: dict[int, tuple[int, float]] = {}  # function -> number, sum
         self.by_situation: dict[int, dict[bytes, Column]] = {0: {}}  # while learning
         self.columns = self.by_situation[0]  # of the situation that is being recorded
-        self.addresses: dict[Table, list[int]] | None = None  # recorded ones, made when a gap between them is asked for
+        self.addresses: dict[Table, list[int]] | None = None  # recorded ones, computed when a gap between them is read
 
     def copy(self) -> LearntUnit:
-        """What was learned, shared, with nothing asked or written yet."""
+        """Return a unit that shares the learned data, in its initial state."""
         other = copy.copy(self)
         other.situations, other.alike, other.put = self.situations.copy(), {}, {}
         return other
 
     def write(self, request: CellRequest, values: tuple[int, ...]) -> None:
-        """The unit took a write."""
+        """Record a write that the unit accepted."""
         self.situations.write(request.table, request.address, values)
         self.alike.clear()
         if self.put:
@@ -98,7 +98,7 @@ class Learner:
             unit.situations.rewind()
 
     def _learn_all(self, exchanges: Iterable[Exchange]) -> None:
-        """Reads go into columns, a request that is known by now at little cost; all else is learnt one by one."""
+        """Learn all exchanges: reads go into columns, which is fast for known requests; all others are learned one by one."""
         units, size = self.units, 0
         for order, exchange in enumerate(exchanges):
             unit = units.get(exchange.unit)
@@ -120,7 +120,7 @@ class Learner:
                 yield from columns.values()
 
     def _drop_oldest(self, order: int) -> None:
-        """Half of what is kept: a recording of days goes on."""
+        """Drop the older half of the kept replies, so that a recording of days can be learned."""
         oldest = min((c.orders[0] for c in self._columns() if len(c)), default=order)
         for column in self._columns():
             self.context.dropped += column.drop_before((oldest + order) // 2)
@@ -131,7 +131,7 @@ class Learner:
                 unit.write(request, request.values)
 
     def _learn_odd(self, unit: LearntUnit, request: CellRequest, exchange: Exchange) -> None:
-        """A read whose answer is not what was asked for."""
+        """Learn a read whose reply is not a normal one."""
         reply = exchange.reply or b""
         if requests.is_exception(exchange.request, reply):
             self._learn_refusal(unit, request, Recorded(exchange.t_s, self._response(reply), exchange.latency_s))
@@ -139,9 +139,9 @@ class Learner:
             self._counters.misfits += 1
 
     def _learn(self, exchange: Exchange) -> Column | None:
-        """What an exchange tells; for a read the new column that it belongs to."""
+        """Learn an exchange; return the new column for a read."""
         request = requests.parse_request(exchange.request)
-        if exchange.unit == 0 and exchange.reply == b"":  # on TCP, unit 0 may well be a device that answers
+        if exchange.unit == 0 and exchange.reply == b"":  # on TCP, unit 0 can be a device that answers
             if request is not None and request.values is not None and len(self._broadcasts) < MAX_ENTRIES:
                 self._broadcasts.append(request)
             self._broadcast(request)
@@ -179,7 +179,7 @@ class Learner:
         unit.columns = unit.by_situation.setdefault(unit.situations.learned, {})
 
     def _spread(self, unit_id: int, unit: LearntUnit) -> None:
-        """From columns to what the context holds: outcomes of each request, values of each cell."""
+        """Convert the columns to the contents of the context: outcomes of each request, values of each cell."""
         columns = [c for found in unit.by_situation.values() for c in found.values() if len(c)]
         columns.sort(key=lambda c: c.orders[0])
         holding: dict[Cell, dict[int, list[tuple[Column, int]]]] = {}
@@ -213,7 +213,7 @@ class Learner:
 
     @staticmethod
     def _count(unit: LearntUnit, column: Column) -> None:
-        """How long reads take, and how much the device gives at once."""
+        """Learn the latency of reads, and the largest quantity that the device returns."""
         silent = [i for i, reply in column.odd.items() if not reply.data]
         function, answered = column.request.function, len(column) - len(silent)
         if answered:
@@ -224,7 +224,7 @@ class Learner:
             unit.most_read[function] = max(column.request.count, unit.most_read.get(function, 0))
 
     def _count_on(self, unit_id: int, counted: set[Cell], columns: Sequence[Column]) -> None:
-        """The cells of counters, in recorded order: they are put together register by register."""
+        """Learn the cells of counters in recorded order, because their values are assembled register by register."""
         if not counted:
             return
         having = [c for c in columns if any((c.request.table, a) in counted for a in c.request.addresses)]

@@ -1,9 +1,10 @@
-"""A recorded CANopen node, holding again what it held: its object dictionary and its PDO stream, from a log of the bus.
+"""Replays a recorded CANopen node: its object dictionary and its PDO stream, from a log of the bus.
 
-Resolved object by object (SPEC ruling 3), however the next master reads. What the node was asked for answers again in recorded
-order, one value for each upload of the object. What it sent by itself, in TPDOs, is a signal: read at the emulator's clock, by
-SDO too. What the recorded master wrote is a setting: the node starts with what was there first and then holds what is written.
-An object that was never given but with an abort gets it again. Block transfers are not followed. Pure; it knows no files.
+Values are resolved object by object (SPEC ruling 3), however the next client reads. Uploaded values are returned in
+recorded order, one value for each upload of the object. Values sent in TPDOs are signals, read at the emulator's clock,
+also by SDO. Values that the recorded client wrote are settings: the node starts with the first recorded value and then
+holds what is written. An object that was only ever refused with an abort is refused again. Block transfers are not
+evaluated. Pure; it knows no files.
 """
 
 from __future__ import annotations
@@ -24,20 +25,22 @@ from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.errors import UsageError
 
 MAX_VALUES = 1_000_000
-"""Changes of objects that are kept; later ones are counted in `dropped`."""
+"""Most changes of objects that are kept; later ones are counted in `dropped`."""
 
 _PDO_PARAMETERS = range(0x1400, 0x1C00)
 _SDO_SERVERS = range(RESPONSE + 1, RESPONSE + 128)
 _OF_THE_OBJECT = 0x06
-"""Abort codes that begin so tell of the object; others of the transfer, or of the state that the device was in."""
+"""Abort codes that begin with this byte concern the object; others concern the transfer or the state of the device."""
 
 _ABORTS = frozenset(Abort)
 _NEVER_INITIAL = frozenset({0x1001, 0x1003})
 
 
 def node_of(log: CanLog, node_id: int) -> int:
-    """The node that is meant in a log: the one with this id if it is there, else the only one that was asked by SDO. Raises
-    `UsageError`."""
+    """Return the node ID to use in a log: `node_id` if it occurs, else the only node that was accessed by SDO.
+
+    Raises `UsageError`.
+    """
     ids = {frame.can_id for _, frame in log.frames() if not (frame.extended or frame.remote)}
     asked = sorted(can_id & 0x7F for can_id in ids if can_id in _SDO_SERVERS)
     if not asked or node_id in asked or ERROR_CONTROL + node_id in ids:
@@ -53,23 +56,26 @@ def node_of(log: CanLog, node_id: int) -> int:
 
 
 def recorded_objects(log: CanLog, dictionary: Dictionary, node_id: int) -> RecordedObjects:
-    """What a log holds of a node, for a node `node_id`; it may have had another id then. Raises `FileInvalid` or `UsageError`."""
+    """Return what a log contains of a node, for a node `node_id`, whose ID may have been different in the log.
+
+    Raises `FileInvalid` or `UsageError`.
+    """
     then = node_of(log, node_id)
     objects = RecordedObjects(log.frames(), dictionary, then, log.at_end, log.speed)
     if not objects.initial:
         raise UsageError(f"the log holds nothing of node {then} that its data sheet knows", where=str(log.path))
-    if then != node_id:  # identifiers that hang on the node id are those of the id that it has now
+    if then != node_id:  # identifiers derived from the node ID follow the present one
         own = {entry.key for entry in dictionary.entries() if entry.node_relative}
         objects.initial = {key: raw for key, raw in objects.initial.items() if key not in own}
     return objects
 
 
 class RecordedObjects:
-    """A node's value source. `initial` are the values that the node begins with (for `NodeContext.factory`), `refusals` what
-    it aborts (for `NodeContext.refusals`).
+    """A node's value source. `initial` are the values at the start (for `NodeContext.factory`), `refusals` are the
+    objects that it aborts (for `NodeContext.refusals`).
 
-    Time begins with the first call and runs `speed` times as fast as recorded. After the log's end signals hold, begin again, or
-    raise `UsedUp`, as `when_used_up` says; and so does each object that is asked for when its own values are used up.
+    Time begins with the first call and runs `speed` times as fast as recorded. After the log's end signals hold, start
+    again, or raise `UsedUp`, as `when_used_up` says; the same applies to each object whose uploaded values are used up.
     """
 
     def __init__(
@@ -111,7 +117,7 @@ class RecordedObjects:
         return {key: self._values[key][max(bisect_right(times, at_s) - 1, 0)] for key, times in self._times.items()}
 
     def answer(self, key: Key, now_ns: int) -> bytes | None:
-        """The next of the values that were uploaded of an object; None for one that was sent, written, or never asked for."""
+        """Return the next uploaded value of an object; None for an object that was sent, written, or never uploaded."""
         answers = self._answers.get(key)
         if answers is None:
             return None
@@ -158,7 +164,7 @@ class RecordedObjects:
             self._transfer = None
 
     def _response(self, data: bytes) -> None:
-        """A download is over with what the node says to it: that there is no more, or the next request."""
+        """Process a response. The node's response completes a download: its acknowledgement, or the next request."""
         if self._transfer is None:
             return
         command, (key, download, raw) = data[0] >> 5, self._transfer
@@ -180,7 +186,7 @@ class RecordedObjects:
             self._transfer = None
 
     def _uploaded(self, key: Key, raw: bytes) -> None:
-        """A whole value that the node gave when it was asked."""
+        """Record a whole value that the node returned to an upload."""
         self._transfer = None
         if not self._fits(key, raw):
             return
@@ -211,7 +217,7 @@ class RecordedObjects:
         if key not in self._written and key[0] not in _NEVER_INITIAL:
             self.initial.setdefault(key, raw)
         if key[0] in _PDO_PARAMETERS:
-            self._data.put(*key, raw)  # from here on TPDOs carry what this says
+            self._data.put(*key, raw)  # changes the contents of TPDOs from here on
         values = self._values.setdefault(key, [])
         if values and values[-1] == raw:
             return

@@ -1,7 +1,7 @@
-"""The functions of a device's own that its profile declares, on the unit that replays the device.
+"""The device-specific functions that a profile declares, on the unit that replays the device.
 
-Such a function is asked for with the one request that is documented, says what is documented, and leaves in its registers what
-the profile says; any other request gets exception 03. Encodes for itself, as everything on this side of the wire.
+Such a function has one documented request and one documented reply, and sets registers as the profile states; all other
+requests get exception 03. Like all emulator code, it has its own encoder.
 """
 
 from __future__ import annotations

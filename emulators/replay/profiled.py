@@ -1,9 +1,10 @@
-"""A replayed unit that keeps to its device's profile where the recording has no answer.
+"""A replayed unit that follows its device's profile where the recording has no answer.
 
-What was recorded goes first. Of the rest the profile tells what the device has: which functions, how many registers a request,
-no half values, what can be written and what cannot be read, what functions without registers answer. A write that it allows
-is accepted and reads back. Effects are as it states them, and diagnostics (08, 0B, 0C) that it names are the unit's own: a
-recorded answer would count another wire. Pure; decodes for itself.
+Recorded answers come first. For other requests the profile states the functions, the registers per request, whether
+half values are refused, what can be written and what cannot be read, and the answers of functions without registers. A
+write that it permits is accepted and can be read back. Effects are those of the profile. The diagnostics (08, 0B, 0C)
+that it names are computed by the unit, because a recorded answer would count a different line. Pure; it has its own
+decoder.
 """
 
 from __future__ import annotations
@@ -19,11 +20,11 @@ from fieldtwin.gateway.core.profile import DeviceProfile
 
 _CELL_FUNCTIONS = frozenset({0x01, 0x02, 0x03, 0x04, 0x05, 0x06, 0x0F, 0x10})
 _COUNTING = frozenset({0x08, 0x0B, 0x0C})
-"""What tells of the wire as it is now. A recorded answer would tell of another."""
+"""Functions that report on the present line. A recorded answer would report on a different one."""
 
 
 class ProfiledReplay(ReplayUnit):
-    """Unit `unit_id` of a recording of a device that `profile` describes, functions of its own included."""
+    """Unit `unit_id` of a recording of a device that `profile` describes, device-specific functions included."""
 
     def __init__(self, profile: DeviceProfile, replay: ExchangeReplay, unit_id: int, name: str = "") -> None:
         super().__init__(replay, unit_id, name or profile.name, parts_of(profile))
@@ -82,7 +83,7 @@ class ProfiledReplay(ReplayUnit):
         return super().recall(pdu)
 
     def _refusal(self, request: CellRequest) -> int:
-        """0, or the exception that the profile has for it: quantities before addresses."""
+        """Return 0, or the exception code that the profile requires: quantities are checked before addresses."""
         registers = request.table in ("holding", "input")
         pairs = registers and self._limits.even_only and request.function != 0x06
         most = self._limits.read_registers if request.values is None and registers else request.count
@@ -97,7 +98,7 @@ class ProfiledReplay(ReplayUnit):
         return 0
 
     def _fill(self, request: CellRequest) -> None:
-        """Cells of the request that no tag names and nobody recorded hold 0 from now on."""
+        """Set the cells of the request to 0 that no tag names and that were not recorded."""
         if request.table in self._tables:
             for address in request.addresses:
                 if (request.table, address) not in self._declared and not self.replay.knows(

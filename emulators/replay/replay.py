@@ -1,12 +1,11 @@
-"""A recorded Modbus device, answering again: SPEC ruling 3.
+"""Replays a recorded Modbus device: SPEC ruling 3.
 
-Values are resolved cell by cell (unit, table, address, what was written before), so that a master which splits or merges
-the recorded ranges gets the same numbers. What concerns a request as a whole, an exception, a limit, silence, latency, is kept
-by the request's shape. Everything is answered in recorded order from one `VirtualContext`, whose commands are the
-cells and shapes.
+Values are resolved cell by cell (unit, table, address, earlier writes), so a client that splits or merges the recorded
+ranges gets the same numbers. Properties of a whole request (an exception, a limit, silence, latency) are kept by the
+request's shape. All answers come in recorded order from one `VirtualContext`, whose commands are the cells and shapes.
 
-Two words of one value stay together as long as they were always recorded together, which is how masters read; a counter's stay
-together whatever happens (`counters`). Pure: PDUs in, PDUs out. It knows neither units' wires nor clocks.
+The registers of one value stay together if they were always recorded together, which is how clients read; those of a
+counter always stay together (`counters`). Pure: request PDUs in, response PDUs out. It knows neither lines nor clocks.
 """
 
 from __future__ import annotations
@@ -40,18 +39,19 @@ from fieldtwin.gateway.core.values import COMMAND
 
 
 class NeverRecorded(Enum):
-    """What is answered to a request of which nothing was recorded; named in the prototype file."""
+    """The answer to a request that was not recorded; named in the prototype file."""
 
     EXCEPTION = "exception"
     SILENCE = "silence"
     INTERPOLATE = "interpolate"
-    """As `EXCEPTION`; but a register between two recorded ones reads as the straight line between them, a bit as the one
-    below."""
+    """Like `EXCEPTION`, but a register between two recorded ones is interpolated linearly, and a bit takes the value of
+    the one below.
+    """
 
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What the device says, None for silence, and how long it had taken it in the recording."""
+    """The device's reply, None for silence, and its latency in the recording."""
 
     reply: bytes | None
     latency_s: float = 0.0
@@ -60,11 +60,11 @@ class Answer:
 class ExchangeReplay:
     """Answers requests from recorded exchanges.
 
-    Of a recording that holds several units, each answers for itself; one that was never recorded stays silent. A write
-    that was recorded is answered as it was, and changes what is read afterwards, as it did. A write of another value to
-    cells that did accept writes is accepted, and they read back what was written. Anything else that was never recorded is
-    answered with exception 01 (function), 02 (address) or 03 (more cells than the device ever gave), or not at all.
-    Under `ERROR` a used-up recording is answered with exception 04 and counted.
+    If a recording contains several units, each answers for itself; a unit that was not recorded stays silent. A
+    recorded write is answered as recorded, and changes later reads as recorded. A write of a different value to cells
+    that accepted writes is accepted, and can be read back. All other requests that were not recorded are answered with
+    exception 01 (function), 02 (address) or 03 (more cells than the device ever returned), or not at all. With `ERROR`,
+    a used-up recording is answered with exception 04 and counted.
     """
 
     def __init__(
@@ -103,8 +103,10 @@ class ExchangeReplay:
             return replay
 
     def copy(self) -> ExchangeReplay:
-        """Another device of the same recording, from its beginning: what was learned is in memory once. This one must not
-        have answered anything."""
+        """Return a device with the same recording, in its initial state, which shares the learned data.
+
+        This one must not have answered any request.
+        """
         other = copy.copy(self)
         other.context = self.context.copy()
         other.counters = replace(self.counters)
@@ -115,11 +117,11 @@ class ExchangeReplay:
 
     @property
     def units(self) -> tuple[int, ...]:
-        """The unit ids that were recorded."""
+        """The unit IDs that were recorded."""
         return tuple(sorted(self._units))
 
     def respond(self, unit_id: int, pdu: bytes) -> Answer:
-        """What the recorded unit answers to `pdu` (function code and data) now."""
+        """Return the answer of the recorded unit to `pdu` (function code and data) now."""
         if not pdu:
             return Answer(None)
         unit = self._units.get(unit_id)
@@ -133,7 +135,7 @@ class ExchangeReplay:
             return self._counted(pdu, Answer(requests.exception(pdu, requests.DEVICE_FAILURE)))
 
     def broadcast(self, pdu: bytes, unit_id: int | None = None) -> None:
-        """A request to all units of the line, as `unit_id` hears it, or all: writes have their effect, nobody answers."""
+        """Process a broadcast for `unit_id`, or for all units: writes have their effect, and no unit answers."""
         request = requests.parse_request(pdu)
         if request is not None and request.values is not None:
             for number, unit in self._units.items():
@@ -141,33 +143,33 @@ class ExchangeReplay:
                     unit.write(request, request.values)
 
     def was_recorded(self, unit_id: int, pdu: bytes) -> bool:
-        """Whether this very request was."""
+        """Return whether exactly this request was recorded."""
         unit = self._units.get(unit_id)
         return unit is not None and shape_key(unit_id, pdu) in unit.recorded_in
 
     def refuse(self, unit_id: int, pdu: bytes, code: int) -> Answer:
-        """The answer to what the device is known not to do, though nobody recorded it."""
+        """Return the answer to a request that the device is known to refuse, although it was not recorded."""
         latency_s = self._units[unit_id].usual_latency_s(pdu[0])
         return self._counted(pdu, Answer(requests.exception(pdu, code), latency_s))
 
     def accept(self, unit_id: int, request: CellRequest, pdu: bytes) -> Answer:
-        """The answer to a write that the device is known to take, though nobody recorded it."""
+        """Return the answer to a write that the device is known to accept, although it was not recorded."""
         unit = self._units[unit_id]
         unit.write(request, request.values or ())
         latency_s = unit.usual_latency_s(pdu[0]) or unit.usual_latency_s(3)
         return self._counted(pdu, Answer(requests.written_reply(request, pdu), latency_s))
 
     def own_request_lengths(self, unit_id: int) -> dict[int, int]:
-        """Functions that no standard knows, of which every recorded request was as long as the others: bytes of the PDU."""
+        """Return the PDU lengths, in bytes, of non-standard functions whose recorded requests all have the same length."""
         found = self._units[unit_id].request_lengths
         return {function: max(lengths) for function, lengths in found.items() if len(lengths) == 1}
 
     def knows(self, unit_id: int, table: Table, address: int) -> bool:
-        """Whether a cell was recorded, written or put."""
+        """Return whether a cell was recorded, written or put."""
         return self._knows(unit_id, self._units[unit_id], (table, address))
 
     def put(self, unit_id: int, table: Table, address: int, values: Sequence[int]) -> None:
-        """The unit itself changed these cells: they read so until they are written or put again, counters too."""
+        """Set cells from the device's side, counters included: they keep the values until they are written or put again."""
         self._units[unit_id].put.update({(table, address + i): value for i, value in enumerate(values)})
 
     def _counted(self, pdu: bytes, answer: Answer) -> Answer:
@@ -191,13 +193,13 @@ class ExchangeReplay:
             if request is None or requests.is_exception(pdu, reply):
                 return Answer(reply, outcome.latency_s)
             if request.values is None and requests.parse_values(request, reply) is None:
-                return Answer(reply, outcome.latency_s)  # a device's own mistake, kept as it was
+                return Answer(reply, outcome.latency_s)  # the device's own mistake, replayed as recorded
             if request.values is not None:
                 if requests.is_written(request, pdu, reply):
                     unit.write(request, request.values)
                 return Answer(reply, outcome.latency_s)
             if not self._knows_all(unit_id, unit, request):
-                return Answer(reply, outcome.latency_s)  # half a counter was recorded: all there is of it
+                return Answer(reply, outcome.latency_s)  # only part of a counter was recorded: return what there is
             return Answer(self._read(unit_id, unit, request), outcome.latency_s)
         if request is None or pdu[0] not in unit.functions:
             known = pdu[0] in unit.functions
@@ -209,7 +211,7 @@ class ExchangeReplay:
         return self._answer_new_write(unit, request, request.values, pdu)
 
     def _answer_new_read(self, unit_id: int, unit: LearntUnit, request: CellRequest, pdu: bytes) -> Answer:
-        """A range that was never recorded as such."""
+        """Answer a read of a range that was not recorded."""
         refused = unit.least_refused.get(request.function)
         if refused is not None and refused <= request.count > unit.most_read.get(request.function, 0):
             return Answer(requests.exception(pdu, requests.ILLEGAL_VALUE), unit.usual_latency_s(request.function))
@@ -218,7 +220,7 @@ class ExchangeReplay:
         return Answer(self._read(unit_id, unit, request), unit.usual_latency_s(request.function))
 
     def _answer_new_write(self, unit: LearntUnit, request: CellRequest, values: tuple[int, ...], pdu: bytes) -> Answer:
-        """A range or a value that was never recorded as such."""
+        """Answer a write of a range or a value that was not recorded."""
         if all((request.table, address) in unit.writable for address in request.addresses):
             unit.write(request, values)
             return Answer(requests.written_reply(request, pdu), unit.usual_latency_s(request.function))
@@ -234,9 +236,10 @@ class ExchangeReplay:
         return Answer(requests.exception(pdu, code))
 
     def _outcome(self, unit: LearntUnit, shape: bytes) -> Recorded | None:
-        """What came of a request of this shape, in recorded order; None when there never was one.
+        """Return the outcome of a request of this shape, in recorded order; None if none was recorded.
 
-        Silence is an event and no state: when the recordings are used up, `HOLD` stays on the last answer, if there was any.
+        Silence is an event and not a state: when the recordings are used up, `HOLD` keeps the last answer, if there was
+        any.
         """
         situations = unit.recorded_in.get(shape)
         if situations is None:
@@ -267,7 +270,7 @@ class ExchangeReplay:
         return all(self._knows(unit_id, unit, (request.table, address)) for address in request.addresses)
 
     def _value(self, unit_id: int, unit: LearntUnit, cell: Cell) -> int:
-        """One cell: from its counter, or as recorded after the same writes, or as it was written."""
+        """Return the value of one cell: from its counter, as recorded after the same writes, or as written."""
         if cell in unit.put:
             return unit.put[cell]
         if self.never_recorded is NeverRecorded.INTERPOLATE and not self._knows(unit_id, unit, cell):
@@ -287,7 +290,7 @@ class ExchangeReplay:
         return int.from_bytes(self.context.take(COMMAND(in_situation(key, situation))).data, "big")
 
     def _neighbours(self, unit: LearntUnit, cell: Cell) -> tuple[int, int] | None:
-        """The nearest recorded addresses below and above a cell that is none; None outside of all that was recorded."""
+        """Return the nearest recorded addresses below and above an unknown cell; None outside of the recorded range."""
         if unit.addresses is None:
             tables: dict[Table, list[int]] = {table: [] for table in TABLE_CODES}
             names = {code: table for table, code in TABLE_CODES.items()}
@@ -300,7 +303,7 @@ class ExchangeReplay:
         return (known[at - 1], known[at]) if 0 < at < len(known) else None
 
     def _between_all(self, unit_id: int, unit: LearntUnit, request: CellRequest) -> bool:
-        """Whether what is not known lies between what is, and that is answer enough."""
+        """Return whether all unknown cells lie between known ones and may be interpolated."""
         if self.never_recorded is not NeverRecorded.INTERPOLATE:
             return False
         cells = [(request.table, address) for address in request.addresses]
@@ -319,7 +322,7 @@ class ExchangeReplay:
         return low + round((high - low) * (address - below) / (above - below))
 
     def _now(self, unit_id: int, unit: LearntUnit, cell: Cell) -> int:
-        """What a recorded cell was last read as, or will be first: nothing is taken."""
+        """Return the last value read of a recorded cell, or its first value; the recording does not advance."""
         if cell in unit.put:
             return unit.put[cell]
         key, written = cell_key(unit_id, cell), unit.situations.written(cell)
@@ -331,7 +334,7 @@ class ExchangeReplay:
 
     @staticmethod
     def _choose(unit: LearntUnit, key: bytes, situations: list[int]) -> int:
-        """The recorded situation to use; remembered until the next write."""
+        """Return the recorded situation to use, which is cached until the next write."""
         if key not in unit.alike:
             unit.alike[key] = unit.situations.most_alike(situations)
         return unit.alike[key]

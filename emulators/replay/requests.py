@@ -1,8 +1,8 @@
-"""Recorded Modbus PDUs taken apart into cells, and answers put together from cells.
+"""Splits recorded Modbus PDUs into cells, and builds replies from cells.
 
-A cell is one bit or register: table and address. Functions 01 to 06, 0F and 10h are understood cell by cell (MODBUS
-Application Protocol V1.1b3, 6.1 to 6.12); all others are opaque: answered as a whole or not at all. Pure, and a stranger to the
-slave's own decoding in fieldtwin.emulators.modbus and to the master's.
+A cell is one bit or register: table and address. Functions 01 to 06, 0F and 10h are processed cell by cell (MODBUS
+Application Protocol V1.1b3, 6.1 to 6.12); all others are opaque: answered as a whole or not at all. Pure, and
+independent of the server's decoder in fieldtwin.emulators.modbus and of the client's.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ ILLEGAL_FUNCTION, ILLEGAL_ADDRESS, ILLEGAL_VALUE, DEVICE_FAILURE = 1, 2, 3, 4
 
 @dataclass(frozen=True, slots=True)
 class CellRequest:
-    """A request for cells of one table. `values` is None for a read, and what to write for a write."""
+    """A request for cells of one table. `values` is None for a read, and the values to write for a write."""
 
     function: int
     table: Table
@@ -39,7 +39,7 @@ class CellRequest:
 
 
 def parse_request(pdu: bytes) -> CellRequest | None:
-    """The cells that a request is about; None where it is opaque: another function, or not well formed."""
+    """Return the cells of a request; None if it is opaque: a different function, or malformed."""
     function = pdu[0] if pdu else 0
     if len(pdu) < 5:
         return None
@@ -58,7 +58,10 @@ def parse_request(pdu: bytes) -> CellRequest | None:
 
 
 def leaves_the_table(pdu: bytes) -> bool:
-    """Whether a request is well formed but for its last address, which is none (AP 6: 02, where a bad quantity is 03)."""
+    """Return whether a request is valid except that its last address is outside of the table.
+
+    Such a request gets exception 02, while a bad quantity gets 03 (AP 6).
+    """
     if len(pdu) < 5 or pdu[0] not in {*_READS, 15, 16}:
         return False
     address, count = struct.unpack(">HH", pdu[1:5])
@@ -66,7 +69,7 @@ def leaves_the_table(pdu: bytes) -> bool:
 
 
 def parse_values(request: CellRequest, reply: bytes) -> tuple[int, ...] | None:
-    """The cells that a normal reply to a read carries; None where it is no such reply."""
+    """Return the cells in a normal reply to a read; None if `reply` is not one."""
     if len(reply) < 2 or reply[0] != request.function or reply[1] != len(reply) - 2:
         return None
     data = reply[2:]
@@ -76,27 +79,27 @@ def parse_values(request: CellRequest, reply: bytes) -> tuple[int, ...] | None:
 
 
 def is_exception(request: bytes, reply: bytes) -> bool:
-    """Whether `reply` is an exception response to `request`."""
+    """Return whether `reply` is an exception response to `request`."""
     return len(reply) == 2 and reply[0] == request[0] | 0x80
 
 
 def exception(request: bytes, code: int) -> bytes:
-    """An exception response."""
+    """Return an exception response."""
     return bytes((request[0] | 0x80, code))
 
 
 def is_written(request: CellRequest, pdu: bytes, reply: bytes) -> bool:
-    """Whether `reply` is what a write that succeeded is answered with."""
+    """Return whether `reply` is the reply to a successful write."""
     return reply == written_reply(request, pdu)
 
 
 def written_reply(request: CellRequest, pdu: bytes) -> bytes:
-    """The normal reply to a write: the request itself, or its function, address and count."""
+    """Return the normal reply to a write: the request itself, or its function, address and count."""
     return pdu if request.function <= 6 else pdu[:5]
 
 
 def read_reply(request: CellRequest, values: list[int]) -> bytes:
-    """The normal reply to a read."""
+    """Return the normal reply to a read."""
     if request.function <= 2:
         packed = sum(bit << i for i, bit in enumerate(values))
         data = packed.to_bytes((request.count + 7) // 8, "little")

@@ -1,8 +1,8 @@
-"""What was written before: the part of a device's past on which its recorded answers depend (SPEC ruling 3).
+"""The writes so far: the part of a device's past on which its recorded answers depend (SPEC ruling 3).
 
-A situation is the last value written to each cell, of one unit, since the recording began. Each has a number. What was
-recorded is kept by situation; what is asked for is looked up in the present situation or, where nothing was recorded in that one,
-in the recorded one that is most like it. Pure bookkeeping; it knows no protocol.
+A situation is the last value written to each cell of one unit since the recording began. Each situation has a number.
+Recordings are kept by situation. A read uses the present situation or, if nothing was recorded in it, the most similar
+recorded one. Pure bookkeeping; it knows no protocol.
 """
 
 from __future__ import annotations
@@ -16,21 +16,22 @@ Cell = tuple[Table, int]
 Written = tuple[Cell, int]
 
 MAX_SITUATIONS = 1024
-"""Distinct situations of one unit that are told apart; further ones are kept with the last of these, counted as `folded`."""
+"""Distinct situations of one unit that are kept apart; further ones are merged into the last of these, counted as `folded`.
+"""
 
 
 class Situations:
     """Numbers the recorded situations of one unit and follows its writes. Number 0: nothing was written.
 
-    First the recording is learned, then `rewind` goes back to its beginning: from there on nothing more is learned, so that
-    a master that writes ever new values costs no memory.
+    After the recording has been learned, `rewind` returns to its beginning. From then on nothing more is learned, so
+    that a client that always writes new values needs no memory.
     """
 
     def __init__(self, max_situations: int = MAX_SITUATIONS) -> None:
         self.max_situations = max_situations
         self.folded = 0
         self.now: int | None = 0
-        """The present situation's number; None for one that was never recorded."""
+        """The present situation's number; None if it was not recorded."""
         self._learning = True
         self._state: dict[Cell, Written] = {}
         self._known: list[frozenset[Written]] = [frozenset()]
@@ -38,7 +39,7 @@ class Situations:
         self._numbers: dict[frozenset[Written], int] = {frozenset(): 0}
 
     def copy(self) -> Situations:
-        """Another unit of the same recording, of which nothing more is learned: it begins at the beginning."""
+        """Return the situations for a second unit of the same recording, in the initial state and without further learning."""
         if self._learning:
             raise Bug("situations were copied while they are being learned")
         other = Situations(self.max_situations)
@@ -48,17 +49,17 @@ class Situations:
 
     @property
     def learned(self) -> int:
-        """The number under which what is being recorded now is kept."""
+        """The number under which the present recording is kept."""
         return len(self._known) - 1 if self.now is None else self.now
 
     def rewind(self) -> None:
-        """Nothing was written yet; what is known stays known, and no more is learned."""
+        """Return to the initial state without writes; keep what is known, and stop learning."""
         self._learning = False
         self._state = {}
         self.now = 0
 
     def write(self, table: Table, address: int, values: Sequence[int]) -> None:
-        """The unit accepted these values for the cells from `address` on."""
+        """Record that the unit accepted these values for the cells from `address` on."""
         for i, value in enumerate(values):
             cell = (table, address + i)
             self._state[cell] = (cell, value)
@@ -76,18 +77,18 @@ class Situations:
         self._values.append(dict(state))
 
     def written(self, cell: Cell) -> int | None:
-        """The value last written to `cell`, or None."""
+        """Return the value last written to `cell`, or None."""
         written = self._state.get(cell)
         return written[1] if written else None
 
     def written_in(self, situation: int, cell: Cell) -> int | None:
-        """The value that `cell` had last been given in that situation, or None."""
+        """Return the value last written to `cell` in that situation, or None."""
         return self._values[situation].get(cell)
 
     def most_alike(self, candidates: Sequence[int]) -> int:
-        """Of some situations the one most like the present one; the earliest of several.
+        """Return the candidate most similar to the present situation; the earliest if there are several.
 
-        Most alike: most cells with the same value, then most cells written at all, then fewest written besides.
+        Most similar: most cells with the same value, then most cells written at all, then fewest additional writes.
         """
         if self.now is not None and self.now in candidates:
             return self.now

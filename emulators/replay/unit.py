@@ -1,8 +1,8 @@
-"""A recorded unit on an emulated line: what a Modbus slave asks, answered by a replay.
+"""A recorded unit on an emulated line: a replay in the form of a Modbus unit.
 
-It takes the place of a unit that computes its answers: same counters, same calls; what is registered on it, and exception
-06 while it is to be busy, go before what was recorded. `latency_s` is what the last answer had taken
-in the recording; whoever sends the reply may wait as long.
+It replaces a unit that computes its answers, with the same counters and calls. Registered functions, and exception 06
+while it is busy, take precedence over the recording. `latency_s` is the recorded latency of the last answer, which the
+sender of the reply may use as a delay.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from fieldtwin.gateway.core.errors import UsageError
 
 
 class _NoBank(RegisterBank):
-    """A recorded unit computes nothing, so nothing is behind it."""
+    """An empty bank, because a recorded unit computes no answers."""
 
     def read(self, table: Table, address: int, count: int, now_ns: int) -> Sequence[int]:
         raise IllegalAddress(f"{table}:{address}")
@@ -26,7 +26,7 @@ class _NoBank(RegisterBank):
 
 
 class ReplayUnit(ModbusUnit):
-    """Unit `unit_id` of a recording, which must hold it. It may be served under any id."""
+    """Unit `unit_id` of a recording, which must contain it. It may be served under any unit ID."""
 
     def __init__(self, replay: ExchangeReplay, unit_id: int, name: str = "", parts: UnitParts | None = None) -> None:
         if unit_id not in replay.units:
@@ -46,7 +46,7 @@ class ReplayUnit(ModbusUnit):
         self._registered.add(function)
 
     def respond(self, pdu: bytes, now_ns: int) -> bytes | None:
-        """The recorded answer, None for silence. Exchanges are keyed by order, not by time."""
+        """Return the recorded answer, None for silence. Exchanges are ordered by sequence, not by time."""
         busy = now_ns < self._busy_until_ns
         if pdu and (self.computes(pdu) or (busy and pdu[0] not in WHILE_BUSY) or self.diagnostics.listen_only):
             self.latency_s = 0.0
@@ -73,15 +73,15 @@ class ReplayUnit(ModbusUnit):
         self.counters.naks += reply[1:2] == b"\x07"
 
     def computes(self, pdu: bytes) -> bool:
-        """Whether the unit answers this itself, whatever was recorded."""
+        """Return whether the unit computes this answer itself, regardless of the recording."""
         return pdu[0] in self._registered
 
     def recall(self, pdu: bytes) -> Answer:
-        """What the recorded unit answers."""
+        """Return the answer of the recorded unit."""
         return self.replay.respond(self.unit_id, pdu)
 
     def execute_broadcast(self, pdu: bytes, now_ns: int) -> None:
-        """A write to all units has its effect on this one too."""
+        """Execute a write to all units on this unit."""
         self.counters.broadcasts += 1
         self.counters.unanswered += 1
         self.diagnostics.log.note_received(listening=self.diagnostics.listen_only, broadcast=True)

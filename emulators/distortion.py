@@ -1,4 +1,4 @@
-"""What a device holds instead of what its recording or model says: value faults, and values that somebody sets."""
+"""The values that a device holds instead of those of its recording or model: value faults, and values that a user sets."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class _Put:
 
 @dataclass
 class Distortions:
-    """Of one device. `apply` is asked for every number that the device is about to hold."""
+    """The value faults of one device. `apply` is called for every number that the device is about to hold."""
 
     _puts: dict[str, _Put] = field(default_factory=dict)
     counts_given: bool = False
@@ -31,7 +31,7 @@ class Distortions:
         return bool(self._puts)
 
     def put_in(self, active: Active, tag: str) -> None:
-        """`tag` is distorted from now on; ``""``: every tag."""
+        """Distort `tag` from now on; ``""``: every tag."""
         assert isinstance(active.fault, ValueFault)
         self._puts[active.id] = _Put(active, active.fault, tag)
 
@@ -39,14 +39,14 @@ class Distortions:
         return self._puts.pop(id, None) is not None
 
     def of(self, tag: str, *, named: bool = False) -> bool:
-        """Return whether anything may distort `tag`; with `named` only what is aimed at this tag, not at all tags."""
+        """Return whether a fault may distort `tag`; with `named` only faults aimed at this tag, not at all tags."""
         return any(
             (put.tag == tag or (put.tag == "" and not named)) and put.fault.on(tag) is not None
             for put in self._puts.values()
         )
 
     def apply(self, tag: str, value: float, now_ns: int, *, named: bool = False) -> float:
-        """The number that the device holds instead of `value`, in engineering units. `named`: as `of`."""
+        """Return the number that the device holds instead of `value`, in engineering units. `named` as in `of`."""
         for put in self._puts.values():
             if (put.tag != tag and (put.tag != "" or named)) or not in_time(put.active, now_ns):
                 continue
@@ -60,7 +60,7 @@ class Distortions:
         return value
 
     def gave(self, tag: str, now_ns: int, *, named: bool = False) -> None:
-        """Count a strike of each fault that distorts `tag`, because the device has sent the value. `named`: as `of`."""
+        """Count a strike of each fault that distorts `tag`, because the device has sent the value. `named` as in `of`."""
         for put in self._puts.values():
             aimed = put.tag == tag or (put.tag == "" and not named)
             if aimed and in_time(put.active, now_ns) and put.fault.on(tag) is not None:

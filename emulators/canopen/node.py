@@ -1,7 +1,7 @@
 """The emulated CANopen node: NMT slave, dispatch of frames, and the object dictionary as an SDO client sees it.
 
-A pure object: frames and `now_ns` in, frames out, and when to be called next. It must never know asyncio, sockets, nor
-what a driver makes of its frames. `serve.serve_node` runs it on a connection.
+A pure object: it takes frames and `now_ns`, and returns frames and the time of the next call. It must never know asyncio,
+sockets, or how a driver interprets its frames. `serve.serve_node` runs it on a connection.
 
 =================  ===========================================================  =====================================
 state              answers                                                      left by

@@ -1,4 +1,4 @@
-"""The hello of the software CAN bus, the bus's and the emulators' side of it: two records before the first frame.
+"""The hello of the software CAN bus, for the bus and the emulators: two records before the first frame.
 
 Pure bytes; no sockets. A hello is as long as a frame's record (24 bytes) and its first byte has bit 7 set, which no
 frame's record has, so a reader of fixed-size records needs no second framing. Network byte order:
@@ -6,15 +6,16 @@ frame's record has, so a reader of fixed-size records needs no second framing. N
     0  u8   80h
     1  u8   protocol version: 1, or 2 for records that carry CAN FD (80 bytes each); the answer has that of the request
     2  u8   status (answer): 0 welcome, 1 wrong bit rate, 2 unknown version, 3 bus full
-    3  u8   options (request): bit 0, confirm each frame of mine when it was on the wire; bit 1, error frames when my
-            controller's state changes or frames for me were lost; bit 2, one for each error on the wire that I took part in
-    4  u32  bit rate: wanted (0: whatever the bus has), in the answer the bus's own
+    3  u8   options (request): bit 0, confirm each frame of the client once it was on the wire; bit 1, error frames when the
+            state of the client's controller changes or frames for the client were lost; bit 2, an error frame for each error
+            on the wire in which the client took part
+    4  u32  bit rate: requested (0: that of the bus), in the answer that of the bus
     8  u64  monotonic clock of the bus in ns (answer)
     16 4s   "ftcb"
     20 u16  transmit window (answer): unconfirmed frames that the bus takes without holding back the sender
-    22 u16  data bit rate in kbit/s, in version 2: wanted (0: whatever the bus has), in the answer the bus's own; else 0
+    22 u16  data bit rate in kbit/s, in version 2: requested (0: that of the bus), in the answer that of the bus; else 0
 
-The joining side speaks first. After a status other than 0 the bus closes.
+The client sends its hello first. After an answer with a status other than 0, the bus closes the connection.
 """
 
 from __future__ import annotations

@@ -102,7 +102,9 @@ TRANSITIONS = (
     *(Transition(13, state, _C.ERROR, _S.FAULT_REACTION) for state in _S if state not in (_S.FAULT, _S.FAULT_REACTION)),
     Transition(14, _S.FAULT_REACTION, _C.REACTED, _S.FAULT),
     Transition(15, _S.FAULT, _C.FAULT_RESET, _S.SWITCH_ON_DISABLED),
-    Transition(16, _S.QUICK_STOP, _C.ENABLE_OPERATION, _S.OPERATION_ENABLED),  # if the option code lets it stay there
+    Transition(
+        16, _S.QUICK_STOP, _C.ENABLE_OPERATION, _S.OPERATION_ENABLED
+    ),  # if the option code permits the drive to stay there
 )
 
 _BY_CAUSE = {(t.source, t.cause): t for t in TRANSITIONS}

@@ -47,7 +47,7 @@ class ModemEnd(Outgoing, Incoming, Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Untamed:
-    """Losses that the modems do not repair, as probabilities per packet: it never arrives, it arrives twice, or it
+    """Faults of the link that the modems do not correct, as probabilities per packet: it never arrives, it arrives twice, or it
     arrives before its predecessor.
     """
 

@@ -2,7 +2,7 @@
 
     write_html(subject, results, reproduce, path)
 
-What failed comes first, with every byte; what passed is a line in the table, its bytes folded away.
+Failed cases come first, with every byte; a passed case is a line in the table, with its bytes folded away.
 """
 
 from __future__ import annotations

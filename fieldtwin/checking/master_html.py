@@ -1,6 +1,6 @@
 """The conformance report of a master as one HTML file: no network, no script, readable on paper.
 
-What failed or stayed open comes first, with its frames. All cases follow in a table, with the frames of passed ones folded away.
+Failed and open cases come first, with their frames. All cases follow in a table; the frames of passed ones are folded away.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""Commissioning: the verbs that meet a real device. Each looks before it asks, and asks before it writes."""
+"""Commissioning: the commands for a real device. Each listens before it sends, and confirms before it writes."""

@@ -24,7 +24,7 @@ from fieldtwin.gateway.protocols.canopen.datatypes import DataType
 from fieldtwin.gateway.protocols.canopen.dictionary import DictionaryEntry, ObjectDictionary
 
 AUTO = "auto"
-"""The type of a CANopen object of which nothing is known: what its length says."""
+"""The type of a CANopen object of unknown type: it follows from the data's length."""
 
 ORDERS = ("ABCD", "CDAB", "BADC", "DCBA")
 TYPES = (*REGISTERS_OF, "int8", "uint8", "string", "bytes")
@@ -42,8 +42,11 @@ _OF_TYPE_CODE = {
 
 @dataclass(frozen=True, slots=True)
 class RawForm:
-    """How raw addresses are read: `type` None is uint16, bool for bits, and what its length says for an object; `registers`
-    is the length of text; `count` values stand one behind the other."""
+    """The interpretation of raw addresses.
+
+    `type` None is uint16, bool for bits, and for an object it follows from the length; `registers` is the length of
+    text; `count` values follow one another.
+    """
 
     type: str | None = None
     order: str = "ABCD"
@@ -183,7 +186,7 @@ def object_name(index: int, subindex: int) -> str:
 
 
 def tag_of_entry(entry: DictionaryEntry) -> Tag:
-    """An entry of an EDS as a tag: its type, its access and its limits are what the file says."""
+    """Return an entry of an EDS as a tag, with type, access and limits of the file."""
     kind = _OF_TYPE_CODE.get(
         DataType(entry.type_code) if entry.type_code in set(DataType) else DataType.DOMAIN, "bytes"
     )
@@ -204,7 +207,7 @@ def raw_tag(
     object_: tuple[int, int] | None = None,
     order: str = "ABCD",
 ) -> Tag:
-    """A tag of which nothing is known but where it stands and how it is read; whether it may be written the device tells."""
+    """Return a tag with only an address and a type; the device decides whether it may be written."""
     fixed = at is not None and at.table in ("discrete", "input")
     stores = object_ is not None and object_[0] in _STORING
     return Tag(

@@ -17,7 +17,7 @@ SPREAD = 32
 
 @dataclass(frozen=True, slots=True)
 class Alike:
-    """`units` answer alike. `one_device`: they are one; else it is possible and not known."""
+    """Units that answer alike: `units`. `one_device`: they are one device; otherwise that is only possible."""
 
     units: tuple[int, ...]
     one_device: bool
@@ -25,9 +25,9 @@ class Alike:
 
 
 def likeness(answers: Sequence[UnitAnswer], asked: int, again: Sequence[UnitAnswer] = ()) -> Alike | None:
-    """Whether the units that answered, of `asked`, are one device; `again` are their answers a second time.
+    """Return how likely the units that answered, of `asked`, are one device.
 
-    None where they are several, or fewer than three.
+    `again` are their answers to a second round. None if they are several devices, or fewer than three units.
     """
     if len(answers) < 3 or len(answers) < asked:
         return None
@@ -46,7 +46,7 @@ def likeness(answers: Sequence[UnitAnswer], asked: int, again: Sequence[UnitAnsw
 
 
 def spread_over(units: Sequence[int]) -> tuple[int, ...]:
-    """`SPREAD` of `units` spread over all, likely ones first among them; all where there are no more."""
+    """Return `SPREAD` of `units` over their whole range, with likely ones among them; all if there are no more."""
     if len(units) <= SPREAD:
         return tuple(units)
     ordered = sorted(units)

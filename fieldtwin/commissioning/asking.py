@@ -64,7 +64,7 @@ class Asker(Protocol):
     """Asks one device."""
 
     async def read(self, asked: RegisterRange | ObjectKey, *, patient: bool = True) -> Asked:
-        """Read that, without any retry unless `patient`. Raises only what ends the connection."""
+        """Read a range or an object, without any retry unless `patient`. Raises only errors that end the connection."""
         ...
 
     async def function(self, request: Request[Any]) -> Asked:
@@ -144,7 +144,7 @@ def _without_result(error: WireError) -> Silent | Invalid:
 
 
 class CanopenAsker:
-    """A node behind `master`. A pause of `spacing_s` after each transfer leaves the bus to others."""
+    """A node behind `master`. A pause of `spacing_s` after each transfer leaves the bus free for others."""
 
     def __init__(
         self, master: CanopenMaster, node: int, clock: Clock, *, retries: int = 2, spacing_s: float = 0.0

@@ -14,7 +14,7 @@ from fieldtwin.gateway.protocols.canopen.nmt import NmtState
 from fieldtwin.gateway.protocols.canopen.sync_watch import SyncWatch
 
 _STUFF = 1.1
-"""Bits on the wire per bit of a frame, with stuff bits of usual data."""
+"""Bits on the bus per bit of a frame, with the stuff bits of usual data."""
 
 
 @dataclass(slots=True)
@@ -36,13 +36,13 @@ class NodeHeard:
 
     @property
     def certain(self) -> bool:
-        """Whether the node is there, and not only its identifiers."""
+        """Return whether the node itself was seen, not only its identifiers."""
         return bool(self.heartbeats or self.boot_ups or self.sdo_replies or self.emergencies)
 
 
 @dataclass(slots=True)
 class BusHeard:
-    """The sum of what came."""
+    """The totals of the observation."""
 
     frames: int = 0
     errors: int = 0
@@ -50,13 +50,13 @@ class BusHeard:
     bits: float = 0.0
     nodes: dict[int, NodeHeard] = field(default_factory=dict)
     sdo_masters: dict[int, int] = field(default_factory=dict)
-    """Node -> when another master last sent it an SDO request (ns)."""
+    """Node -> time (ns) of the last SDO request that another master sent to it."""
     nmt_commands: int = 0
     commands: int = 0
     """RPDOs, by the predefined identifiers."""
     syncs: int = 0
     sync_producers: str = ""
-    """Why there is more than one SYNC producer; empty where nothing shows it."""
+    """The reason to assume more than one SYNC producer; empty without evidence."""
     times: int = 0
     lss_requests: int = 0
     others: int = 0
@@ -68,7 +68,7 @@ class BusHeard:
         return bool(self.sdo_masters or self.nmt_commands or self.lss_requests or self.commands)
 
     def load(self, seconds: float, bitrate: int) -> float:
-        """The share of the bus that the frames took; 0 where the bit rate is not known."""
+        """Return the share of the bus that the frames took; 0 if the bit rate is not known."""
         return self.bits / (seconds * bitrate) if seconds > 0 and bitrate else 0.0
 
 
@@ -80,7 +80,7 @@ class BusEar:
         self._sync = SyncWatch()
 
     def feed(self, frame: CanFrame, t_ns: int) -> None:
-        """A frame that came at `t_ns`."""
+        """Add a frame received at `t_ns`."""
         heard = self.heard
         if frame.error:
             heard.errors += 1

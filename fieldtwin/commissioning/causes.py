@@ -28,14 +28,14 @@ _EDGES = frozenset({0x00, 0x80, 0xC0, 0xE0, 0xF0, 0xF8, 0xFC, 0xFE, 0xFF})
 
 @dataclass(frozen=True, slots=True)
 class Cause:
-    """One explanation: what, why it is thought of, what to do. A larger `weight` is looked at first."""
+    """One explanation: the cause, its evidence, the remedy. Causes with a larger `weight` are checked first."""
 
     name: str
     weight: int
     why: str
     remedy: str
     harmless: bool = False
-    """As it may well be: no fault."""
+    """True for a cause that is normal and not a fault."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +80,7 @@ def ranked(causes: Iterable[Cause]) -> list[Cause]:
 
 
 def serial_causes(e: SerialEvidence) -> list[Cause]:
-    """Of silence, of garbage, and of a question without an answer."""
+    """Return the causes of silence, of garbage, and of an unanswered question on a serial line."""
     found: list[Cause] = []
     if e.ignored:
         found.append(
@@ -111,12 +111,12 @@ def serial_causes(e: SerialEvidence) -> list[Cause]:
 
 
 def _elsewhere(e: SerialEvidence) -> bool:
-    """Whether traffic proved other settings."""
+    """Return whether traffic proved other settings."""
     return e.verdict is not None and e.verdict.sure and e.settings not in (e.verdict.settings, *e.verdict.others)
 
 
 def _many_errors(e: SerialEvidence) -> bool:
-    """Whether the port counts errors though the frames are whole: bits are right and their parity is not, for one."""
+    """Return whether the port counts errors although the frames are whole, for example with a wrong parity."""
     return e.errors is not None and e.errors.parity + e.errors.frame > (1 - HEALTHY) * e.heard.bytes
 
 
@@ -311,7 +311,7 @@ def _of_probe(probe: Probe, e: SerialEvidence) -> list[Cause]:
 
 
 def can_causes(facts: CanFacts, heard: BusHeard, load: float) -> list[Cause]:
-    """Of a silent CAN bus, of errors, of a bus that is full."""
+    """Return the causes of a silent CAN bus, of errors, and of a full bus."""
     found: list[Cause] = []
     errors = facts.tx_errors + facts.rx_errors
     if facts.state == "bus-off":
@@ -354,7 +354,7 @@ def can_causes(facts: CanFacts, heard: BusHeard, load: float) -> list[Cause]:
 
 
 def tcp_causes(problem: str, heard: bytes, hung_up: bool, port: int) -> list[Cause]:
-    """Of a host that cannot be reached (`problem` is what the operating system said), or that behaves oddly unasked."""
+    """Return the causes for a host that cannot be reached (`problem` is the operating system's error), or that misbehaves."""
     text = problem.lower()
     table: list[tuple[Callable[[], bool], list[Cause]]] = [
         (lambda: "refused" in text, [

@@ -16,7 +16,7 @@ from fieldtwin.gateway.core.profile import RegisterRange, Table, gap_text
 
 NOT_ASKED, READABLE, REFUSED, SILENT, INVALID = range(5)
 STATE_NAMES = ("not asked", "readable", "refused", "no reply", "invalid reply")
-"""As people read them; the keys of a dump file are `STATE_KEYS`."""
+"""The names for users; the keys of a dump file are `STATE_KEYS`."""
 STATE_KEYS = ("not_asked", "readable", "refused", "silent", "invalid")
 SHORT = 2
 """A read of more values than this does not decide the state of an address that it could not bring."""
@@ -37,7 +37,7 @@ class Coverage:
         self._sizes = bytearray(ADDRESSES)
 
     def note(self, at: RegisterRange, state: int) -> None:
-        """Record what a read of `at` came to: one of `READABLE`, `REFUSED`, `SILENT`, `INVALID`."""
+        """Record the outcome of a read of `at`: one of `READABLE`, `REFUSED`, `SILENT`, `INVALID`."""
         if state == READABLE:
             self.states[at.address : at.end] = bytes((READABLE,)) * at.count
             return
@@ -50,11 +50,11 @@ class Coverage:
                 self.states[address], self._sizes[address] = state, size
 
     def is_definite(self, address: int) -> bool:
-        """Whether the device said yes or no about this address."""
+        """Return whether the device accepted or refused this address."""
         return self.states[address] in (READABLE, REFUSED)
 
     def is_sampled(self, address: int) -> bool:
-        """Whether definite answers stand within `GRID` addresses on both sides, or here."""
+        """Return whether there are definite answers within `GRID` addresses on both sides, or at the address."""
         below = self.states[max(0, address - GRID + 1) : address + 1]
         above = self.states[address : address + GRID]
         return any(s in (READABLE, REFUSED) for s in below) and any(s in (READABLE, REFUSED) for s in above)
@@ -83,14 +83,13 @@ class Coverage:
         return found
 
     def count(self, state: int, scope: Spans) -> int:
-        """How many addresses of `scope` are in `state`."""
+        """Return the number of addresses of `scope` in `state`."""
         return sum(self.states.count(state, low, high) for low, high in scope)
 
 
 @dataclass(frozen=True, slots=True)
 class Stretch:
-    """Addresses from `start` to before `end`, of which `asked` were asked, all with the outcome `state`; the others were not
-    asked."""
+    """A range of addresses from `start` to before `end`: `asked` of them were read, all with the outcome `state`."""
 
     start: int
     end: int
@@ -129,7 +128,7 @@ def stretches(coverage: Coverage, scope: Spans) -> list[Stretch]:
 
 
 def _tail(stretch: Stretch) -> int:
-    """How many neighbouring addresses a stretch without gaps has; 0 for one with gaps, which more samples may join."""
+    """Return the number of addresses of a stretch without gaps; 0 for one with gaps, which more samples may join."""
     return stretch.asked if stretch.is_whole else 0
 
 
@@ -161,7 +160,7 @@ def describe(table: Table, coverage: Coverage, scope: Spans, *, function_refused
 
 
 def joined(spans: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Intervals in order, with those that touch or overlap made one."""
+    """Return the intervals in order; those that touch or overlap are joined."""
     out: list[tuple[int, int]] = []
     for start, end in sorted(spans):
         if out and out[-1][1] >= start:

@@ -68,7 +68,7 @@ class Leave:
         return ignored or tag.secret or (self.settings and not tag.writable)
 
     def near(self, tag: Tag, left: TagValue, right: TagValue) -> bool:
-        """Whether two values are as good as the same."""
+        """Return whether two values are equal within the tolerance."""
         if left.raw == right.raw:
             return True
         room = next((self.tolerance[n] for n in (tag.name, "*") if n in self.tolerance), None)
@@ -83,7 +83,7 @@ def diff_dumps(
     dictionary: ObjectDictionary | None = None,
     leave: Leave | None = None,
 ) -> Differences:
-    """The last pass of the one against that of the other, then what the devices let one read."""
+    """Compare the last passes of two dumps, then the readable ranges of the devices."""
     leave, out = leave or Leave(), Differences()
     one, other = left.passes[-1], right.passes[-1]
     tags = _tags(profile, dictionary)
@@ -198,7 +198,7 @@ def value_in(one: Pass, tag: Tag, profile: DeviceProfile | None) -> TagValue | N
 
 
 def place(tag: Tag) -> str:
-    """As sent: ``holding:4``, ``6041h:00``."""
+    """Return the address as sent: ``holding:4``, ``6041h:00``."""
     if tag.at is not None:
         return f"{tag.at.table}:{tag.at.address}"
     assert tag.object is not None
@@ -287,7 +287,7 @@ def _why_not(dump: Dump, cells: Sequence[Cell]) -> str:
 
 
 def _diff_access(out: Differences, left: Dump, right: Dump) -> None:
-    """Longest reads and functions, where both dumps tell."""
+    """Compare longest reads and functions, if both dumps contain them."""
     for table in left.maps.keys() & right.maps.keys():
         a, b = left.maps[table], right.maps[table]
         if a.get("limit_proved") and b.get("limit_proved") and a["max_read"] != b["max_read"]:

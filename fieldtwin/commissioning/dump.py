@@ -1,7 +1,7 @@
-"""Dumping a device: the questions of a sweep are asked, every answer is written down before the next question.
+"""Dump a device: send the questions of a sweep, and write down every answer before the next question.
 
-It goes on where a killed one stopped, by answering the sweep's questions from the file as far as that goes. It must never write
-to the device, and asks nothing that is not logged.
+An interrupted dump continues by answering the sweep's questions from the file as far as it goes. This module must never
+write to the device, and sends only requests that are logged.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class Job:
     spacing_s: float = 0.0
 
     def header(self) -> dict[str, Any]:
-        """What makes two dumps the same job; the endpoint may be called otherwise tomorrow."""
+        """Return the properties that two dumps of the same job share; the endpoint is not one of them, because it may change."""
         target = self.target
         ranges = [gap_text(s) for s in self.spans] or [f"{a:04X}h..{b:04X}h" for a, b in self.objects]
         return {
@@ -123,7 +123,7 @@ class Result:
 
 
 class Dumper:
-    """One session of a job. `earlier`: the dump that is gone on with."""
+    """One session of a job. `earlier`: the dump that is continued."""
 
     def __init__(
         self,
@@ -192,7 +192,7 @@ class Dumper:
             self._write(map_line(self._so_far, found.table, _map_line(found)))
 
     def _objects_line(self, sweep: ObjectSweep | ListedObjects) -> dict[str, Any]:
-        """How many objects are in each state, and which were not asked for."""
+        """Return the number of objects in each state, and those that were not asked."""
         first = self._so_far.passes[0]
         indexes = {index for cells in (first.cells, first.refused, first.silent, first.invalid) for index, _ in cells}
         if isinstance(sweep, ListedObjects):
@@ -303,7 +303,7 @@ class Dumper:
 
 
 def check_resumable(job: Job, earlier: Dump) -> None:
-    """Raise `FileInvalid` when `earlier` is the dump of another job."""
+    """Raise `FileInvalid` when `earlier` is the dump of a different job."""
     now = job.header()
     different = [key for key, value in now.items() if earlier.header.get(key) != value]
     if different:
@@ -360,7 +360,7 @@ def _size(sweep: Sweeping) -> int:
 
 
 def _place(sweep: Sweeping, asked: RegisterRange | ObjectKey) -> int:
-    """How far a sweep is when it has asked this."""
+    """Return the progress of a sweep after this question."""
     if isinstance(sweep, Sweep) and isinstance(asked, RegisterRange):
         return asked.address - sweep.span.address
     if isinstance(sweep, ObjectSweep) and isinstance(asked, ObjectKey):

@@ -1,8 +1,8 @@
-"""How a sweep goes on where asking address by address is too expensive: beyond silence, and with other read lengths.
+"""Continue a sweep where asking address by address is too expensive: in silent areas, and with other read lengths.
 
-Every question in silence costs a timeout, so the addresses are sampled, the roundest first, until the time budget is used up.
-Among refusals a device may hold values that it gives only whole, so reads of two and more registers are tried there. Pure, as
-`dump_sweep` is.
+Every question in a silent area costs a timeout, so the addresses are sampled, the roundest first, until the time budget
+is used up. Among refusals a device may hold values that can only be read whole, so reads of two and more registers are
+tried there. Pure, as `dump_sweep` is.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from fieldtwin.commissioning.coverage import INVALID, READABLE, REFUSED, coarse_
 from fieldtwin.commissioning.dump_sweep import ROUND, Asking, Sweep
 
 LEVELS = ((1000, 4096), (500, 1024), (100, 256), (ROUND, 64), (16,))
-"""Where manuals begin blocks, the likeliest first."""
+"""Steps at which manuals usually begin blocks, the likeliest first."""
 SILENT_AGAIN = 3
 """Number of consecutive questions without a reply that end a readable block inside a silent area."""
 LENGTHS = (1, 2, 4, 8, 16, 32)
-"""Registers in a read that looks for values that the device gives only whole."""
+"""Lengths in registers of the reads that look for values that can only be read whole."""
 
 
 def beyond_silence(sweep: Sweep) -> Asking:
@@ -51,8 +51,10 @@ def _last_asked(sweep: Sweep, at: int) -> int:
 
 
 def other_lengths(sweep: Sweep) -> Asking:
-    """Ask for two and more registers at once where single ones were refused. Take down in `found.lengths` the lengths for which
-    that was done everywhere."""
+    """Read two and more registers where single ones were refused.
+
+    `found.lengths` receives the lengths for which that was done everywhere.
+    """
     if not sweep.in_words:
         if not sweep.found.stopped:
             sweep.found.lengths = [1]
@@ -85,7 +87,7 @@ def _places(sweep: Sweep, length: int) -> Iterator[int]:
 
 
 def _may_hide(sweep: Sweep, at: int, length: int) -> bool:
-    """Whether `length` registers at `at` could be one value: none was readable, and the device is not silent there."""
+    """Return whether `length` registers at `at` could be one value: none was readable, and the device is not silent there."""
     if at + length > sweep.span.end:
         return False
     states = sweep.coverage.states
@@ -93,7 +95,7 @@ def _may_hide(sweep: Sweep, at: int, length: int) -> bool:
 
 
 def _extend(sweep: Sweep, at: int, length: int) -> Asking:
-    """A read of `length` registers at `at` was taken where shorter ones were not: find the neighbours of the same kind."""
+    """Find the neighbours of a read of `length` registers at `at` that succeeded where shorter ones did not."""
     low, high = at, at + length
     while high + length <= sweep.span.end and sweep.coverage.states[high] != READABLE:
         if not (yield from sweep.ask(high, length)):

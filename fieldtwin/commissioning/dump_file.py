@@ -1,4 +1,4 @@
-"""A dump on disk: JSON lines, one for each answer, so that a killed dump loses at most its last line and goes on from there.
+"""A dump on disk: JSON lines, one for each answer. A killed dump loses at most its last line and can be continued.
 
 ::
 
@@ -16,7 +16,7 @@
 Version 1 had no `invalid` (it was among `silent`), and its `map` lines called silence a hole. It is still read; the states of
 addresses then come from its `read` lines.
 
-It must never know a wire.
+This module must not depend on a connection.
 """
 
 from __future__ import annotations
@@ -60,10 +60,11 @@ Cell = tuple[str, int] | tuple[int, int]
 
 @dataclass
 class Pass:
-    """The values of one time through. Registers are 2 bytes, bits one (0 or 1); objects as the node sent them.
+    """The values of one pass. Registers are 2 bytes, bits one (0 or 1); objects as the node sent them.
 
-    `refused` holds exception or abort codes; `silent` and `invalid` what got no reply and no valid one. For registers these three
-    hold only what was asked one by one. `failed` counts the reads of any length that brought no values.
+    `refused` holds exception or abort codes; `silent` and `invalid` hold addresses without a reply and without a valid
+    one. For registers these three hold only addresses that were read one by one. `failed` counts the reads of any
+    length without values.
     """
 
     utc_ns: int
@@ -80,8 +81,11 @@ class Pass:
 
 @dataclass
 class Dump:
-    """A dump as read from its file. `lines` are all but the header; `ended` says that it is complete. `whole_bytes` is where its
-    last whole line ends."""
+    """A dump as read from its file.
+
+    `lines` are all lines except the header; `ended` means that it is complete. `whole_bytes` is the end of its last
+    complete line.
+    """
 
     path: str
     header: dict[str, Any]
@@ -124,12 +128,12 @@ class Dump:
 
     @property
     def not_asked(self) -> int:
-        """How many addresses no request named, those between samples included."""
+        """The number of addresses that no request contained, including those between samples."""
         return sum(line["counts"].get(STATE_KEYS[NOT_ASKED], 0) for line in self.maps.values() if "counts" in line)
 
     @property
     def is_mostly_unknown(self) -> bool:
-        """Whether the device gave no definite answer for more than half of what the dump was to ask for."""
+        """Return whether the device gave no definite answer for more than half of the dump's scope."""
         unknown, asked_for = self.unknown
         return 2 * unknown > asked_for
 
@@ -177,7 +181,7 @@ def load_dump(path: Path, *, keep_lines: bool = False) -> Dump:
 
 
 def map_line(dump: Dump, table: Table, found: dict[str, Any]) -> dict[str, Any]:
-    """`found`, the line about the limits of a table, with the state of each address as the reads of `dump` tell it."""
+    """Return `found`, the line about the limits of a table, with the state of each address by the reads of `dump`."""
     states = describe(
         table,
         dump.coverage.get(table) or Coverage(),
@@ -190,7 +194,7 @@ def map_line(dump: Dump, table: Table, found: dict[str, Any]) -> dict[str, Any]:
 
 
 def _lines(path: Path) -> Iterator[tuple[int, int, dict[str, Any]]]:
-    """Line number, where it ends, and what it says."""
+    """Yield line number, end position and content."""
     try:
         with path.open("rb") as file:
             end = 0
@@ -292,14 +296,15 @@ def outcome_of(line: dict[str, Any]) -> Outcome:
 
 
 def key_of(asked: RegisterRange | ObjectKey) -> str:
-    """How a read is named in the file."""
+    """Return the name of a read in the file."""
     return gap_text(asked) if isinstance(asked, RegisterRange) else str(asked)
 
 
 class DumpWriter:
-    """Appends lines to `path`; each is the operating system's when the call returns. `resume`: behind the last whole line.
+    """A writer that appends lines to `path`; each is handed to the operating system when the call returns.
 
-    Raises `FileInvalid` when the file cannot be written; at most `max_bytes` are.
+    `resume`: continue after the last complete line. Raises `FileInvalid` when the file cannot be written; at most
+    `max_bytes` are.
     """
 
     def __init__(self, path: Path, *, resume_at: int | None = None, max_bytes: int = 4 << 30) -> None:

@@ -1,6 +1,6 @@
-"""How a node's object dictionary is found out over SDO: index by index, or entry by entry of an EDS.
+"""Explore a node's object dictionary over SDO: index by index, or entry by entry of an EDS.
 
-Pure, and a generator as `dump_sweep` is. Nothing is written; a write-only object is never asked for.
+Pure, and a generator as `dump_sweep` is. Nothing is written; a write-only object is never requested.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ NO_OBJECT, NO_SUBINDEX = 0x0602_0000, 0x0609_0011
 MOST_MISSING = 8
 """Number of consecutive missing subindices that end an array, whatever the value of its subindex 0."""
 LEVELS = ((0x1000,), (0x100, 0x800), (0x40,), (0x10,))
-"""Where profiles begin groups of objects, the likeliest first."""
+"""Steps at which profiles usually begin groups of objects, the likeliest first."""
 EVERYTHING = ((0x1000, 0x9FFF),)
 """Communication, manufacturer and device profile area (CiA 301, 7.4.1)."""
 
@@ -43,7 +43,7 @@ class ObjectKey:
 
 
 class _Patience:
-    """How long a node that does not answer is asked. `budget_us`: the time that questions without a result may take together."""
+    """The patience with a silent node. `budget_us`: the time that questions without a result may take together."""
 
     def __init__(self, budget_us: int | None) -> None:
         self.stopped = ""
@@ -54,11 +54,11 @@ class _Patience:
 
     @property
     def lost(self) -> bool:
-        """Whether the node was silent for the last `MOST_SILENT` questions."""
+        """Return whether the node was silent for the last `MOST_SILENT` questions."""
         return self._silent >= MOST_SILENT
 
     def note(self, outcome: Outcome) -> None:
-        """Take down what a question came to."""
+        """Record the outcome of a question."""
         self._silent = self._silent + 1 if isinstance(outcome, Silent) else 0
         self._heard |= not isinstance(outcome, Silent)
         self._spent_us += outcome.us if isinstance(outcome, Silent | Invalid) else 0
@@ -70,10 +70,10 @@ class _Patience:
 
 
 class ObjectSweep(_Patience):
-    """Asks every index of `ranges` (both ends included) for subindex 0, and what it finds for the others.
+    """A sweep over every index of `ranges` (both ends included): subindex 0 first, then the others of existing objects.
 
-    After `MOST_SILENT` questions in a row without a reply the other indexes are sampled, the roundest first. Where the node
-    answers again, the sweep continues from there.
+    After `MOST_SILENT` consecutive questions without a reply the other indices are sampled, the roundest first. Where
+    the node answers again, the sweep continues from there.
     """
 
     def __init__(self, ranges: Sequence[tuple[int, int]] = EVERYTHING, budget_us: int | None = None) -> None:
@@ -108,7 +108,7 @@ class ObjectSweep(_Patience):
             yield from self._members(index, 1)
 
     def _members(self, index: int, count: int) -> Generator[ObjectKey, Outcome, None]:
-        """Where subindex 0 is a small number it may count the others: subindex 1 tells."""
+        """Read the other subindices. If subindex 0 is a small number, it may be their count, which subindex 1 confirms."""
         missing = 0
         for sub in range(1, min(count, 254) + 1):
             outcome = yield from self._ask(index, sub)

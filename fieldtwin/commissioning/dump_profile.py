@@ -17,9 +17,10 @@ from fieldtwin.gateway.devices.read_plan import ILLEGAL_ADDRESS, TOO_LONG, Group
 
 
 class ProfileSweep:
-    """Reads `tags` of `profile`. `maps` say what was found, by table.
+    """A sweep that reads `tags` of `profile`. `maps` are the findings by table.
 
-    Where the device is silent, reads are not repeated after `MOST_SILENT` in a row, and end when they have taken `budget_us`.
+    Where the device is silent, reads are not repeated after `MOST_SILENT` in a row, and end when they have taken
+    `budget_us`.
     """
 
     def __init__(self, profile: DeviceProfile, tags: Sequence[Tag], budget_us: int | None = None) -> None:
@@ -66,14 +67,14 @@ class ProfileSweep:
 
 
 def _let_alone(profile: DeviceProfile, tags: Sequence[Tag]) -> list[RegisterRange]:
-    """Where tags stand that are not asked for: a read over a gap between two others must not bring them along."""
+    """Return the registers of tags that are not wanted, so that a read over a gap between two others does not include them."""
     wanted = [t.registers for t in tags]
     others = [t.registers for t in profile.tags.values() if t.name not in {w.name for w in tags}]
     return [o for o in others if not any(w.overlaps(o) for w in wanted)]
 
 
 def dumped_tags(profile: DeviceProfile) -> tuple[list[Tag], list[Tag]]:
-    """The tags that a dump reads, and those that it leaves alone: secrets, and what changes something when it is read."""
+    """Return the tags that a dump reads, and those that it omits: secrets, and tags whose reading has an effect."""
     touchy = {e.tag.name for e in profile.effects if e.on_read}
     readable = [t for t in profile.tags.values() if t.readable]
     wanted = [t for t in readable if not t.secret and t.name not in touchy]

@@ -33,7 +33,7 @@ MOST_PAIR_TRIALS = 4
 
 @dataclass(frozen=True, slots=True)
 class Taken:
-    """The device answered; `raw` as on the wire, bits one a byte. It took `us` microseconds, as in the other outcomes."""
+    """The device answered; `raw` as on the bus, bits one per byte. It took `us` microseconds, as in the other outcomes."""
 
     raw: bytes
     us: int = 0
@@ -49,7 +49,7 @@ class Refused:
 
 @dataclass(frozen=True, slots=True)
 class Silent:
-    """Nothing that could be a reply arrived, however often the device was asked."""
+    """No reply arrived, despite all repetitions."""
 
     problem: str
     us: int = 0
@@ -95,7 +95,7 @@ class TableMap:
 
     @property
     def cells(self) -> int:
-        """How many addresses can be read."""
+        """The number of readable addresses."""
         return sum(end - start for start, end in self.readable)
 
     def add_unit(self, start: int, end: int, size: int) -> None:
@@ -117,10 +117,11 @@ class TableMap:
 
 
 class Sweep:
-    """Finds out about `span`. `most` is the longest read to try (None: the standard's). `stride` 1 asks every address.
+    """An exploration of `span`. `most` is the longest read to try (None: the standard's). `stride` 1 reads every address.
 
-    `found` and `coverage` grow as `asking` runs. `patient` says whether the question that was just yielded deserves retries.
-    `budget_us` limits the time that questions without a result take (None: no limit); `spacing_us` is the pause after each.
+    `found` and `coverage` grow as `asking` runs. `patient` is whether the last yielded question deserves retries.
+    `budget_us` limits the time that questions without a result take (None: no limit); `spacing_us` is the pause after
+    each.
     """
 
     def __init__(
@@ -157,11 +158,11 @@ class Sweep:
 
     @property
     def halted(self) -> bool:
-        """Whether the sweep is to ask nothing more here: it was stopped, or the device has become silent."""
+        """Return whether the sweep must not ask more here: it was stopped, or the device has become silent."""
         return bool(self.found.stopped) or self._lost
 
     def asking(self) -> Asking:
-        """Yield ranges to read, take outcomes, and end when the span is known, the device silent, or the table given up."""
+        """Yield ranges to read, receive outcomes, and end when the span is known, the device silent, or the sweep stopped."""
         yield from self.walk(self.span.address)
 
     def resume(self) -> None:
@@ -188,7 +189,10 @@ class Sweep:
             at = begins = yield from self._after_a_refusal(at, count)
 
     def _after_a_refusal(self, at: int, count: int) -> Generator[RegisterRange, Outcome, int]:
-        """`count` cells from `at` were not taken: where to go on. Finds the readable prefix, and why it ends."""
+        """Return the address at which to continue after a refused read of `count` cells at `at`.
+
+        Finds the readable prefix, and the reason for its end.
+        """
         grain = self.found.grain
         good = grain if count > grain and (yield from self.ask(at, grain)) else 0
         if not good and (unit := (yield from self.ask_the_length_that_came(at))):
@@ -197,7 +201,7 @@ class Sweep:
             self._pair_trials -= 1
             if (yield from self.ask(at, 2)):
                 good = 2
-                if not self.singles:  # a device that knows pairs only
+                if not self.singles:  # a device that has pairs only
                     self.found.grain = grain = 2
                     self._most -= self._most % 2
         if not good:
@@ -207,8 +211,10 @@ class Sweep:
         return (yield from self._why_it_ends(at, good))
 
     def ask_the_length_that_came(self, at: int) -> Generator[RegisterRange, Outcome, int]:
-        """Where the last reply for `at` carried another number of registers than asked for, ask for that number. Return it if the
-        device then answers, else 0."""
+        """If the last reply for `at` carried an unexpected number of registers, read that number.
+
+        Return it if the device then answers, else 0.
+        """
         (place, count), self._hint = self._hint, (-1, 0)
         if place != at or not count or (at, count) in self.asked or at + count > self.span.end:
             return 0
@@ -219,7 +225,7 @@ class Sweep:
         return count
 
     def _longest(self, at: int, good: int, bad: int, *, forward: bool) -> Generator[RegisterRange, Outcome, int]:
-        """The longest read that is taken, from `at` on or up to it, between one that is and one that is not."""
+        """Return the longest accepted read, from `at` on or up to it, between an accepted and a refused length."""
         grain = self.found.grain
         while bad - good > grain:
             middle = good + max(grain, (bad - good) // 2 // 2 * 2)
@@ -230,7 +236,7 @@ class Sweep:
         return good
 
     def _why_it_ends(self, at: int, good: int) -> Generator[RegisterRange, Outcome, int]:
-        """A read of `good` cells from `at` is taken and a longer one is not: a hole after it, a border, or the limit?"""
+        """Find why a read of `good` cells from `at` is accepted and a longer one is not: a hole, a border, or the limit."""
         grain, edge = self.found.grain, at + good
         if edge + grain > self.span.end or self.halted:
             return edge
@@ -249,9 +255,9 @@ class Sweep:
         return edge
 
     def through_a_void(self, at: int) -> Generator[RegisterRange, Outcome, int]:
-        """From `at`, right after an address that could not be read, to the next one that can, or to the end."""
+        """Continue from `at`, after an address that could not be read, to the next readable one, or to the end."""
         end, grain, dense = self.span.end, self.found.grain, at + DENSE
-        unasked = probe = at  # nothing between these two was asked
+        unasked = probe = at  # the addresses between these two were not read
         while probe < end and not self.halted:
             if (yield from self._probe(probe, strided=probe >= dense and self.stride > 1)):
                 return (yield from self.back_from(probe, unasked))
@@ -279,8 +285,11 @@ class Sweep:
         return at
 
     def _probe(self, at: int, *, strided: bool) -> Trying:
-        """Whether something can be read at `at`. As long as nothing could be, the device may know pairs only: a pair is asked
-        for too, and where not every address is asked, first."""
+        """Return whether `at` can be read.
+
+        As long as no register was readable, the device may have pairs only: a pair is read too, and first if not every
+        address is read.
+        """
         grain = self.found.grain
         readable = self.coverage.states[at] == READABLE
         if readable or (at, grain) in self.asked or at + grain > self.span.end:
@@ -342,7 +351,7 @@ class Sweep:
         return isinstance(outcome, Taken)
 
     def _charge(self, outcome: Outcome) -> None:
-        """Count the time of a question that brought nothing against the budget."""
+        """Count the time of a question without a result against the budget."""
         if self.charges_everything or isinstance(outcome, Silent | Invalid):
             self.spent_us += outcome.us + self._spacing_us
         if self._budget_us is not None and self.spent_us > self._budget_us and not self.found.stopped:

@@ -1,6 +1,6 @@
-"""A dump from end to end: the ranges that a person names, how long it will take, the files, the open wire.
+"""A dump from end to end: the ranges of the user, the estimated duration, the files, the open connection.
 
-It must never know a screen.
+This module must not depend on a display.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from fieldtwin.gateway.core.profile import RegisterRange, resolve_gap
 from fieldtwin.gateway.wallclock import WallClock
 
 REPLY_S = 0.01
-"""How long a device is taken to think, for an estimate."""
+"""Assumed response time of a device, for an estimate."""
 _INDEXES = re.compile(r"^(?:0x)?([0-9A-Fa-f]{4})h?(?:\.\.(?:0x)?([0-9A-Fa-f]{4})h?)?$")
 CAN_BITS = 2 * 130
 """Bits of an SDO request and its reply, stuffed."""
@@ -74,7 +74,7 @@ def object_ranges(texts: Sequence[str]) -> tuple[tuple[int, int], ...]:
 
 
 def estimate(job: Job, spacing_s: float) -> Estimate:
-    """How long a pass takes at this pace."""
+    """Return the estimated number of requests and duration of a pass at this rate."""
     least = most = 0
     for sweep in job.sweeps():
         if isinstance(sweep, Sweep):

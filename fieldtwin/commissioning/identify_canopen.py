@@ -60,7 +60,7 @@ async def identify_canopen(
     connector: Connector | None = None,
     clock: Clock | None = None,
 ) -> CanIdentity:
-    """Ask `node` on the bus at `url` what it is, and compare with `profiles`. Errors as `canopen_at`."""
+    """Identify `node` on the bus at `url`, and compare it with `profiles`. Errors as `canopen_at`."""
     clock = clock or WallClock()
     result = CanIdentity(url, node)
     async with canopen_at(url, bitrate, sdo_timeout_s=timeout_s, taps=taps, connector=connector, clock=clock) as master:
@@ -85,7 +85,7 @@ async def identify_canopen(
 
 
 class _Asker:
-    """Single uploads, whose abort is an answer."""
+    """A sender of single uploads, for which an abort is an answer."""
 
     def __init__(self, master: CanopenMaster, result: CanIdentity, clock: Clock, pause_s: float) -> None:
         self._master, self._result, self._clock = master, result, clock

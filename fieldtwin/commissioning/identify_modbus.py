@@ -97,7 +97,7 @@ async def identify_modbus(
         on_progress("function 2Bh/0Eh, device identification")
         await asker.identification()
         if "no answer" in result.clues.silence.values() or not result.answers:
-            on_progress("register 0")  # also for servers that swallow what follows a function that they do not know
+            on_progress("register 0")  # also for servers that lose the request after an unknown function
             await asker.ask("03", ReadRegisters("holding", 0, 1))
         if result.answers:
             for profile in profiles:
@@ -117,7 +117,7 @@ def modbus_frames(url: str, unit: int) -> list[str]:
 
 
 class _Asker:
-    """Single questions, whose refusal is an answer."""
+    """A sender of single questions, for which a refusal is an answer."""
 
     def __init__(self, client: ModbusClient, unit: int, result: ModbusIdentity) -> None:
         self._client, self._unit, self._result = client, unit, result
@@ -136,7 +136,7 @@ class _Asker:
         return None
 
     async def identification(self) -> None:
-        """Basic, then regular, then extended objects, as far as the unit goes along."""
+        """Read basic, then regular, then extended objects, as far as the unit supports them."""
         objects: dict[int, bytes] = {}
         for code in (1, 2, 3):
             before = len(objects)
@@ -150,7 +150,7 @@ class _Asker:
                 self._result.clues.silence["2B"] = "no answer" if isinstance(e, ReplyTimeout) else e.message
                 break
             if len(objects) == before:
-                break  # conformity ends here: it repeats what it has
+                break  # the unit supports no higher level: it repeats its objects
         if objects:
             self._result.answers = True
             self._result.clues.silence.pop("2B", None)
@@ -188,7 +188,7 @@ class _Asker:
 
 
 async def _compare(client: ModbusClient, result: ModbusIdentity, profile: DeviceProfile) -> Candidate:
-    """Read what tells this profile from others, the telling tags first; no more where they rule it out."""
+    """Read the tags that distinguish this profile from others, the decisive ones first; stop when they rule it out."""
     against = contradicted(profile, result.clues)
     if against:
         return Candidate(profile.name, Sureness.RULED_OUT, (), (against,))
@@ -211,7 +211,7 @@ async def _compare(client: ModbusClient, result: ModbusIdentity, profile: Device
 
 
 def _telling(tag: Tag) -> int:
-    """Tags that could turn out to be nonsense come first."""
+    """Return the rank of a tag: those that could turn out to be implausible come first."""
     return 0 if tag.type.startswith("float") else 1 if tag.values or tag.range is not None else 2
 
 

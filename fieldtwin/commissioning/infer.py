@@ -1,7 +1,8 @@
-"""From several dumps of one unit to what its registers probably are.
+"""Infer the meaning of registers from several dumps of one unit.
 
-The orders of bytes that the device seems to keep to are learnt from a first look and weigh in a second one. A float by itself is
-never certain: large whole numbers that waver look the same, but not several of them. It must never see a profile.
+The byte orders that the device seems to use are learnt in a first pass and have weight in a second one. A single float
+is never certain: large whole numbers that vary look the same, but not several of them. This module must never see a
+profile.
 """
 
 from __future__ import annotations
@@ -30,12 +31,12 @@ REGISTER_TABLES, BIT_TABLES = ("holding", "input"), ("coil", "discrete")
 
 @dataclass(frozen=True, slots=True)
 class Series:
-    """What cells held over time: per table and address a word (or bit) for each pass. Only cells that every pass has."""
+    """The history of cells: per table and address a word (or bit) for each pass. Only cells that every pass has."""
 
     times_s: tuple[float, ...]
     cells: Mapping[str, Mapping[int, Sequence[int]]]
     pairs: frozenset[str] = frozenset()
-    """Tables whose registers the device gives in pairs only: its values take two."""
+    """Tables whose registers the device has in pairs only: its values take two."""
 
     @property
     def passes(self) -> int:
@@ -56,7 +57,10 @@ class Inference:
 
 
 def series_of(dumps: Sequence[Dump]) -> Series:
-    """All passes of all dumps by time. Raises `FileInvalid` where they are not of one Modbus unit, or have nothing in common."""
+    """Return all passes of all dumps by time.
+
+    Raises `FileInvalid` if they are not of one Modbus unit, or have no cells in common.
+    """
     for dump in dumps:
         if dump.protocol != "modbus":
             raise FileInvalid("a CANopen node's EDS says its types: there is nothing to infer", path=dump.path)
@@ -65,7 +69,7 @@ def series_of(dumps: Sequence[Dump]) -> Series:
     passes = sorted((p for d in dumps for p in d.passes if p.cells), key=lambda p: p.utc_ns)
     if dumps and not all(d.ended for d in dumps) and len(passes) > 1:
         most = max(len(p.cells) for p in passes)
-        passes = [p for p in passes if len(p.cells) >= 0.9 * most]  # an interrupted pass would leave nothing in common
+        passes = [p for p in passes if len(p.cells) >= 0.9 * most]  # an interrupted pass would leave no common cells
     if not passes:
         raise FileInvalid("a dump without values", path=dumps[0].path if dumps else "")
     common = set(passes[0].cells)
@@ -130,7 +134,7 @@ def _look(runs: Sequence[Run], orders: Mapping[str, float], pairs: frozenset[str
 
 
 def _marked(reading: Reading, series: Series) -> Reading:
-    """With the marks of all passes, the repetitions too: how long a state was held is what makes it one."""
+    """Return the reading with the marks of all passes, including repetitions, because the time that a state is held matters."""
     if reading.type == "string":
         return reading
     columns = [series.cells[reading.table][reading.address + i] for i in range(reading.registers)]
@@ -149,7 +153,7 @@ def _as_observed(reading: Reading) -> Reading:
 
 
 def _orders_kept(readings: Sequence[Reading]) -> dict[str, float]:
-    """What each order costs on this device: devices keep to one."""
+    """Return the cost of each order on this device, because devices use one order throughout."""
     seen = {order: PRIOR_WEIGHT * math.exp(-cost) for order, cost in ORDER_COST.items()}
     for reading in readings:
         if reading.registers > 1 and reading.type != "string" and reading.moves and reading.probability >= LIKELY:
@@ -159,7 +163,7 @@ def _orders_kept(readings: Sequence[Reading]) -> dict[str, float]:
 
 
 def _supported(readings: Sequence[Reading]) -> list[Reading]:
-    """What nothing else on the device supports is capped: an order that few values keep to, a float among no floats."""
+    """Cap readings without support on the device: of an order with few values, or a single float."""
     moving = [r for r in readings if r.moves and r.probability >= LIKELY and r.type != "string"]
     orders = Counter(r.order for r in moving if r.registers > 1)
     floats = Counter(r.order for r in moving if r.type.startswith("float"))

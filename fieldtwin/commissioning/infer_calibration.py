@@ -20,7 +20,7 @@ UPPER_HALF = "may be its upper half"
 """Part of the reason why a reading is capped that has a neighbour with which it could be one longer number."""
 
 OTHER_HALF = "it may be the upper half of"
-"""The same for a register that never moved and has a neighbour that does."""
+"""The same for a register that never changed, with a neighbour that did."""
 
 CURVES: dict[str, Curve] = {
     "single": ((2.31, 0.9359), (8.97, 0.9904)),
@@ -94,9 +94,10 @@ def calibrated(probability: float, kind: str) -> float:
 
 
 def fitted(samples: Sequence[tuple[float, bool]], bins: int = 16) -> Curve:
-    """A curve for ``(probability of the model, right)``. Bins of equally many samples; neighbours that would fall are merged.
+    """Return a curve for ``(probability of the model, right)``.
 
-    The curve lies one standard error below what was observed, so that it claims too little rather than too much.
+    Bins have equally many samples; neighbours that would fall are merged. The curve lies one standard error below the
+    observation, so that it claims too little rather than too much.
     """
     ordered = sorted((log_odds(p), right) for p, right in samples)
     size = max(25, -(-len(ordered) // bins))

@@ -1,8 +1,8 @@
-"""How surprising a series of register words is if it were a value of this type and order, in nats (natural bits).
+"""The cost of reading a series of register words as a value of a type and order, in nats (natural bits).
 
-The right reading of a device's registers is the one that makes them least surprising: a float in the right word order moves a
-little, in the wrong one it leaps over decades. Costs are minus log probabilities, so the costs of neighbours add up and readings
-can be weighed against each other. Pure arithmetic; knows no dump and no profile.
+The right reading of a device's registers is the least surprising one: a float in the right word order changes a little,
+in the wrong one it jumps over decades. Costs are minus log probabilities, so the costs of neighbours add up and
+readings can be weighed against each other. Pure arithmetic; independent of dumps and profiles.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ TYPE_COST = {
     "bcd16": 5.0, "string": 3.0,
 }  # fmt: skip
 ORDER_COST = {"ABCD": 0.3, "CDAB": 1.0, "BADC": 3.0, "DCBA": 2.5}
-"""How rare each is among devices."""
+"""The cost of each byte order, by its rarity among devices."""
 NUMBERS = tuple(kind for kind in TYPE_COST if kind != "string")
 SWAPPED_SINGLE_COST = 3.0
 """A device that swaps the bytes of longer values seldom swaps those of single registers."""
 ZERO_COST = 0.7
-"""A register that is always 0, as most that mean nothing are."""
+"""The cost of a register that is always 0, like most unused registers."""
 
 _FORMATS = {
     "int16": ">h", "uint16": ">H", "int32": ">i", "uint32": ">I", "int64": ">q", "uint64": ">Q", "float32": ">f",
@@ -41,23 +41,26 @@ _FORMATS = {
 _MANTISSA_BITS = {"float32": 23, "float64": 52}
 _LN2 = math.log(2)
 WILD_COST = 9.0
-"""A number by itself that leaps over its whole range: so looks the lower half of something longer."""
+"""The cost of a single number that jumps over its whole range, as the lower half of a longer number does."""
 LARGE, LARGE_COST = 1 << 28, 4.0
-"""A whole number so large is a counter. One that wavers would be a measurement to nine digits: so looks a float."""
+"""A whole number of this size is a counter.
+
+A varying one would be a measurement of nine digits, and is more likely a float.
+"""
 _LEAST_STEP_COST = 0.05
 _TEMPER = 0.7
-"""Steps are taken for this much of what they say: they are not independent of each other."""
+"""The weight of the evidence of steps, because they depend on each other."""
 
 
 def orders_of(kind: str) -> tuple[str, ...]:
-    """The orders that make a difference for this type."""
+    """Return the orders that make a difference for this type."""
     if kind == "string":
         return ("ABCD", "BADC")
     return ("ABCD", "BADC") if REGISTERS_OF[kind] == 1 else ("ABCD", "CDAB", "BADC", "DCBA")
 
 
 def whole_numbers(words: Sequence[Sequence[int]], order: str) -> list[int]:
-    """Each pass's words put together in this order, as unsigned numbers."""
+    """Return each pass's words combined in this order, as unsigned numbers."""
     if order in ("BADC", "DCBA"):
         words = [[w >> 8 | (w & 0xFF) << 8 for w in row] for row in words]
     if order in ("CDAB", "DCBA"):
@@ -98,7 +101,7 @@ def cost(words: Sequence[Sequence[int]], kind: str, order: str) -> float:
 
 
 def cost_of(wholes: Sequence[int], kind: str, order: str) -> float:
-    """As `cost`, of numbers put together already."""
+    """Return the cost as `cost` does, for numbers that are combined already."""
     if not any(wholes):
         return ZERO_COST if kind == "uint16" and order == "ABCD" else 6.0 + TYPE_COST[kind]
     numbers = decode_numbers(wholes, kind)
@@ -141,14 +144,14 @@ def _wavers(numbers: Sequence[int]) -> bool:
 
 
 def _is_wild(numbers: Sequence[int], bits: int) -> bool:
-    """Whether it leaps, on the average, over more than an eighth of its range, around its ends if that is nearer."""
+    """Return whether the numbers jump on average over more than an eighth of their range, wrapping around its ends."""
     whole = 1 << bits
     leaps = [min((b - a) % whole, (a - b) % whole) for a, b in pairwise(numbers)]
     return bool(leaps) and sum(leaps) / len(leaps) > whole / 8
 
 
 def _first_cost(first: int, bits: int, *, signed: bool) -> float:
-    """Whole numbers are small more often than large: each magnitude is as likely as any other."""
+    """Return the cost of a first number: small ones are more frequent, with each magnitude equally likely."""
     return math.log(abs(first) + 1) + math.log(bits * _LN2) + (_LN2 if signed else 0.0)
 
 
@@ -193,8 +196,10 @@ def _float_cost(numbers: Sequence[float], kind: str) -> float:
 
 
 def _real_steps_cost(numbers: Sequence[float], bits: int) -> float:
-    """Steps as real numbers, for what crosses zero or a power of two, and for what goes evenly: each costs the digits that it
-    shows beyond its scale."""
+    """Return the cost of steps as real numbers, for values that cross zero or a power of two, and for even changes.
+
+    Each step costs the digits that it shows beyond its scale.
+    """
     steps = [b - a for a, b in pairwise(numbers)]
     if not steps or not any(steps):
         return _LEAST_STEP_COST * len(steps)
@@ -221,7 +226,7 @@ def _real_walk(distances: Sequence[float], fine: Sequence[float]) -> float:
 
 @lru_cache(maxsize=4096)
 def _mantissa_cost(value: float, kind: str) -> float:
-    """The digits of a first value: few where it is round, in twos or in tens."""
+    """Return the cost of a first value's digits: low for a round number, binary or decimal."""
     bits = _MANTISSA_BITS[kind]
     raw = struct.pack(_FORMATS[kind], value)
     mantissa = int.from_bytes(raw) & ((1 << bits) - 1)
@@ -260,5 +265,5 @@ def _text_cost(words: Sequence[Sequence[int]], order: str) -> float:
 
 
 def _kind(letter: str) -> str:
-    """Small, capital, digit, or a mark between words: text changes from one to another now and then only."""
+    """Return the class of a character: small, capital, digit, or a mark between words. Classes change rarely within text."""
     return "a" if letter.islower() else "A" if letter.isupper() else "0" if letter.isdigit() else "-"

@@ -25,7 +25,7 @@ FUNCTIONS = {"coil": 1, "discrete": 2, "holding": 3, "input": 4}
 
 
 def draft_profile(inference: Inference, dumps: Sequence[Dump], name: str = "") -> str:
-    """The YAML of a profile named ``draft/NAME``. Every line of a tag says how sure it is and why."""
+    """Return the YAML of a profile named ``draft/NAME``. Every tag's line states its certainty and the reason."""
     series, unit = inference.series, int(dumps[0].header["address"])
     slug = "".join(c if c.isalnum() and c.isascii() else "-" for c in name.lower()).strip("-") or f"unit-{unit}"
     lines = [
@@ -59,7 +59,7 @@ def tag_name(reading: Reading) -> str:
 
 
 def doubts(reading: Reading) -> str:
-    """How sure, against what, and what else is worth knowing; one line."""
+    """Return one line with the certainty, the alternatives, and other remarks."""
     parts = [f"{reading.level}" if reading.level is Level.CERTAIN else f"{reading.level} ({_percent(reading)})"]
     if reading.level is Level.UNKNOWN:
         parts = [f"unknown, perhaps {reading.type} {reading.order} ({_percent(reading)})"]
@@ -176,7 +176,7 @@ def _limits(dumps: Sequence[Dump], series: Series) -> list[str]:
 
 
 def _gaps(series: Series) -> list[str]:
-    """What lies between readable registers and is near enough to be read over."""
+    """Return the gaps between readable registers that are small enough to be read over."""
     gaps = []
     for table, cells in series.cells.items():
         known = sorted(cells)

@@ -32,7 +32,7 @@ from fieldtwin.gateway.devices.codec import reorder
 CERTAIN, LIKELY, GUESS = 0.9997, 0.80, 0.50
 """`CERTAIN` is a probability of the model; the others are calibrated."""
 FEWEST_PASSES, FEWEST_VALUES = 6, 4
-"""With fewer passes, or fewer different values, nothing is certain."""
+"""With fewer passes, or fewer different values, no reading is certain."""
 
 
 class Level(Enum):
@@ -51,10 +51,9 @@ class Level(Enum):
 class Reading:
     """A stretch of registers read as one value. `probability` against all others; `rivals` the next best, best first.
 
-    `model` is the probability before it was calibrated (`infer_calibration`), None while it is not.
-
-    `sign_open`: no value was seen that tells a signed integer from an unsigned one; `probability` is then that of both.
-    `capped` says why it is not certain however probable.
+    `model` is the probability before calibration (`infer_calibration`), None if not calibrated. `sign_open`: no value
+    was seen that distinguishes a signed integer from an unsigned one; `probability` is then that of both. `capped` is
+    the reason why it is not certain, however probable.
     """
 
     table: str
@@ -122,7 +121,7 @@ class Run:
 
 
 def run_of(table: str, address: int, words: Sequence[Sequence[int]]) -> Run:
-    """All readings of a run with their costs, the dear part of inferring; takes some milliseconds a register."""
+    """Return all readings of a run with their costs. This is the expensive part: some milliseconds a register."""
     return Run(table, address, words, [t for start in range(len(words)) for t in _tiles(words, start)])
 
 
@@ -262,7 +261,7 @@ def _reading(
 
 
 def _twin(tile: _Tile, values: Sequence[float | str]) -> str:
-    """The integer type of the other sign, where both read all values alike; "" where a value tells them apart."""
+    """Return the integer type of the other sign, if both read all values alike; "" if a value distinguishes them."""
     if "int" not in tile.type:
         return ""
     most = 1 << (16 * tile.size - 1)
@@ -272,7 +271,7 @@ def _twin(tile: _Tile, values: Sequence[float | str]) -> str:
 
 
 def _cap(tile: _Tile, words: Sequence[Sequence[int]], values: Sequence[float | str]) -> str:
-    """Why a reading is not certain whatever its probability: another reading would have shown the same."""
+    """Return why a reading is not certain whatever its probability: another reading would have shown the same values."""
     if tile.type == "string":
         return ""
     numbers = [float(v) for v in values]
@@ -303,14 +302,16 @@ def _cap(tile: _Tile, words: Sequence[Sequence[int]], values: Sequence[float | s
 
 
 def _zeros_beside(tile: _Tile, words: Sequence[Sequence[int]]) -> bool:
-    """Whether the two registers where a longer number would have its upper half were always 0."""
+    """Return whether the two registers of a longer number's upper half were always 0."""
     places = (tile.end, tile.end + 1) if tile.order in ("CDAB", "DCBA") else (tile.start - 2, tile.start - 1)
     return all(0 <= i < len(words) and not any(words[i]) for i in places)
 
 
 def _is_regular(steps: Sequence[float]) -> bool:
-    """Whether most steps of a register are one and the same, more or less, around the end of its range too. Where a float passes
-    a power of two its steps change once."""
+    """Return whether most steps of a register are about equal, also around the end of its range.
+
+    Where a float passes a power of two its steps change once.
+    """
     usual = median(steps)
     off = [abs((s - usual + 0x8000) % 0x10000 - 0x8000) for s in steps]
     return usual != 0 and sum(o <= max(2.0, 0.1 * abs(usual)) for o in off) >= 0.6 * len(off)

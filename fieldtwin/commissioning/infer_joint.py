@@ -1,4 +1,4 @@
-"""What neighbouring registers show together and neither shows alone: a carry from the low into the high word, and single bits.
+"""Evidence that only neighbouring registers show together: a carry from the low into the high word, and single bits.
 
 Pure arithmetic in nats, as `infer_costs` is.
 """
@@ -11,7 +11,7 @@ from itertools import pairwise
 
 HALF = 0x8000
 _CARRY_SIGN = math.log(40)
-"""By chance a change of the high word would rarely be exactly what the low word's overflow asks for."""
+"""By chance a change of the high word would rarely match the low word's overflow exactly."""
 MOST_BITS, FEWEST_CHANGES = 8, 3
 
 
@@ -40,10 +40,10 @@ def carry_evidence(highs: Sequence[int], lows: Sequence[int]) -> float:
 
 
 def toggled_bits(values: Sequence[int]) -> tuple[int, ...]:
-    """The bits of a status word that changed, lowest first; empty where the register does not behave like one.
+    """Return the bits of a status word that changed, lowest first; empty if the register does not behave like one.
 
-    A status word changes a bit or two at a time and rests between. A count changes its lowest bits most, and a measurement many
-    at once.
+    A status word changes a bit or two at a time and rests between. A count changes its lowest bits most, and a
+    measurement many at once.
     """
     flips = [a ^ b for a, b in pairwise(values) if a != b]
     if len(flips) < FEWEST_CHANGES or any(v >> 16 or v < 0 for v in values):

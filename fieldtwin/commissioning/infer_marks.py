@@ -111,7 +111,7 @@ def with_scales(readings: Sequence[Reading]) -> list[Reading]:
 
 
 def _scaled(reading: Reading, floats: Sequence[Reading]) -> Reading:
-    """The scale under which all passes agree to the last digit. It says much only where the digits move much."""
+    """Find the scale with which all passes agree to the last digit. It is significant only if the digits change much."""
     numbers = [float(v) for v in reading.values]
     spread = max(numbers) - min(numbers)
     if len(numbers) < FEWEST_PASSES or len(set(numbers)) < 4 or spread < 5:
@@ -129,9 +129,9 @@ _CLOCK = ("year", "month", "day", "hour", "minute", "second")
 
 
 def clock_fields(table: str, address: int, words: Sequence[Sequence[int]], times_s: Sequence[float]) -> list[Reading]:
-    """Six registers that are the date and time of day, year first or second first, as numbers or as BCD: their readings.
+    """Return six registers that are the date and time of day, year first or second first, as numbers or as BCD, as readings.
 
-    It is a clock when each pass gives a date, within a day of the truth (time zones), that goes on as time does.
+    They are a clock when each pass gives a date within a day of the truth (time zones) that advances with time.
     """
     found: list[Reading] = []
     start = 0

@@ -40,7 +40,7 @@ class Histogram:
         self.count += 1
 
     def percentile_us(self, share: float) -> int:
-        """The smallest bound that `share` (0 to 1) of all are not above; at most what was seen. 0 where nothing was."""
+        """Return the smallest bound that covers `share` (0 to 1) of all samples, at most the largest sample; 0 for none."""
         left = share * self.count
         for bucket, count in enumerate(self.counts):
             left -= count
@@ -49,7 +49,7 @@ class Histogram:
         return self.most_us
 
     def describe(self) -> dict[str, object]:
-        """For JSON: `buckets` are pairs of upper bound in us (None: more) and count, empty ones left out."""
+        """Return plain data for JSON: `buckets` are pairs of upper bound in us (None: more) and count, without empty ones."""
         pairs = [(_BOUNDS_US[i] if i < BUCKETS else None, n) for i, n in enumerate(self.counts) if n]
         return {
             "count": self.count,

@@ -55,7 +55,7 @@ class LineReport:
 
 @dataclass(frozen=True, slots=True)
 class LineLook:
-    """How to look: for how long, and with a question to `probe_unit` (None: nothing is sent)."""
+    """The options of an observation: its duration, and the unit of a probe, `probe_unit` (None: nothing is sent)."""
 
     listen_s: float = 5.0
     probe_unit: int | None = None
@@ -264,7 +264,7 @@ def probe_of(unit: int, sent: bytes, heard: bytes, *, answered: bool) -> Probe:
 
 
 def _alike(sent: bytes, heard: bytes) -> bool:
-    """Whether `heard` is `sent` with some bytes changed."""
+    """Return whether `heard` is `sent` with some bytes changed."""
     same = sum(a == b for a, b in zip(sent, heard, strict=False))
     return same * 2 >= len(sent)
 

@@ -17,7 +17,7 @@ from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.endpoint import SerialSettings
 
 SHORTEST_S, LONGEST_S = 1.5, 6.0
-"""How long one setting is listened to: longer where the line is silent for long between bursts."""
+"""Time limits for one setting: longer where the line is silent for long between bursts."""
 
 ENOUGH_BYTES = 400
 """Number of bytes without a good frame after which a setting is rejected."""
@@ -34,7 +34,7 @@ class Audition:
 
 @dataclass(frozen=True, slots=True)
 class LineVerdict:
-    """The settings of the line. `sure` says whether it may be relied upon, `why` in a sentence; `others` fit as well."""
+    """The settings of the line. `sure`: they can be relied upon; `why` is a sentence; `others` fit as well."""
 
     settings: SerialSettings
     framing: str
@@ -45,12 +45,12 @@ class LineVerdict:
 
     @property
     def fits(self) -> tuple[SerialSettings, ...]:
-        """All settings at which what was heard makes sense."""
+        """All settings at which the bytes make sense."""
         return (self.settings, *self.others)
 
 
 def dwell_over(heard: Heard, elapsed_s: float) -> bool:
-    """Whether this setting has been listened to for long enough."""
+    """Return whether this setting has been observed for long enough."""
     if heard.sure or elapsed_s >= LONGEST_S:
         return True
     if heard.bytes >= ENOUGH_BYTES and not heard.good_bytes:
@@ -60,7 +60,7 @@ def dwell_over(heard: Heard, elapsed_s: float) -> bool:
 
 
 def judge(auditions: Iterable[Audition]) -> LineVerdict | None:
-    """The best of what was heard; None where nothing makes sense."""
+    """Return the best setting; None if the bytes make sense at none."""
     good = [a for a in auditions if a.heard.frames and a.heard.share > 0.2]
     if not good:
         return None
@@ -86,12 +86,12 @@ def judge(auditions: Iterable[Audition]) -> LineVerdict | None:
 
 
 def worth_hearing(first: SerialSettings, candidates: Sequence[SerialSettings]) -> list[SerialSettings]:
-    """`first`, then the others, each once."""
+    """Return `first`, then the others, each once."""
     return list(dict.fromkeys([first, *candidates]))
 
 
 def siblings(settings: SerialSettings) -> list[SerialSettings]:
-    """The same baud rate with the other parities: what else a good-looking setting may be."""
+    """Return the same baud rate with the other parities, which may fit as well as a plausible setting."""
     bits = settings.frame[0]
     return [SerialSettings(settings.baudrate, bits + p + "1") for p in "NEO" if p != settings.parity]
 

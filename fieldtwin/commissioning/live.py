@@ -110,7 +110,7 @@ async def frames_at(
 
 
 def frame_of(url: str, unit: int, request: Request[Any]) -> bytes:
-    """What `request` to `unit` would look like on the wire at `url`, with transaction id 1: for `--dry-run`."""
+    """Return the frame of `request` to `unit` on the endpoint `url`, with transaction ID 1: for `--dry-run`."""
     endpoint = Endpoint.parse(url)
     char_time_ns = round(endpoint.serial.char_time_s * NS_PER_S) if endpoint.is_serial else 0
     framer = make_framer(

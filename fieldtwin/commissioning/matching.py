@@ -1,8 +1,8 @@
-"""Which profile fits a device, how surely, and why. Pure: clues in, a ranking out.
+"""Find the profile that fits a device, with certainty and reasons. Pure: clues in, a ranking out.
 
-Certain is only what the device itself says in a way that nothing else says: its identity objects (2Bh/0Eh), its vendor id and
-product code (1018h), the SunSpec header and a model number. That registers can be read and look sensible never makes certain:
-sister models share maps, and an empty register is sensible everywhere.
+Certainty requires an unambiguous identification by the device itself: its identity objects (2Bh/0Eh), its vendor ID and
+product code (1018h), or the SunSpec header and a model number. Readable and plausible registers never make a profile
+certain: sister models share maps, and an empty register is plausible everywhere.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _SUNSPEC_PROFILE = re.compile(r"^sunspec/.*-(\d+)$")
 
 
 class Sureness(IntEnum):
-    """How surely a profile fits; ordered."""
+    """The certainty with which a profile fits; ordered."""
 
     RULED_OUT = 0
     POSSIBLE = 1
@@ -39,7 +39,7 @@ class Sureness(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class SunSpec:
-    """A SunSpec map: where it begins, and its models as (number, address of the number, registers behind its length)."""
+    """A SunSpec map: its base, and its models as (number, address of the number, number of registers after its length)."""
 
     base: int
     models: tuple[tuple[int, int, int], ...]
@@ -72,7 +72,7 @@ class CanClues:
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """A profile and what speaks for it and against."""
+    """A profile, with reasons for and against it."""
 
     profile: str
     sureness: Sureness
@@ -97,7 +97,7 @@ def rank(candidates: Iterable[Candidate]) -> list[Candidate]:
 
 
 def certain(ranked: Sequence[Candidate]) -> str | None:
-    """The one profile that is certain, if there is one."""
+    """Return the one profile that is certain, if there is one."""
     found = [c.profile for c in ranked if c.sureness is Sureness.CERTAIN]
     return found[0] if len(found) == 1 else None
 
@@ -117,7 +117,10 @@ def summary(ranked: Sequence[Candidate]) -> str:
 
 
 def contradicted(profile: DeviceProfile, clues: ModbusClues) -> str:
-    """Why `profile` cannot be, by what the unit said of itself; empty where it may. Then nothing need be read for it."""
+    """Return why `profile` contradicts the unit's identification; empty if it does not.
+
+    Its registers then need not be read.
+    """
     if clues.objects is not None:
         for number, label in ((0, "vendor"), (1, "product code")):
             stated, told = profile.form.identification.get(number), clues.objects.get(number)
@@ -132,7 +135,10 @@ def contradicted(profile: DeviceProfile, clues: ModbusClues) -> str:
 
 
 def judge_modbus(profile: DeviceProfile, clues: ModbusClues, readings: Mapping[str, Reading]) -> Candidate:
-    """How surely the unit is a device of `profile`. `readings`: the tags of its `identify`, and some others, by name."""
+    """Return the certainty that the unit is a device of `profile`.
+
+    `readings`: tags of its `identify`, and others, by name.
+    """
     against = contradicted(profile, clues)
     if against:
         return Candidate(profile.name, Sureness.RULED_OUT, (), (against,))
@@ -198,8 +204,10 @@ def _own_words(
 
 
 def _model_holds(profile: DeviceProfile, found: SunSpec, number: int) -> str:
-    """Whether the profile's registers lie in the device's model 1, its model `number`, or the marks around all models ("SunS"
-    and the end model); in words."""
+    """Return, in words, where the profile's registers lie in the device's SunSpec map, or an empty string.
+
+    It is the device's model 1, its model `number`, or the marks around all models ("SunS" and the end model).
+    """
     blocks = [(at, at + 2 + size) for n, at, size in found.models if n in (1, number)]
     end = max((at + 2 + size for _, at, size in found.models), default=found.base)
     blocks += [(found.base, found.base + 2), (end, end + 2)]
@@ -215,7 +223,7 @@ def _keys(profile: DeviceProfile, readings: Mapping[str, Reading]) -> tuple[list
     for entry in profile.form.identify:
         reading = readings.get(entry.tag)
         if reading is None or (reading.value is None and not reading.refused):
-            continue  # lost on the wire: that says nothing
+            continue  # lost in transit: no evidence
         value = reading.value.value if reading.value is not None else None
         if value is None:
             wrong.append(f"{entry.tag} cannot be read: {reading.problem or 'no value'}")
@@ -251,7 +259,7 @@ def _plausibility(readings: Iterable[Reading]) -> tuple[list[str], list[str]]:
 
 
 def _sense(reading: Reading) -> int:
-    """1: it could have been nonsense and is not; -1: it is; 0: it says nothing."""
+    """Return 1 for a plausible value that could have been implausible, -1 for an implausible one, 0 for no evidence."""
     tag = reading.tag
     if reading.value is None:
         return -1 if reading.refused else 0
@@ -282,7 +290,7 @@ def _shown(reading: Reading) -> str:
 
 
 def judge_canopen(profile: DeviceProfile, eds: ObjectDictionary | None, clues: CanClues) -> Candidate:
-    """How surely the node is a device of `profile`, whose data sheet is `eds`."""
+    """Return the certainty that the node is a device of `profile`, whose data sheet is `eds`."""
     told = clues.identity
     if eds is None or told is None:
         return Candidate(profile.name, Sureness.RULED_OUT, (), ("there is nothing to compare",))

@@ -1,4 +1,4 @@
-"""Replies of a scan that do not fit its question, and what may cause them on a serial line and on TCP. Pure."""
+"""Replies of a scan that do not fit its question, and their possible causes on a serial line and on TCP. Pure."""
 
 from __future__ import annotations
 
@@ -37,7 +37,10 @@ class OddReply:
 def gathered(
     known: Sequence[OddReply], damaged: Mapping[int, bytes], settings: SerialSettings | None
 ) -> list[OddReply]:
-    """`known` and the replies `damaged` (unit -> PDU) heard at `settings`; the same reply from many units is one finding."""
+    """Add the replies `damaged` (unit -> PDU), received at `settings`, to `known`.
+
+    The same reply from many units is one finding.
+    """
     found = {(odd.settings, odd.pdu): set(odd.units) for odd in known}
     for unit, pdu in damaged.items():
         found.setdefault((settings, pdu), set()).add(unit)

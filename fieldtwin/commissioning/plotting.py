@@ -15,7 +15,7 @@ FORMATS = (".png", ".svg", ".pdf")
 
 
 def check_plot(path: Path) -> None:
-    """Raise `UsageError` where no picture could be made at the end: better said before an hour of watching."""
+    """Raise `UsageError` if no picture can be made at the end, before an hour of watching."""
     if path.suffix.lower() not in FORMATS:
         raise UsageError("no picture of that kind", expected=", ".join(FORMATS), got=path.name)
     if not _there():

@@ -1,6 +1,6 @@
-"""One device at the end of a wire, as the commissioning verbs use it: read tags, write one, show the frames without sending.
+"""One device on a live connection for the commissioning commands: read tags, write one, show the frames without sending.
 
-It must never decide what may be written (`writing` does), nor know a file or a screen.
+It must never decide what may be written (`writing` does), and must not depend on files or displays.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from fieldtwin.gateway.protocols.modbus.requests import (
 
 WIRE_TROUBLE = (ReplyTimeout, CrcError, Desync)
 OBJECT_BYTES = {"bool": 1, "int8": 1, "uint8": 1, "int16": 2, "uint16": 2, "int32": 4, "uint32": 4, "float32": 4}
-"""Bytes of an object of that type; 8 for the others that are numbers."""
+"""Number of bytes of an object of that type; 8 for the other numeric types."""
 
 
 MOST_SILENT = 3
@@ -58,12 +58,12 @@ class Answer:
 
 
 class Point(Protocol):
-    """A device that can be asked. Frames are as on the wire, one line of hex or candump's text each."""
+    """A device that can be queried. Frames are as on the bus, one line of hex or candump's text each."""
 
     protocol: str
     where: str
     requests: int
-    """How many requests, or transfers, were sent for it."""
+    """Number of requests, or transfers, sent to it."""
 
     async def read(
         self, tags: Sequence[Tag], found: dict[str, Answer] | None = None, *, alone: bool = False
@@ -76,22 +76,22 @@ class Point(Protocol):
         ...
 
     async def write(self, tag: Tag, data: bytes) -> None:
-        """Write the bytes of `encoded` in one request, once. Raises the errors of wire and device."""
+        """Write the bytes of `encoded` in one request, once. Raises the errors of connection and device."""
         ...
 
     def read_frames(self, tags: Sequence[Tag]) -> list[str]:
-        """What `read` would send first."""
+        """Return the first frames that `read` would send."""
         ...
 
     def write_frames(self, tag: Tag, data: bytes) -> list[str]:
-        """What `write` would send."""
+        """Return the frames that `write` would send."""
         ...
 
 
 def encoded(tag: Tag, value: Scalar) -> bytes:
-    """The bytes of an engineering value as they stand on the wire: registers, or an object's little-endian bytes.
+    """Return the bytes of an engineering value as on the bus: registers, or an object's little-endian bytes.
 
-    Raises `NotAllowed` for what the tag cannot hold. Bytes are taken as they are.
+    Raises `NotAllowed` for a value that the tag cannot hold. Bytes are used unchanged.
     """
     if isinstance(value, bytes):
         return value
@@ -118,7 +118,10 @@ def _text(tag: Tag, value: str) -> bytes:
 
 
 def decoded(tag: Tag, data: bytes, t_ns: int) -> TagValue:
-    """The value in `data`. An object of unknown type is an unsigned number where it has the length of one, else text or bytes."""
+    """Return the value in `data`.
+
+    An object of unknown type is an unsigned number if it has the length of one, else text or bytes.
+    """
     if tag.at is not None:
         return decode(tag, data, t_ns)
     if tag.type == AUTO:
@@ -199,7 +202,7 @@ class ModbusPoint:
         return found
 
     async def write(self, tag: Tag, data: bytes) -> None:
-        """As `Point.write`; the function is the one that the profile's limits leave."""
+        """Write as `Point.write`, with the function that the profile's limits permit."""
         self.requests += 1
         await self.client.execute(self.unit, write_request(tag, data, self._functions))
 
@@ -240,7 +243,7 @@ class ModbusPoint:
         return Answer(apply_scale(tag, answer.value, by.value if by is not None else None))
 
     def _plan(self, tags: Sequence[Tag]) -> GroupPlan:
-        """The gateway's own planner over just these tags; asked for again, it knows what was learnt."""
+        """Return the gateway's own planner over just these tags; later calls use what was learnt."""
         key = tuple(t.name for t in tags)
         if key not in self._plans:
             self._plans[key] = GroupPlan(asked_profile(tags, self._profile), "asked", self.learnt)
@@ -248,7 +251,7 @@ class ModbusPoint:
 
 
 class CanopenPoint:
-    """`node` on the bus at `url`, asked over SDO through `master`; it is never commanded to another state."""
+    """`node` on the bus at `url`, queried over SDO through `master`; its NMT state is never changed."""
 
     protocol = "canopen"
 
@@ -266,7 +269,7 @@ class CanopenPoint:
     async def read(
         self, tags: Sequence[Tag], found: dict[str, Answer] | None = None, *, alone: bool = False
     ) -> dict[str, Answer]:
-        """As `Point.read`: one transfer a tag, so `alone` changes nothing."""
+        """Read as `Point.read`: one transfer a tag, so `alone` has no effect."""
         answers: dict[str, Answer] = {} if found is None else found
         for tag in tags:
             assert tag.object is not None
@@ -302,8 +305,10 @@ def _singly(read: Read) -> tuple[Read, ...]:
 
 
 def asked_profile(tags: Sequence[Tag], profile: DeviceProfile | None) -> DeviceProfile:
-    """A profile of `tags` alone, in one group ``asked``, with the limits and gaps of `profile`. Without one nothing is known:
-    reads go as far as the standard lets them, and never over a register that was not asked for."""
+    """Return a profile of `tags` alone, in one group ``asked``, with the limits and gaps of `profile`.
+
+    Without `profile` reads are as long as the standard permits, and never include a register that was not requested.
+    """
     form = profile.form if profile is not None else ProfileForm(
         device="raw/raw", source="", protocol="modbus", limits=Limits(max_gap=0)
     )  # fmt: skip
@@ -318,15 +323,17 @@ def planned(tags: Sequence[Tag], profile: DeviceProfile | None) -> tuple[Read, .
 
 
 def part(read: RegisterRange, at: RegisterRange, raw: bytes) -> bytes:
-    """The bytes of `at` out of what `read` brought (bits one a byte)."""
+    """Return the bytes of `at` out of those of `read` (bits one per byte)."""
     width = 1 if read.table in ("coil", "discrete") else 2
     start = (at.address - read.address) * width
     return raw[start : start + at.count * width]
 
 
 def write_request(tag: Tag, data: bytes, functions: Sequence[int] | None) -> Request[Any]:
-    """The one request that writes `tag`: 05 or 0Fh for a coil, 06 for one register where the device has it or is unknown,
-    else 10h."""
+    """Return the one request that writes `tag`.
+
+    It is 05 or 0Fh for a coil, 06 for one register if the device has it or is unknown, else 10h.
+    """
     at = tag.registers
     if at.table == "coil":
         value = bool(int.from_bytes(data))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """A phase in words, and seconds of it by the estimate (`total_s` 0: not known)."""
+    """A phase in words, and its elapsed and estimated seconds (`total_s` 0: not known)."""
 
     phase: str
     done_s: float

@@ -27,7 +27,7 @@ MOST_HEX_BYTES = 48
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """A device: where it is, as which unit or node, and what is known of it."""
+    """A device: its endpoint, its unit ID or node ID, and its profile or EDS."""
 
     url: str
     address: int
@@ -87,9 +87,9 @@ async def point_at(
     connector: Connector | None = None,
     clock: Clock | None = None,
 ) -> AsyncIterator[Point]:
-    """The device, ready to be asked; nothing is sent by opening. Errors as `modbus_at` and `canopen_at`.
+    """Yield the device, ready for queries; opening sends nothing. Errors as `modbus_at` and `canopen_at`.
 
-    A profile's own pace is kept: its pause between exchanges, and its time to answer where that is longer.
+    The profile's timing is respected: its pause between exchanges, and its response time if that is longer.
     """
     timeout_s = target.timeout_s
     if target.profile is not None:
@@ -146,7 +146,7 @@ def _not_read(tag: Tag, lost: Unreachable | None) -> Answer:
 
 
 def dry_point(target: Target) -> Point:
-    """The device for `--dry-run`: it tells frames and can send none."""
+    """Return the device for `--dry-run`: it returns frames and cannot send."""
     if target.protocol == "canopen":
         return CanopenPoint(None, target.url, target.address)
     return ModbusPoint(None, target.url, target.address, target.profile)
@@ -170,7 +170,7 @@ def text_of(tag: Tag, answer: Answer) -> str:
 
 
 def place_of(tag: Tag) -> str:
-    """Where a tag stands, both ways for registers."""
+    """Return the address of a tag, in both notations for registers."""
     if tag.at is not None:
         return str(tag.at)
     assert tag.object is not None
@@ -178,7 +178,7 @@ def place_of(tag: Tag) -> str:
 
 
 def row_of(tag: Tag, answer: Answer) -> dict[str, Any]:
-    """A value as JSON has it. `raw` is what the device sent, in hex (bits one a byte)."""
+    """Return a value for JSON. `raw` are the bytes that the device sent, in hex (bits one per byte)."""
     value = answer.value
     shown = value.value.hex() if isinstance(value.value, bytes) else value.value
     row = {

@@ -18,9 +18,9 @@ from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.gateway.core.recording import Exchange, RecordingHeader
 
 MOST_PASSES = 2_000
-"""Passes of a long recording that are kept, spread evenly over it."""
+"""Maximum number of passes of a long recording, spread evenly over it."""
 FEWEST_REPLIES = 3
-"""A request that was answered less often is left out if another one was answered this often: it would shorten every column."""
+"""A request with fewer answers is omitted if another one has this many: it would shorten every column."""
 
 
 def dump_of_recording(
@@ -81,7 +81,7 @@ def _passes(reads: list[Exchange], start_ns: int) -> list[Pass]:
 
 
 def _values(exchange: Exchange) -> dict[Cell, bytes] | None:
-    """The cells that a reply carries; None if it is an exception or does not fit its request."""
+    """Return the cells that a reply carries; None if it is an exception or does not fit its request."""
     asked = parse_request(exchange.request)
     span, reply = asked.read_span, exchange.reply
     if span is None or reply is None:

@@ -33,7 +33,7 @@ ADAPTER_RATES = (125_000, 250_000, 500_000, 1_000_000, 50_000, 20_000, 100_000, 
 """Bit/s of CiA 301, 5.3, likely ones first."""
 RATE_LISTEN_S = 1.0
 QUIET_S = 0.5
-"""How long another master's SDO must have been silent before ours goes."""
+"""Time in seconds that another master's SDO must have been silent before the scan sends one."""
 PATIENCE_S = 5.0
 FASTSCAN_S = 13.5
 MOST_UNCONFIGURED = 16
@@ -69,7 +69,7 @@ class CanScan:
     took_s: float = 0.0
     stopped: bool = False
     conflicts: dict[int, str] = field(default_factory=dict)
-    """By node id: why there seem to be two nodes with it."""
+    """By node ID: the reason to assume two nodes with it."""
     notes: list[str] = field(default_factory=list)
 
     @property
@@ -78,7 +78,7 @@ class CanScan:
 
 
 class _EarTap(Tap):
-    """Lets the ear hear what is received while we ask."""
+    """A tap that passes received frames to the listener while the scan sends."""
 
     def __init__(self, ear: BusEar) -> None:
         self._ear = ear
@@ -118,7 +118,7 @@ class CanScanner:
         self.result = CanScan(url, heard=self._ear.heard)
 
     async def run(self) -> CanScan:
-        """Scan. Raises `Unreachable` where the bus cannot be joined, `UsageError` where it runs at another bit rate."""
+        """Run the scan. Raises `Unreachable` where the bus cannot be joined, `UsageError` if its bit rate is different."""
         began_ns = self._clock.monotonic_ns()
         try:
             self.result.facts = self._facts(self._endpoint)
@@ -184,7 +184,7 @@ class CanScanner:
                 heard = self._ear.heard
                 self._tell(Progress(phase, elapsed_s, listen_s, f"{heard.frames} frames", len(heard.nodes)))
                 await clock.sleep_until_ns(clock.monotonic_ns() + round(min(0.1, listen_s - elapsed_s) * NS_PER_S))
-                connection.inbound.data_stream.clear()  # the ear heard it when it came
+                connection.inbound.data_stream.clear()  # already counted when it arrived
             result.listened_s += (clock.monotonic_ns() - began_ns) / NS_PER_S
 
     def _silent_endpoint(self) -> Endpoint:

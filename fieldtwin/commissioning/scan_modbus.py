@@ -37,7 +37,7 @@ comes sooner: a sweep that is to find them must be this slow.
 """
 MANY_FAILURES = 3
 MOST_BREAKS = 3
-"""A far end that hangs up so often in a row over one unit is not asked for it again."""
+"""Number of consecutive disconnections by the server during one unit's question after which the unit is skipped."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,7 +123,10 @@ class ModbusScanner:
         self.result = ModbusScan(url)
 
     async def run(self) -> ModbusScan:
-        """Scan. Raises `Unreachable` where the wire cannot be opened; whatever ends it later, `result` has what was found."""
+        """Run the scan.
+
+        Raises `Unreachable` where the endpoint cannot be opened; after later errors `result` has the findings.
+        """
         began_ns = self._clock.monotonic_ns()
         try:
             if self._endpoint.is_serial:
@@ -146,7 +149,7 @@ class ModbusScanner:
 
     @property
     def _ended(self) -> bool:
-        """Whether nothing more is to be asked."""
+        """Return whether the scan must not ask more."""
         return self._met_master or self._stop()
 
     def planned(self) -> list[tuple[str, list[Step]]]:
@@ -224,7 +227,7 @@ class ModbusScanner:
                 waiting = kin
             result.auditions.append(await self._audition(waiting.pop(0), 0.0))
         found = judge(result.auditions)
-        if found is not None and found.settings != first and not self._stop():  # who else is there?
+        if found is not None and found.settings != first and not self._stop():  # look for other units
             longer = await self._audition(found.settings, options.listen_s, whole=True)
             result.auditions = [longer if a.settings == longer.settings else a for a in result.auditions]
         result.verdict = judge(result.auditions)
@@ -246,7 +249,7 @@ class ModbusScanner:
         return True
 
     async def _audition(self, settings: SerialSettings, listen_s: float, *, whole: bool = False) -> Audition:
-        """Listen at `settings`: for `listen_s` with `whole`, else until it is clear what is heard."""
+        """Listen at `settings`: for `listen_s` with `whole`, else until the result is clear."""
         ear = LineEar(self._framing)
         url = str(plan.with_settings(self._endpoint, settings))
         async with bytes_at(url, taps=self._taps, connector=self._connector, clock=self._clock) as connection:
@@ -349,7 +352,7 @@ class ModbusScanner:
                 return
 
     async def _confirm(self, sweep: UnitSweep, endpoint: Endpoint) -> set[int]:
-        """Ask the first and the late ones that were found again, for a good check sum may be chance: who does not answer."""
+        """Ask the first and the late units again, because a good check sum may be chance; return those that do not answer."""
         first = {next(iter(sweep.found)), *(u for u, a in sweep.found.items() if a.late)}
         again = sweep.another(first)
         await self._drive(again, endpoint, lambda: None)
@@ -372,7 +375,7 @@ class ModbusScanner:
     # -- a host ---------------------------------------------------------------------------------------------------
 
     async def _scan_socket(self) -> None:
-        """A few spread over all unit ids first: where all of them answer alike there is one device behind all."""
+        """Ask a few units spread over all IDs first: if all of them answer alike there is one device behind all."""
         first = spread_over(self._units)
         if len(first) < SPREAD:
             await self._steps([self._pace.step(None, self._units)], "every unit")
@@ -392,7 +395,7 @@ class ModbusScanner:
         self.result.units.sort(key=lambda f: f.answer.unit)
 
     async def _ask_once_more(self, answers: list[UnitAnswer], units: tuple[int, ...]) -> Alike | None:
-        """All answered, not alike: one device whose register changes, or many devices? Ask all a second time."""
+        """Ask all units again that answered differently: one device whose register changes, or many devices."""
         sweep = UnitSweep(
             self._framing, units, timeout_ns=round(self._pace.timeout_s * NS_PER_S),
             interval_ns=round(self._pace.interval_s * NS_PER_S),

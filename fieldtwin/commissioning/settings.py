@@ -16,7 +16,7 @@ LIKELY = tuple(
         (4800, "8E1"), (2400, "8E1"),
     )
 )  # fmt: skip
-"""What devices are delivered with, most frequent first. Two stop bits are not tried by themselves: a receiver looks at one."""
+"""Factory settings of devices, most frequent first. Two stop bits are not tried separately: a receiver checks only one."""
 
 BAUDRATES = (9600, 19200, 38400, 115200, 57600, 4800, 2400, 1200)
 FRAMES = ("8N1", "8E1", "8O1", "8N2")
@@ -29,17 +29,17 @@ SERIAL_UNITS = tuple(range(1, 248))
 TCP_UNITS = (*range(1, 248), 0, 255)
 
 OPENING_S = 0.02
-"""What changing the settings of a port takes."""
+"""Time in seconds to change the settings of a port."""
 
 
 def settings_said(endpoint: Endpoint) -> SerialSettings | None:
-    """The settings that the endpoint itself says, None where it leaves baud rate or frame open."""
+    """Return the settings in the endpoint, None if it leaves baud rate or frame open."""
     said = {name for name, _ in endpoint.params}
     return endpoint.serial if endpoint.is_serial and {"baudrate", "frame"} <= said else None
 
 
 def with_settings(endpoint: Endpoint, settings: SerialSettings) -> Endpoint:
-    """The same port with other settings."""
+    """Return the same port with other settings."""
     kept = tuple((k, v) for k, v in endpoint.params if k not in ("baudrate", "frame"))
     return replace(endpoint, params=(("baudrate", str(settings.baudrate)), ("frame", settings.frame), *kept))
 
@@ -80,7 +80,7 @@ def seconds_of(steps: Iterable[Step]) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Pace:
-    """What each question is given: `timeout_s`, and `interval_s` from one to the next at least."""
+    """The time for each question: `timeout_s`, and at least `interval_s` from one to the next."""
 
     timeout_s: float
     interval_s: float
@@ -110,7 +110,7 @@ def quick_pass(
 def full_pass(
     pace: Pace, candidates: Sequence[SerialSettings | None], units: Sequence[int], done: Iterable[Step] = ()
 ) -> list[Step]:
-    """Every unit at every one of `candidates`, without what was `done`."""
+    """Return steps for every unit at every one of `candidates`, without those in `done`."""
     asked: dict[SerialSettings | None, set[int]] = {}
     for step in done:
         asked.setdefault(step.settings, set()).update(step.units)
@@ -138,7 +138,7 @@ def likely_settings(endpoint: Endpoint) -> list[SerialSettings]:
 
 
 def _open(endpoint: Endpoint, settings: Sequence[SerialSettings]) -> list[SerialSettings]:
-    """`settings` with what the endpoint says put in, each once."""
+    """Return `settings` with the endpoint's stated values inserted, each once."""
     said = dict(endpoint.params)
     baudrate, frame = endpoint.serial.baudrate, endpoint.serial.frame
     return list(

@@ -1,7 +1,7 @@
 """The SunSpec header and its chain of models (SunSpec Device Information Model, 6.1 to 6.3). Pure text and numbers.
 
 A map begins with the characters ``SunS`` at 40000, 50000 or 0 as sent; then models follow one another, each with its number
-and its length in registers, up to number FFFFh. Model 1 names the maker.
+and its length in registers, up to number FFFFh. Model 1 states the manufacturer.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ END = 0xFFFF
 MOST_MODELS = 64
 COMMON, COMMON_REGISTERS = 1, 66
 _FIELDS = {"manufacturer": (2, 16), "model": (18, 16), "version": (42, 8), "serial": (50, 16)}
-"""Of model 1: from its number on, offset and length in registers."""
+"""Fields of model 1: offset from its number, and length in registers."""
 
 
 def text_of(data: bytes) -> str:
@@ -21,7 +21,7 @@ def text_of(data: bytes) -> str:
 
 
 def common(data: bytes) -> dict[str, str]:
-    """The names in model 1, whose registers `data` are from its number on; as far as they go."""
+    """Return the names in model 1, whose registers from its number on are `data`; as far as they go."""
     return {name: text_of(data[2 * at : 2 * (at + size)]) for name, (at, size) in _FIELDS.items()}
 
 

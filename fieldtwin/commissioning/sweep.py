@@ -1,8 +1,8 @@
-"""Which units answer on one wire: one short question each, one after the other. Pure: bytes and times in, bytes and waits out.
+"""Find the units that answer on one connection: one short question each, one after the other. Pure: no I/O and no clock.
 
-No quarantine behind a silence, unlike the plant's master: every reply names its unit, so one that comes late is still put
-down to the right one, and 247 silent units cost 247 timeouts and not twice that. What arrived damaged is asked again, once,
-at the end.
+No quarantine after a silence, unlike the plant's client: every reply contains its unit ID, so a late one is still
+attributed to the right unit, and 247 silent units cost 247 timeouts and not twice that. A question with a damaged reply
+is repeated once, at the end.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ NOBODY = (0x0A, 0x0B)
 """Exceptions by which a gateway reports that no device answers behind it (AP 7)."""
 
 REST_NS = 30 * NS_PER_MS
-"""How long the rest of a reply that has begun may take: a USB adapter hands over every 16 ms."""
+"""Time for the rest of a reply that has begun: a USB adapter delivers bytes every 16 ms."""
 MAX_REPLY_CHARS = 256
 MAX_REMEMBERED = 256
 NEVER_SILENT_NS = 5_000 * NS_PER_MS
@@ -43,7 +43,7 @@ class UnitAnswer:
     exception: int
     latency_ns: int
     late: bool = False
-    """It came after its time: the timeout is too short for this unit."""
+    """The reply came after the timeout, which is too short for this unit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +56,7 @@ class Send:
 
 @dataclass(frozen=True, slots=True)
 class Wait:
-    """Nothing to do before `until_ns`, unless something arrives."""
+    """Wait until `until_ns`, unless bytes arrive."""
 
     until_ns: int
 
@@ -81,10 +81,11 @@ def expected_s(
 
 
 class UnitSweep:
-    """Asks `units` in turn. `interval_ns` is the least time between two questions (the rate limit), `quiet_ns` the silence
-    before each, `char_time_ns` a character's time on a serial line, else 0.
+    """A sweep over `units` in order.
 
-    Drive it with `poll`, `handed_over` and `feed`; read `found`, `damaged` and the rest at any time.
+    `interval_ns` is the least time between two questions (the rate limit), `quiet_ns` the silence before each,
+    `char_time_ns` a character's time on a serial line, else 0. Drive it with `poll`, `handed_over` and `feed`; `found`,
+    `damaged` and the other results can be read at any time.
     """
 
     def __init__(
@@ -102,13 +103,13 @@ class UnitSweep:
         self.damaged: dict[int, bytes] = {}
         """Units that twice gave a reply that does not fit the question, with its PDU; empty if it was not a whole frame."""
         self.behind_gateway: set[int] = set()
-        """Units of which a gateway said that they do not answer."""
+        """Units that a gateway reported as not answering."""
         self.echo = False
-        """What we send comes back."""
+        """Sent bytes come back."""
         self.foreign = 0
         """Number of good frames of another master or its units."""
         self.other_requests = 0
-        """Good requests that are not ours: there is another master."""
+        """Number of good requests of another master."""
         self.noise_bytes = 0
         self.never_silent = False
         self.asked = 0
@@ -132,7 +133,7 @@ class UnitSweep:
 
     @property
     def left(self) -> int:
-        """How many questions are to come, the one under way included."""
+        """The number of remaining questions, including the current one."""
         return len(self._todo) + len(self._again) + (self._now is not None)
 
     @property
@@ -141,7 +142,7 @@ class UnitSweep:
         return self._now.unit if self._now is not None else None
 
     def poll(self, now_ns: int) -> Send | Wait | None:
-        """What to do next; None: all have been asked."""
+        """Return the next step; None when all units have been asked."""
         if self._now is not None:
             if now_ns < self._now.deadline_ns:
                 return Wait(self._now.deadline_ns)
@@ -183,7 +184,7 @@ class UnitSweep:
             asked.deadline_ns = min(max(asked.deadline_ns, now_ns + REST_NS), asked.limit_ns)
 
     def another(self, units: Iterable[int]) -> UnitSweep:
-        """A sweep of `units` on the same wire at the same pace."""
+        """Return a sweep of `units` on the same connection with the same timing."""
         return UnitSweep(
             self._framing,
             units,
@@ -195,17 +196,17 @@ class UnitSweep:
         )
 
     def ask_again(self) -> None:
-        """The connection broke while a unit was asked: it comes first again."""
+        """Repeat the current unit first, because the connection broke during its question."""
         if self._now is not None:
             self._todo.appendleft(self._now.unit)
             self._now = None
         self._splitter.flush()
 
     def skip(self) -> int | None:
-        """Give up on the unit that comes next, and say which: it breaks the connection each time."""
+        """Skip the next unit, which breaks the connection each time, and return it."""
         return self._todo.popleft() if self._todo else None
 
-    # -- what came ------------------------------------------------------------------------------------------------
+    # -- received bytes ------------------------------------------------------------------------------------------
 
     def _judge(self, frame: Frame, now_ns: int) -> None:
         asked = self._now
@@ -224,7 +225,7 @@ class UnitSweep:
             self.other_requests += self._line and request
             if asked is not None and unit == asked.unit and not request:
                 asked.noise, asked.odd = True, frame.pdu
-                if not self._line:  # the transaction id says that this is the reply: hardly anything else follows
+                if not self._line:  # the transaction ID proves the reply: hardly any other bytes follow
                     asked.deadline_ns = min(asked.deadline_ns, now_ns + REST_NS)
             return
         if asked is not None and unit == asked.unit:

@@ -14,7 +14,7 @@ from fieldtwin.gateway.core.clock import NS_PER_MS
 from fieldtwin.gateway.protocols.modbus.framings import Framing
 
 SETTLE_NS = 40 * NS_PER_MS
-"""A silence behind which nothing belongs to what came before, behind a USB adapter as well."""
+"""A silence after which no bytes belong to earlier ones, even with a USB adapter."""
 
 SURE_FRAMES = 3
 """Number of good frames that cannot be chance: one of 65,536 random four-byte sequences has a right check sum."""
@@ -22,7 +22,7 @@ SURE_FRAMES = 3
 
 @dataclass(slots=True)
 class UnitHeard:
-    """One unit id on the line. It is live when it answered."""
+    """One unit ID on the line. It is live when it answered."""
 
     requests: int = 0
     replies: int = 0
@@ -36,7 +36,7 @@ class UnitHeard:
 
 @dataclass(slots=True)
 class Heard:
-    """The sum of what came. `good_bytes` are those of good frames; `longest_gap_ns` is the longest silence between chunks."""
+    """The totals. `good_bytes` are those of good frames; `longest_gap_ns` is the longest silence between chunks."""
 
     framing: Framing
     bytes: int = 0
@@ -45,12 +45,12 @@ class Heard:
     bad_frames: int = 0
     units: dict[int, UnitHeard] = field(default_factory=dict)
     repeated: int = 0
-    """Requests that came twice at once, as where every sender hears itself."""
+    """Number of requests that were immediately repeated, as with an adapter that returns sent bytes."""
     glitches: int = 0
     """Number of pieces of one or two bytes next to frames, caused by a transceiver that switches too early or late."""
     longest_gap_ns: int = 0
     values: dict[int, int] = field(default_factory=dict)
-    """How often each byte value came."""
+    """The count of each byte value."""
 
     @property
     def share(self) -> float:
@@ -69,12 +69,12 @@ class Heard:
 
     @property
     def sure(self) -> bool:
-        """Whether this is Modbus at these settings, beyond chance."""
+        """Return whether this is Modbus at these settings, beyond chance."""
         return self.frames >= SURE_FRAMES and self.share > 0.5
 
 
 class LineEar:
-    """Listens for `framing` (rtu or ascii). `feed` what comes; `settle` now and then, or when nothing comes."""
+    """A listener for `framing` (rtu or ascii). `feed` received bytes; call `settle` from time to time, or during silence."""
 
     def __init__(self, framing: Framing) -> None:
         self.heard = Heard(framing)
@@ -83,7 +83,7 @@ class LineEar:
         self._open: Frame | None = None
 
     def feed(self, data: bytes, t_ns: int) -> None:
-        """A chunk that came at `t_ns`."""
+        """Add a chunk received at `t_ns`."""
         if not data:
             return
         self.settle(t_ns)
@@ -128,7 +128,7 @@ class LineEar:
 
 
 def is_reply(frame: Frame, asked: Frame | None) -> bool:
-    """Whether a good frame is a reply, by its shape, and where that says nothing by the request `asked` before it."""
+    """Return whether a good frame is a reply, by its shape, or else by the request `asked` before it."""
     if frame.pdu[0] & 0x80:
         return True
     shape = _request_shape(frame.pdu)
@@ -138,7 +138,7 @@ def is_reply(frame: Frame, asked: Frame | None) -> bool:
 
 
 def _request_shape(pdu: bytes) -> str:
-    """Whether a PDU can only be a request, only a reply, or either."""
+    """Return whether a PDU can only be a request, only a reply, or either."""
     function, size = pdu[0], len(pdu)
     if function in (0x01, 0x02):
         return "either" if size == 5 and pdu[1] == 3 else "request" if size == 5 else "reply"

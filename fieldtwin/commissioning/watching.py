@@ -70,7 +70,7 @@ def sparkline(values: Sequence[float | None]) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """One round: when, in seconds since the first, and what came. `late_s`: how much later than it was due."""
+    """One round: its time in seconds since the first, and its answers. `late_s`: its delay."""
 
     number: int
     t_s: float
@@ -86,9 +86,9 @@ async def samples(
     count: int | None = None,
     for_s: float | None = None,
 ) -> AsyncGenerator[Sample, None]:
-    """Yield a sample every `every_s` seconds: `count` of them, or those that begin in the first `for_s` seconds, or until closed.
+    """Yield a sample every `every_s` seconds: `count` samples, those that begin within `for_s` seconds, or until closed.
 
-    A round that takes longer than `every_s` makes the next one late; missed samples are not made up for.
+    A round that takes longer than `every_s` makes the next one late; missed samples are not repeated.
     """
     start_ns = due_ns = clock.monotonic_ns()
     end_ns = None if for_s is None else start_ns + round(for_s * NS_PER_S)

@@ -22,10 +22,10 @@ from fieldtwin.gateway.wallclock import WallClock
 
 
 class WireLog(Tap):
-    """Appends to `path`, a session at a time; a line is the operating system's when the call returns.
+    """A log that appends to `path`, a session at a time; a line is handed to the operating system when the call returns.
 
-    At most `max_bytes` a session: then `full` is True and nothing more is written. A verb that may only send what is
-    logged asks `full` before it sends. Raises `FileInvalid` when the file cannot be written.
+    At most `max_bytes` a session: then `full` is True and nothing more is written. A command that may only send logged
+    frames checks `full` before it sends. Raises `FileInvalid` when the file cannot be written.
     """
 
     def __init__(self, path: Path, words: str, clock: Clock | None = None, max_bytes: int = 1 << 30) -> None:

@@ -20,7 +20,7 @@ _TRUE, _FALSE = ("true", "on", "yes"), ("false", "off", "no")
 
 @dataclass(frozen=True, slots=True)
 class Write:
-    """One write that may be made: nothing that is known before asking the device forbids it. `warnings` are for the prompt."""
+    """One permitted write: no rule known before querying the device forbids it. `warnings` are for the prompt."""
 
     tag: Tag
     value: Scalar
@@ -44,10 +44,10 @@ class Written:
 
 
 def plan_write(tag: Tag, text: str, *, i_know: bool = False, restore: bool = False) -> Write:
-    """The write of `text` (a number, the name of a profile's value, ``on``, ``hex:0102``) to `tag`.
+    """Return the write of `text` (a number, the name of a profile's value, ``on``, ``hex:0102``) to `tag`.
 
-    Raises `NotAllowed` for what the profile forbids: read-only, outside the limits; dangerous without `i_know`; a nonvolatile
-    value that is to be put back at once (two writes where one wears).
+    Raises `NotAllowed` for a write that the profile forbids: read-only, outside the limits; dangerous without `i_know`;
+    a nonvolatile value that is to be restored at once (two writes where one wears).
     """
     if not tag.writable:
         raise NotAllowed(f"{tag.name} is read-only", hint="what may be written says the profile's `access`")
@@ -74,7 +74,7 @@ def plan_write(tag: Tag, text: str, *, i_know: bool = False, restore: bool = Fal
 
 
 def plan_writes(pairs: list[tuple[Tag, str]], *, i_know: bool = False, restore: bool = False) -> list[Write]:
-    """Several writes, in order. Raises as `plan_write`; and for a nonvolatile tag that stands twice."""
+    """Return several writes, in order. Raises as `plan_write`; and for a nonvolatile tag that occurs twice."""
     seen: set[str] = set()
     for tag, _ in pairs:
         if tag.name in seen and tag.nonvolatile:
@@ -190,7 +190,7 @@ def _same(write: Write, held: bytes) -> bool:
 
 
 def _equal(tag: Tag, data: bytes, held: bytes) -> bool:
-    """A coil comes back as one byte; everything else byte for byte."""
+    """Return whether the value is held. A coil comes back as one byte; other values are compared byte by byte."""
     if tag.type == "bool":
         return bool(int.from_bytes(data)) == bool(int.from_bytes(held))
     return data == held

@@ -1,11 +1,12 @@
-"""Waivers: failures that somebody answers for, until a day that is named.
+"""Waivers: accepted failures, each with a reason and an expiry date.
 
     waivers:
       - id: MB-013
         reason: the driver is replaced in May, ticket 4711
         expires: 2027-05-31
 
-An id is one of a case, or of a row of the catalogue with all its cases; scenarios use theirs. Whoever has results looks up `of`.
+An ID is that of a case, or of an entry of the test-case list with all its cases; scenarios use their own IDs. Code that has
+results calls `of`.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
-"""The door of decoding: events of a trace in, words and exchanges out, event by event or all at once.
+"""The interface of decoding: events of a trace in, words and exchanges out, event by event or all at once.
 
     decoder = Decoder(system)
     for event in trace.events:
         for exchange in decoder.feed(event): ...
     rest = decoder.finish()
 
-Bounded: one request a line, 64 on a Modbus TCP wire, one transfer a node.
+Bounded: one open request per line, 64 per Modbus TCP connection, one transfer per node.
 """
 
 from __future__ import annotations

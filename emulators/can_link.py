@@ -1,4 +1,4 @@
-"""Joins two CAN buses with faults between them: third-party masters on the near bus, third-party nodes on the far bus.
+"""Joins two CAN buses with faults between them: third-party controllers on the near bus, third-party nodes on the far bus.
 
 A frame from the near side is a request and a frame from the far side a reply; the predefined connection set (CiA 301,
 7.3.3) gives the node from the identifier. Frames keep their order, except those that a fault delays. Frames are not

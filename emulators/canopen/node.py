@@ -6,7 +6,7 @@ sockets, or how a driver interprets its frames. `serve.serve_node` runs it on a 
 =================  ===========================================================  =====================================
 state              answers                                                      left by
 =================  ===========================================================  =====================================
-INITIALISING       LSS, when it has no node id yet                              `start` or a node id: boot-up, PRE-OPERATIONAL
+INITIALISING       LSS, when it has no node ID yet                              `start` or a node ID: boot-up, PRE-OPERATIONAL
 PRE-OPERATIONAL    NMT, error control, SDO, SYNC, TIME, EMCY, LSS               NMT command
 OPERATIONAL        the same and PDOs                                            NMT command, heartbeat loss (1029h)
 STOPPED            NMT, error control, LSS                                      NMT command

@@ -24,7 +24,7 @@ ANY_UNIT = (0, 255)
 NO_PATH = 0x0A
 
 Allow = Callable[[int, bytes], bool]
-"""``(unit id, pdu)`` -> whether this client may send that request."""
+"""``(unit ID, PDU)`` -> whether this client may send that request."""
 
 
 class MbapSlave:

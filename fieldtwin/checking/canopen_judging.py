@@ -32,7 +32,7 @@ async def must_abort(wire: CanopenWire, request: bytes, *codes: int) -> Finding:
 
 
 async def long_object(wire: CanopenWire) -> Key:
-    """An object of two segments at least, of which the first reply was seen. Raises `NotHere`."""
+    """Return an object of at least two segments, after its first reply was received. Raises `NotHere`."""
     if wire.long is None:
         raise NotHere("no object of more than 7 bytes was found: 1008h, 1009h, 100Ah, and those of the EDS")
     return wire.long

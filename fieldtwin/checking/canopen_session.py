@@ -128,7 +128,7 @@ async def learn(wire: CanopenWire) -> dict[str, str]:
 
 
 async def _long_by_eds(wire: CanopenWire) -> Key | None:
-    """An object of the EDS that holds more than 7 bytes."""
+    """Return an object of the EDS that holds more than 7 bytes."""
     texts = [e for e in wire.dictionary or () if e.readable and e.type_code in (0x09, 0x0A, 0x0B, 0x0F)]
     for entry in texts[:MOST_LONG]:
         key = (entry.index, entry.subindex)

@@ -35,7 +35,7 @@ def mux(index: int, subindex: int = 0) -> bytes:
 
 
 def shown(key: Key) -> str:
-    """``1018h:04``."""
+    """Return a text such as ``1018h:04``."""
     return f"{key[0]:04X}h:{key[1]:02X}"
 
 
@@ -150,7 +150,7 @@ class CanopenWire:
             return list(self._pending)
 
     async def pause(self) -> None:
-        """Time for the node to follow a command."""
+        """Give the node time to execute a command."""
         await asyncio.sleep(max(0.05, self._spacing_s))
 
     def forget(self) -> None:
@@ -164,22 +164,22 @@ class CanopenWire:
     # -- SDO ---------------------------------------------------------------------------------------------------------
 
     async def tell(self, data: bytes, *, at_once: bool = False) -> None:
-        """An SDO frame to the server; short ones as they are."""
+        """Send an SDO frame to the server; short ones unchanged."""
         await self.send(CanFrame(SDO_REQUEST + self.node, data), at_once=at_once)
 
     async def ask(self, data: bytes, within_s: float | None = None) -> Reply:
-        """An SDO request, padded to 8 bytes, and the reply."""
+        """Send an SDO request, padded to 8 bytes, and return the reply."""
         self.forget()
         await self.tell(data.ljust(8, b"\0"))
         return await self.reply(within_s)
 
     async def reply(self, within_s: float | None = None) -> Reply:
-        """The next frame of the server."""
+        """Return the next frame of the server."""
         frame = await self.hear(SDO_REPLY + self.node, within_s)
         return Reply(frame.data if frame is not None else b"")
 
     async def abandon(self, key: Key, code: int = 0x0800_0000) -> None:
-        """The client's abort: ends a transfer, is not answered."""
+        """Send the client's abort, which ends a transfer and is not answered."""
         await self.tell(b"\x80" + mux(*key) + code.to_bytes(4, "little"))
 
     async def upload(self, key: Key) -> bytes | Reply:
@@ -203,7 +203,7 @@ class CanopenWire:
         return value
 
     async def download(self, key: Key, value: bytes) -> Reply:
-        """An ordinary download; the last reply."""
+        """Make an ordinary download; return the last reply."""
         if 0 < len(value) <= 4:
             return await self.ask(bytes((0x23 | (4 - len(value)) << 2,)) + mux(*key) + value)
         reply = await self.ask(b"\x21" + mux(*key) + len(value).to_bytes(4, "little"))
@@ -220,7 +220,7 @@ class CanopenWire:
     # -- NMT ---------------------------------------------------------------------------------------------------------
 
     async def command(self, command: int) -> None:
-        """An NMT command to this node (7.2.8.2.1)."""
+        """Send an NMT command to this node (7.2.8.2.1)."""
         await self.send(CanFrame(NMT, bytes((command, self.node))))
 
     async def boots(self) -> bool:

@@ -242,7 +242,7 @@ async def crc_mismatch(wire: CanopenWire) -> Finding:
 
 
 async def _whole_block(wire: CanopenWire, *, lose: bool) -> Finding:
-    """A download of the text's own value by blocks; the second segment gets lost at first if `lose`."""
+    """Download the object's own value by blocks; if `lose`, the second segment is lost at first."""
     key, before = await _text(wire)
     async with _borrowed(wire, key):
         begun = await _begin_block(wire, key, len(before))

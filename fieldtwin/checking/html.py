@@ -40,7 +40,7 @@ def write_html(subject: Subject, results: Sequence[DeviceResult], reproduce: str
 
 
 def render_html(subject: Subject, results: Sequence[DeviceResult], reproduce: str) -> str:
-    """The whole page."""
+    """Return the whole page."""
     bad = by_weight([r for r in results if r.verdict.bad or r.verdict is Verdict.INCONCLUSIVE])
     body = [_header(subject, results, reproduce)]
     if bad:

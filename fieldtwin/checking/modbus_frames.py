@@ -39,7 +39,7 @@ class Answer:
 
 
 def short(data: bytes, most: int = 16) -> str:
-    """Bytes as people read them: ``03 02 00 AA``."""
+    """Return bytes for display: ``03 02 00 AA``."""
     more = f" and {len(data) - most} more" if len(data) > most else ""
     return data[:most].hex(" ").upper() + more
 
@@ -60,7 +60,7 @@ def ascii_frame(body: bytes, check: int | None = None) -> bytes:
 
 
 def mbap(body: bytes, transaction: int, protocol: int = 0, length: int | None = None) -> bytes:
-    """An ADU of unit and PDU (TG 3.1.3), with fields that are wrong if so wanted."""
+    """Return an ADU of unit and PDU (TG 3.1.3), with wrong fields on request."""
     said = len(body) if length is None else length
     return transaction.to_bytes(2) + protocol.to_bytes(2) + said.to_bytes(2) + body
 

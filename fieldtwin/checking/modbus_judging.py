@@ -13,7 +13,7 @@ NAMES = {1: "illegal function", 2: "illegal data address", 3: "illegal data valu
 
 
 def named(code: int) -> str:
-    """``exception 03``, with its name where it has one."""
+    """Return a text such as ``exception 03``, with its name if it has one."""
     return f"exception {code:02X}" + (f" ({NAMES[code]})" if code in NAMES else "")
 
 

@@ -19,7 +19,7 @@ ORDER = (0x03, 0x04, 0x01, 0x02)
 
 
 def read_of(function: int, address: int, count: int) -> bytes:
-    """The PDU of a read (AP 6.1 to 6.4)."""
+    """Return the PDU of a read (AP 6.1 to 6.4)."""
     return bytes((function,)) + address.to_bytes(2) + count.to_bytes(2)
 
 

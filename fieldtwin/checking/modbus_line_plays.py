@@ -250,7 +250,7 @@ async def no_character(wire: ModbusWire) -> Finding:
 
 
 def longest(wire: ModbusWire) -> bytes:
-    """The PDU of the longest request that an echo can carry (SL 2.5.1: a frame of 256 bytes)."""
+    """Return the PDU of the longest request that an echo can carry (SL 2.5.1: a frame of 256 bytes)."""
     return b"\x08\x00\x00" + b"\x5a" * 250
 
 

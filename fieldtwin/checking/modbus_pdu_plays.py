@@ -188,7 +188,7 @@ async def unknown_category(wire: ModbusWire) -> Finding:
 
 
 def text_of(raw: bytes) -> str:
-    """A device's text as it can be shown."""
+    """Return the printable part of a device's text."""
     return raw.decode("latin-1").strip("\0 ") or "(empty)"
 
 

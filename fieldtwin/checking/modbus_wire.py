@@ -105,7 +105,7 @@ class ModbusWire:
     # -- the connection ------------------------------------------------------------------------------------------
 
     async def reopen(self) -> None:
-        """A new connection; the old one is closed first. Raises `Unreachable`."""
+        """Open a new connection after closing the old one. Raises `Unreachable`."""
         await self.aclose()
         self._connection = await self._open()
         self._closed = False

@@ -50,7 +50,7 @@ async def _borrowed(wire: ModbusWire, table: str) -> AsyncIterator[tuple[int, by
 
 
 async def _unchanged(wire: ModbusWire, table: str, address: int, before: bytes, finding: Finding) -> Finding:
-    """The finding, unless the cell changed: that is worse."""
+    """Return the finding, or a worse one if the cell changed."""
     now = await _read(wire, table, address)
     if now != before:
         said = f"; {finding.reason}" if finding.reason else ""
@@ -59,7 +59,7 @@ async def _unchanged(wire: ModbusWire, table: str, address: int, before: bytes, 
 
 
 def _other(before: bytes) -> bytes:
-    """A register's value that differs by one bit."""
+    """Return a register's value that differs by one bit."""
     return before[:1] + bytes((before[1] ^ 1,))
 
 
@@ -99,7 +99,7 @@ async def registers_mismatch(wire: ModbusWire) -> Finding:
 
 
 async def _length_mismatch(wire: ModbusWire, byte_count: int, more: bytes) -> Finding:
-    """FC 16 of one register with a byte count that contradicts the length of the request (AP 7, exception 03)."""
+    """Send FC 16 of one register with a byte count that contradicts the length of the request (AP 7, exception 03)."""
     async with _borrowed(wire, "holding") as (address, before):
         pdu = b"\x10" + address.to_bytes(2) + bytes((0, 1, byte_count)) + _other(before) + more
         return await _unchanged(wire, "holding", address, before, await must_refuse(wire, pdu, 0x03))

@@ -20,7 +20,7 @@ VERSION = 2
 
 
 def as_json(subject: Subject, results: Sequence[DeviceResult]) -> dict[str, Any]:
-    """The whole check: ``fieldtwin report`` reads this."""
+    """Return the whole check; ``fieldtwin report`` reads it."""
     return {
         "kind": KIND,
         "version": VERSION,

@@ -31,7 +31,7 @@ ORDER = (Verdict.ERROR, Verdict.FAILED, Verdict.INCONCLUSIVE, Verdict.PASSED, Ve
 
 
 def overall(results: Sequence[CaseResult]) -> Verdict:
-    """The verdict of the whole check: failed if a required case failed, passed if some case passed and no required one failed."""
+    """Return the verdict of the check: failed if a required case failed, passed if a case passed and no required one failed."""
     verdicts = {r.verdict for r in results}
     if any(r.deviates or r.verdict is Verdict.ERROR for r in results):
         return Verdict.FAILED
@@ -66,7 +66,7 @@ def sources_note(results: Sequence[CaseResult]) -> Markup:
 
 
 def by_weight(results: Sequence[R]) -> list[R]:
-    """Deviations first, then other failures, inconclusive, passed and skipped cases."""
+    """Sort the results: deviations first, then other failures, inconclusive, passed and skipped cases."""
     return sorted(results, key=lambda r: (ORDER.index(r.verdict), not r.deviates))
 
 

@@ -63,7 +63,7 @@ class RawForm:
 
 
 def of_behaviour(name: str, profile: DeviceProfile | None) -> list[str]:
-    """The writes that a profile has under `name`, as ``TAG=VALUE``, in its order. Raises `UsageError`."""
+    """Return the writes that a profile has under `name`, as ``TAG=VALUE``, in its order. Raises `UsageError`."""
     if profile is None:
         raise UsageError(f"the behaviour {name!r}: of which device?", expected="--profile NAME")
     if name not in profile.form.behaviours:
@@ -181,7 +181,7 @@ def _objects(index: int, sub: int, form: RawForm, dictionary: ObjectDictionary |
 
 
 def object_name(index: int, subindex: int) -> str:
-    """``6041h:00``."""
+    """Return a text such as ``6041h:00``."""
     return f"{index:04X}h:{subindex:02X}"
 
 

@@ -68,7 +68,7 @@ class SerialEvidence:
 
 
 def ranked(causes: Iterable[Cause]) -> list[Cause]:
-    """Most likely first, without those of no weight; of one name the weightiest."""
+    """Sort the causes, most likely first, without those of weight 0; of equal names only the one with the largest weight."""
     best: dict[str, Cause] = {}
     for cause in causes:
         if cause.weight > 0 and (cause.name not in best or best[cause.name].weight < cause.weight):

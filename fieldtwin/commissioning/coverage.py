@@ -60,7 +60,7 @@ class Coverage:
         return any(s in (READABLE, REFUSED) for s in below) and any(s in (READABLE, REFUSED) for s in above)
 
     def runs(self, scope: Spans) -> Iterator[tuple[int, int, int]]:
-        """``(start, end, state)`` of neighbouring addresses in one state."""
+        """Yield ``(start, end, state)`` of neighbouring addresses in one state."""
         for low, high in scope:
             start = low
             for address in range(low + 1, high + 1):
@@ -102,7 +102,7 @@ class Stretch:
 
 
 def stretches(coverage: Coverage, scope: Spans) -> list[Stretch]:
-    """The states of `scope`, in order. Scattered samples with the same outcome become one stretch."""
+    """Return the states of `scope`, in order. Scattered samples with the same outcome become one stretch."""
     found: list[Stretch] = []
     gap: tuple[int, int] | None = None
     for low, high in scope:
@@ -171,7 +171,7 @@ def joined(spans: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
 
 
 def coarse_to_fine(start: int, end: int, finest: int, levels: Sequence[Sequence[int]]) -> Iterator[int]:
-    """Each address from `start` to before `end` that is a multiple of `finest` or of a number in `levels`, the roundest first."""
+    """Yield each multiple of `finest` or of a number in `levels` from `start` to before `end`, the roundest first."""
     seen: set[int] = set()
     yield start
     seen.add(start)

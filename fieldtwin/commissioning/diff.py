@@ -176,7 +176,7 @@ def diff_dictionary(dump: Dump, dictionary: ObjectDictionary) -> Differences:
 
 
 def cells_of(tag: Tag) -> list[Cell]:
-    """The registers or the object that hold a tag."""
+    """Return the registers or the object that hold a tag."""
     if tag.at is not None:
         return [(tag.at.table, a) for a in range(tag.at.address, tag.at.end)]
     assert tag.object is not None
@@ -206,7 +206,7 @@ def place(tag: Tag) -> str:
 
 
 def spans(cells: Iterable[Cell]) -> list[str]:
-    """``holding:0..3``: neighbouring cells together."""
+    """Return ranges such as ``holding:0..3`` of neighbouring cells."""
     runs: list[tuple[Cell, int]] = []
     for table, number in sorted(cells, key=lambda c: (str(c[0]), c[1])):
         if runs and runs[-1][0][0] == table and runs[-1][0][1] + runs[-1][1] == number:
@@ -232,7 +232,7 @@ def _shown(tag: Tag, value: TagValue | None) -> str:
 
 
 def _diff_unnamed(out: Differences, left: Dump, right: Dump, named: set[Cell], leave: Leave) -> int:
-    """Registers and objects without a name, by their bytes. How many only one of the dumps asked for."""
+    """Compare registers and objects without a name by their bytes. Return the number of those in only one of the dumps."""
     one, other, alone = left.passes[-1], right.passes[-1], 0
     for cell in sorted((one.cells.keys() | other.cells.keys()) - named, key=lambda c: (str(c[0]), c[1])):
         name = spans([cell])[0]
@@ -278,7 +278,7 @@ def _refused(dump: Dump, cells: Sequence[Cell]) -> bool:
 
 
 def _why_not(dump: Dump, cells: Sequence[Cell]) -> str:
-    """Why a dump has no value of `cells`, where the device did not refuse them."""
+    """Return why a dump has no value of `cells`, if the device did not refuse them."""
     states = {dump.state_of(c) for c in cells}
     return {INVALID: "got no valid reply", SILENT: "got no reply"}.get(max(states), "was not asked for")
 
@@ -305,7 +305,7 @@ def _access(line: Mapping[str, object]) -> str:
 
 
 def _diff_limits(out: Differences, dump: Dump, profile: DeviceProfile) -> None:
-    """Reads that the profile's driver would send and the device refuses."""
+    """Add the reads that the profile's driver would send and the device refuses."""
     limits = profile.form.limits
     for table, line in dump.maps.items():
         longest = int(line.get("max_read") or 0)

@@ -227,7 +227,7 @@ class Dumper:
             self._progress(i + 1, len(reads), self.result.requests)
 
     async def _read_again(self, asked: RegisterRange | ObjectKey) -> None:
-        """A read that is refused now is halved: where two sweeps' reads met there may be a border."""
+        """Repeat a read, and halve it if it is refused: there may be a border where two sweeps' reads met."""
         outcome = await self._outcome(asked)
         if isinstance(outcome, Refused) and isinstance(asked, RegisterRange) and asked.count > 1:
             half = asked.count // 2
@@ -284,7 +284,7 @@ class Dumper:
         self._write({"pass": number, "at": _iso(self._clock.utc_ns())})
 
     def _write(self, line: dict[str, Any]) -> None:
-        """A line of the job, unless it was written in an earlier session."""
+        """Write a line of the job, unless it was written in an earlier session."""
         what = next(iter(line))
         if self._next_recorded(what, line[what]) is None:
             self._writer.write(line)
@@ -316,7 +316,7 @@ def check_resumable(job: Job, earlier: Dump) -> None:
 
 
 def started(job: Job, clock: Clock) -> dict[str, Any]:
-    """The header of a new dump."""
+    """Return the header of a new dump."""
     return job.header() | {"endpoint": job.target.url, "started": _iso(clock.utc_ns()), "by": who()}
 
 

@@ -45,7 +45,7 @@ def beyond_silence(sweep: Sweep) -> Asking:
 
 
 def _last_asked(sweep: Sweep, at: int) -> int:
-    """The nearest address below `at` that was asked, or the one before the span."""
+    """Return the nearest address below `at` that was read, or the one before the span."""
     states = sweep.coverage.states
     return next((a for a in range(at - 1, sweep.span.address - 1, -1) if states[a]), sweep.span.address - 1)
 

@@ -110,14 +110,14 @@ class Dump:
         return bool(self.header["ranges"]) or not self.header.get("profile")
 
     def scope(self, table: str) -> list[tuple[int, int]]:
-        """The addresses of a table that the dump was to ask for; with a profile, those that its tags were read at."""
+        """Return the addresses of a table in the scope of the dump; with a profile, those of its tags."""
         if not self.names_ranges:
             return joined(self.asked.get(table, []))
         spans = [resolve_gap(text, "sent") for text in self.header["ranges"]]
         return joined([(s.address, s.end) for s in spans if s.table == table]) if spans else [(0, ADDRESSES)]
 
     def holes(self, table: str) -> list[RegisterRange]:
-        """Ranges in which the device refused every address."""
+        """Return the ranges in which the device refused every address."""
         return [resolve_gap(text, "sent") for text in self.maps.get(table, {}).get("refused", [])]
 
     @property
@@ -138,7 +138,7 @@ class Dump:
         return 2 * unknown > asked_for
 
     def state_of(self, cell: Cell) -> int:
-        """One of the states in `coverage`, for a register or an object, from the first pass."""
+        """Return one of the states in `coverage`, for a register or an object, from the first pass."""
         if isinstance(cell[0], str):
             known = self.coverage.get(cell[0])
             return known.states[cell[1]] if known is not None else NOT_ASKED

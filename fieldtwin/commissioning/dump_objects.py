@@ -137,5 +137,5 @@ class ListedObjects(_Patience):
 
 
 def of_dictionary(dictionary: ObjectDictionary, budget_us: int | None = None) -> ListedObjects:
-    """A sweep of every entry that can be read."""
+    """Return a sweep of every entry that can be read."""
     return ListedObjects((ObjectKey(e.index, e.subindex) for e in dictionary if e.readable), budget_us)

@@ -103,7 +103,7 @@ class TableMap:
         self.units = [u for u in self.units if not (start <= u[0] and u[1] <= end)] + [(start, end, size)]
 
     def reads(self) -> list[RegisterRange]:
-        """The fewest reads that bring everything readable, never over a hole or a border."""
+        """Return the fewest reads that cover everything readable, never over a hole or a border."""
         most = self.max_read or 1
         planned: list[RegisterRange] = []
         for start, end in self.readable:
@@ -268,7 +268,7 @@ class Sweep:
         return end
 
     def back_from(self, at: int, lowest: int) -> Generator[RegisterRange, Outcome, int]:
-        """The register at `at` can be read: where its block begins, at `lowest` or after it."""
+        """Return where the block of the readable register at `at` begins, at `lowest` or after it."""
         grain = self.found.grain
         while at > lowest and not self.halted:
             room = min(at - lowest, self._most)

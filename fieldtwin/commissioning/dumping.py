@@ -49,7 +49,7 @@ class Estimate:
 
 
 def register_spans(texts: Sequence[str]) -> tuple[RegisterRange, ...]:
-    """``holding``, ``holding:0..999``, ``40001..40100``. Raises `UsageError`."""
+    """Parse ``holding``, ``holding:0..999``, ``40001..40100``. Raises `UsageError`."""
     spans = []
     for text in texts:
         table = next((t for t in TABLES if t == text), None)
@@ -61,7 +61,7 @@ def register_spans(texts: Sequence[str]) -> tuple[RegisterRange, ...]:
 
 
 def object_ranges(texts: Sequence[str]) -> tuple[tuple[int, int], ...]:
-    """``6000..6FFF``, ``1018h``. Raises `UsageError`."""
+    """Parse ``6000..6FFF``, ``1018h``. Raises `UsageError`."""
     ranges = []
     for text in texts:
         match = _INDEXES.match(text)

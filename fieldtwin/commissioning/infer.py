@@ -144,7 +144,7 @@ def _marked(reading: Reading, series: Series) -> Reading:
 
 
 def _as_observed(reading: Reading) -> Reading:
-    """With the share of such readings that were right on generated maps as its probability."""
+    """Return the reading with the observed share of right readings on generated maps as its probability."""
     kind = kind_of(reading.type, reading.registers, moves=reading.moves, capped=reading.capped)
     share = calibrated(reading.probability, kind)
     left = (1 - share) / max(1e-9, 1 - reading.probability)

@@ -73,13 +73,13 @@ def kind_of(kind: str, registers: int, *, moves: bool, capped: str) -> str:
 
 
 def log_odds(probability: float) -> float:
-    """The log odds of a probability, at most 12 either way."""
+    """Return the log odds of a probability, limited to 12 in both directions."""
     p = min(1 - 1e-6, max(1e-6, probability))
     return max(-12.0, min(12.0, math.log(p / (1 - p))))
 
 
 def calibrated(probability: float, kind: str) -> float:
-    """The share of right readings that was observed for readings of this kind with this probability of the model."""
+    """Return the observed share of right readings for this kind and this probability of the model."""
     curve = CURVES[kind]
     if not curve:
         return probability

@@ -78,7 +78,7 @@ def decode_series(words: Sequence[Sequence[int]], kind: str, order: str) -> list
 
 
 def decode_numbers(wholes: Sequence[int], kind: str) -> list[float] | None:
-    """Unsigned numbers as numbers of this type."""
+    """Return unsigned numbers as numbers of this type."""
     if kind.startswith("uint"):
         return list(wholes)
     bits = 16 * REGISTERS_OF[kind]
@@ -93,8 +93,10 @@ def decode_numbers(wholes: Sequence[int], kind: str) -> list[float] | None:
 
 
 def cost(words: Sequence[Sequence[int]], kind: str, order: str) -> float:
-    """The cost of `words` (one row a pass) as a series of this type, the rarity of the type included; that of the order is not
-    (`order_cost`)."""
+    """Return the cost of `words` (one row a pass) as a series of this type.
+
+    The rarity of the type is included; that of the order is not (`order_cost`).
+    """
     if kind == "string":
         return _text_cost(words, order) + TYPE_COST[kind]
     return cost_of(whole_numbers(words, order), kind, order)
@@ -170,7 +172,7 @@ def walk_cost(numbers: Sequence[int]) -> float:
 
 
 def _steps_cost(distances: Sequence[float]) -> float:
-    """Cauchy distributed, of the scale that suits them best."""
+    """Return the cost of Cauchy distributed distances with the scale that fits them best."""
     best = math.inf
     for scale in (median(distances), sum(distances) / len(distances)):
         scale = max(scale, 0.3)
@@ -239,7 +241,7 @@ def _mantissa_cost(value: float, kind: str) -> float:
 
 
 def _ordered(value: float, kind: str) -> int:
-    """The number of a float among all floats, so that neighbours differ by 1."""
+    """Return the number of a float among all floats, so that neighbours differ by 1."""
     raw = int.from_bytes(struct.pack(_FORMATS[kind], value))
     sign = 1 << (31 if kind == "float32" else 63)
     return raw if raw < sign else sign - raw

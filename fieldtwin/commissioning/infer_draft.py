@@ -49,7 +49,7 @@ def draft_profile(inference: Inference, dumps: Sequence[Dump], name: str = "") -
 
 
 def checked(text: str, path: Path) -> DeviceProfile:
-    """The draft as the profile reader sees it. Raises `FileInvalid` where it refuses it."""
+    """Load the draft with the profile reader. Raises `FileInvalid` if the reader refuses it."""
     return resolve(parse(text, str(path)))
 
 
@@ -91,7 +91,7 @@ def _seen(reading: Reading) -> str:
 
 
 def _tag(reading: Reading) -> list[str]:
-    """The lines of one value. One of unknown type is a plain number for each of its registers."""
+    """Return the lines of one value. One of unknown type is a plain number for each of its registers."""
     if reading.level is Level.UNKNOWN and reading.type != "uint16":
         return [
             f'  {reading.table}_{a}: {{at: "{reading.table}:{a}", type: uint16}}  # {doubts(reading)}'
@@ -113,7 +113,7 @@ def _tag(reading: Reading) -> list[str]:
 
 
 def _flags(reading: Reading) -> list[str]:
-    """A tag for each bit of a status word that changed."""
+    """Return a tag for each bit of a status word that changed."""
     if "bits" not in reading.marks:
         return []
     words = [int(v) & 0xFFFF for v in reading.values]
@@ -142,7 +142,7 @@ def _states(dumps: Sequence[Dump]) -> list[str]:
 
 
 def _bits(series: Series) -> tuple[list[str], int]:
-    """A tag for each bit, at most `MOST_BITS`; and how many are left out."""
+    """Return a tag for each bit, at most `MOST_BITS`, and the number of omitted ones."""
     lines: list[str] = []
     left = 0
     for table in BIT_TABLES:

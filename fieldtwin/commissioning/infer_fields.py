@@ -189,7 +189,7 @@ def _number_tiles(words: Sequence[Sequence[int]], start: int, size: int) -> list
 
 
 def _sums(by_end: Sequence[Sequence[_Tile]], count: int) -> list[float]:
-    """The log of the summed weights of all tilings of the first i registers."""
+    """Return the log of the summed weights of all tilings of the first i registers."""
     sums = [0.0] * (count + 1)
     for end in range(1, count + 1):
         sums[end] = _log_sum([sums[t.start] - t.cost for t in by_end[end]])
@@ -209,7 +209,7 @@ def _log_sum(logs: Sequence[float]) -> float:
 
 
 def _best(by_end: Sequence[Sequence[_Tile]], count: int) -> list[_Tile]:
-    """The tiling of the least cost."""
+    """Return the tiling with the least cost."""
     least = [0.0] + [math.inf] * count
     chosen: list[_Tile | None] = [None] * (count + 1)
     for end in range(1, count + 1):
@@ -318,13 +318,13 @@ def _is_regular(steps: Sequence[float]) -> bool:
 
 
 def text_of(words: Sequence[int], order: str) -> str:
-    """The characters of registers."""
+    """Return the characters of registers."""
     data = b"".join(w.to_bytes(2) for w in words)
     return reorder(data, order if order == "BADC" else "ABCD").rstrip(b"\0 ").decode("ascii", errors="replace")
 
 
 def runs_of(cells: Mapping[int, Sequence[int]], most: int = 4096) -> list[tuple[int, list[Sequence[int]]]]:
-    """Neighbouring registers together: ``(first address, the words of each)``; longer runs than `most` are cut."""
+    """Return runs of neighbouring registers, ``(first address, the words of each)``; those longer than `most` are cut."""
     runs: list[tuple[int, list[Sequence[int]]]] = []
     for address in sorted(cells):
         if runs and runs[-1][0] + len(runs[-1][1]) == address and len(runs[-1][1]) < most:

@@ -63,7 +63,7 @@ def toggled_bits(values: Sequence[int]) -> tuple[int, ...]:
 
 
 def bits_cost(values: Sequence[int]) -> float:
-    """The cost of a register as sixteen flags, of which a few change: `math.inf` where it does not behave so."""
+    """Return the cost of a register as sixteen flags of which a few change; `math.inf` if it does not behave so."""
     bits = toggled_bits(values)
     if not bits:
         return math.inf

@@ -28,7 +28,7 @@ _MAINS = (
 
 
 def marked(reading: Reading, times_s: Sequence[float]) -> Reading:
-    """`reading` with its marks. `times_s`: when each pass was, in seconds since 1970 UTC."""
+    """Return `reading` with its marks. `times_s`: the time of each pass, in seconds since 1970 UTC."""
     if reading.type == "string" or not reading.moves:
         return reading
     numbers = [float(v) for v in reading.values]
@@ -105,7 +105,7 @@ def _likeness(reading: Reading, numbers: Sequence[float], *, whole: bool) -> lis
 
 
 def with_scales(readings: Sequence[Reading]) -> list[Reading]:
-    """Integers that are a float of the same device times a power of ten, in every pass, get that scale."""
+    """Give integers that equal a float of the same device times a power of ten in every pass that scale."""
     floats = [r for r in readings if r.type.startswith("float") and r.moves and r.probability >= 0.8]
     return [_scaled(r, floats) if "int" in r.type and r.moves else r for r in readings]
 

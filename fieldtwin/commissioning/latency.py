@@ -10,7 +10,7 @@ BUCKETS = 71
 
 
 def bound_us(bucket: int) -> int:
-    """The upper bound of a bucket in microseconds."""
+    """Return the upper bound of a bucket in microseconds."""
     return round(10 * 10 ** (bucket / PER_DECADE))
 
 

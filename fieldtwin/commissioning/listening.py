@@ -109,6 +109,6 @@ def _same_bits(settings: SerialSettings, others: list[SerialSettings]) -> tuple[
 
 
 def describe(verdict: LineVerdict) -> str:
-    """One line for a person."""
+    """Return one line for the user."""
     also = f" (or {', '.join(name_of(o) for o in verdict.others)})" if verdict.others else ""
     return f"{name_of(verdict.settings)}{also}: {verdict.why}"

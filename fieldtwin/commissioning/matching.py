@@ -92,7 +92,7 @@ class Reading:
 
 
 def rank(candidates: Iterable[Candidate]) -> list[Candidate]:
-    """Best first."""
+    """Sort the candidates, best first."""
     return sorted(candidates, key=lambda c: (-c.sureness, -c.signs, c.profile))
 
 
@@ -246,7 +246,7 @@ def _keys(profile: DeviceProfile, readings: Mapping[str, Reading]) -> tuple[list
 
 
 def _plausibility(readings: Iterable[Reading]) -> tuple[list[str], list[str]]:
-    """Values that could have been nonsense and are not, and those that are."""
+    """Return the plausible values, out of those that could have been implausible, and the implausible ones."""
     signs: list[str] = []
     nonsense: list[str] = []
     for reading in readings:

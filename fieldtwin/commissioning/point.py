@@ -105,7 +105,7 @@ def encoded(tag: Tag, value: Scalar) -> bytes:
 
 
 def _text(tag: Tag, value: str) -> bytes:
-    """Text as a device has it: in registers filled up with NULs, its bytes swapped where the order swaps bytes."""
+    """Return text as a device holds it: padded to whole registers with NULs, its bytes swapped where the order swaps bytes."""
     if not value.isascii():
         raise NotAllowed(f"{tag.name}: only ASCII can be written", got=repr(value))
     raw = value.encode("ascii")
@@ -318,7 +318,7 @@ def asked_profile(tags: Sequence[Tag], profile: DeviceProfile | None) -> DeviceP
 
 
 def planned(tags: Sequence[Tag], profile: DeviceProfile | None) -> tuple[Read, ...]:
-    """The fewest reads for `tags` (`plan_reads`)."""
+    """Return the fewest reads for `tags` (`plan_reads`)."""
     return plan_reads(asked_profile(tags, profile), "asked")
 
 
@@ -347,7 +347,7 @@ def write_request(tag: Tag, data: bytes, functions: Sequence[int] | None) -> Req
 
 
 def read_request(at: RegisterRange) -> Request[Any]:
-    """The request that reads a range."""
+    """Return the request that reads a range."""
     if at.table == "coil" or at.table == "discrete":
         return ReadBits(at.table, at.address, at.count)
     return ReadRegisters(at.table, at.address, at.count)

@@ -153,7 +153,7 @@ def dry_point(target: Target) -> Point:
 
 
 def text_of(tag: Tag, answer: Answer) -> str:
-    """A value for a person: with the name of its number where the profile has one; secrets are hidden."""
+    """Return a value for display, with the profile's name of the number if it has one; secrets are hidden."""
     value = answer.value.value
     if value is None:
         return "-"

@@ -188,7 +188,7 @@ class CanScanner:
             result.listened_s += (clock.monotonic_ns() - began_ns) / NS_PER_S
 
     def _silent_endpoint(self) -> Endpoint:
-        """The endpoint for listening: an adapter that can does not even acknowledge."""
+        """Return the endpoint for listening: if possible the adapter does not even acknowledge frames."""
         facts = self.result.facts
         if facts is None or not facts.can_listen_only or self._endpoint.param("listen"):
             return self._endpoint

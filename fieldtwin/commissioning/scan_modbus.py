@@ -184,7 +184,7 @@ class ModbusScanner:
             await self._search_all([self._pace.step(here, self._units)])
 
     async def _search(self) -> None:
-        """Settings unknown, line silent: the likely ones first."""
+        """Search for the settings of a silent line, the likely ones first."""
         steps = plan.quick_pass(self._quick, plan.likely_settings(self._endpoint), self._units, self._options.quick_s)
         done = await self._steps(steps, "likely settings", until_found=not self._options.every_setting)
         if self._quick != self._pace:
@@ -272,7 +272,7 @@ class ModbusScanner:
     # -- questions ------------------------------------------------------------------------------------------------
 
     async def _steps(self, steps: list[Step], phase: str, *, until_found: bool = False) -> list[Step]:
-        """Go through `steps`; those that were begun."""
+        """Run `steps`; return those that were begun."""
         total_s, done_s = plan.seconds_of(steps), 0.0
         for i, step in enumerate(steps):
             if self._ended:

@@ -45,7 +45,7 @@ def with_settings(endpoint: Endpoint, settings: SerialSettings) -> Endpoint:
 
 
 def name_of(settings: SerialSettings) -> str:
-    """``9600 8N1``."""
+    """Return a text such as ``9600 8N1``."""
     return f"{settings.baudrate} {settings.frame}"
 
 
@@ -93,7 +93,7 @@ class Pace:
 def quick_pass(
     pace: Pace, candidates: Sequence[SerialSettings], units: Sequence[int], budget_s: float = 30.0
 ) -> list[Step]:
-    """The likely units at the likely settings, as many of both as `budget_s` allows: some units everywhere first."""
+    """Return steps for likely units at likely settings, as many as `budget_s` allows: some units at every setting first."""
     steps: list[Step] = []
     left_s = budget_s
     for first, last in ((0, 5), (5, 10), (10, 18), (18, len(UNITS))):
@@ -123,7 +123,7 @@ def full_pass(
 
 
 def all_settings(endpoint: Endpoint) -> list[SerialSettings]:
-    """Baud rate x parity x stop bits that `endpoint` leaves open, likely ones first."""
+    """Return all combinations of baud rate, parity and stop bits that `endpoint` leaves open, likely ones first."""
     ascii_mode = endpoint.scheme == "ascii"
     frames = ASCII_FRAMES if ascii_mode else FRAMES
     every = [SerialSettings(baudrate, frame) for frame in frames for baudrate in BAUDRATES]

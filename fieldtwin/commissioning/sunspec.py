@@ -16,7 +16,7 @@ _FIELDS = {"manufacturer": (2, 16), "model": (18, 16), "version": (42, 8), "seri
 
 
 def text_of(data: bytes) -> str:
-    """Characters up to the first zero."""
+    """Return the characters up to the first zero."""
     return data.split(b"\0")[0].decode("ascii", "replace").strip()
 
 

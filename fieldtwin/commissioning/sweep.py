@@ -76,7 +76,7 @@ class _Asked:
 def expected_s(
     units: int, request_chars: int, *, char_time_s: float, timeout_s: float, interval_s: float = 0.0
 ) -> float:
-    """Seconds that asking `units` silent units takes."""
+    """Return the seconds that `units` silent units take."""
     return units * max(request_chars * char_time_s + timeout_s, interval_s)
 
 
@@ -166,7 +166,7 @@ class UnitSweep:
         return Send(unit, data)
 
     def handed_over(self, now_ns: int) -> None:
-        """The driver has the question; its characters leave from now on."""
+        """Note that the driver has accepted the question, whose characters are sent from now on."""
         if self._now is not None:
             gone_ns = now_ns + len(self._now.sent) * self._char_ns
             self._now.deadline_ns = gone_ns + self._timeout_ns
@@ -174,7 +174,7 @@ class UnitSweep:
             self._not_before_ns = self._now.began_ns + self._interval_ns
 
     def feed(self, data: bytes, now_ns: int) -> None:
-        """Something arrived."""
+        """Add received bytes."""
         for frame in self._splitter.feed(data, now_ns):
             self._judge(frame, now_ns)
         asked = self._now

@@ -54,7 +54,7 @@ class Heard:
 
     @property
     def share(self) -> float:
-        """Which part of the bytes is good."""
+        """The share of good bytes."""
         return self.good_bytes / self.bytes if self.bytes else 0.0
 
     @property

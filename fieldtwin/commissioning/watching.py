@@ -56,7 +56,7 @@ class History:
 
 
 def sparkline(values: Sequence[float | None]) -> str:
-    """One character a value. A value that does not change is a line in the middle."""
+    """Return one character per value. A constant value is a line in the middle."""
     known = [v for v in values if v is not None]
     if not known:
         return GAP * len(values)

@@ -86,7 +86,7 @@ def plan_writes(pairs: list[tuple[Tag, str]], *, i_know: bool = False, restore: 
 
 
 def parse_value(tag: Tag, text: str) -> Scalar:
-    """A value as a person writes it. Raises `UsageError`."""
+    """Parse a value in the user's notation. Raises `UsageError`."""
     named = {name: number for number, name in tag.values}
     if text in named:
         return named[text]

@@ -73,7 +73,7 @@ class HonestNode:
         )
 
     def command(self, specifier: int) -> bool:
-        """NMT; True where a boot-up message is due."""
+        """Execute an NMT command; return True when a boot-up message is due."""
         if specifier in _RESETS:
             self.state = PRE_OPERATIONAL
             self._server.reset()

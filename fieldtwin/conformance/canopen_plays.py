@@ -37,7 +37,7 @@ def same_toggle(scene: CanScene) -> list[SayFrame]:
 
 
 def other_length(scene: CanScene) -> list[SayFrame]:
-    """A segmented upload that ends before the length that was indicated."""
+    """End a segmented upload before the indicated length."""
     return _segmented(scene, lambda n: bytes((0x01 | (7 - len(scene.poison)) << 1,)) + scene.poison.ljust(7, b"\0"))
 
 
@@ -97,7 +97,7 @@ def flood(scene: CanScene) -> list[SayFrame]:
 
 
 def short(scene: CanScene) -> list[SayFrame]:
-    """The bytes of the reply that hold something, and not one more."""
+    """Send only the bytes of the reply that carry data."""
     if not scene.opens:
         return scene.honest()
     used = 4 + (4 - (scene.true[0][0] >> 2 & 3))
@@ -166,7 +166,7 @@ def refuses_crc(scene: CanScene) -> list[SayFrame]:
 
 
 def unanswered(scene: CanScene) -> list[SayFrame]:
-    """The reply, or the request, was lost on the bus."""
+    """Lose the reply, or the request, on the bus."""
     return []
 
 
@@ -189,7 +189,7 @@ def refuses_write(scene: CanScene) -> list[SayFrame]:
 
 
 def slow_segments(scene: CanScene) -> list[SayFrame]:
-    """A segmented upload, a byte a segment, of which each step takes its time."""
+    """Send a segmented upload with one byte per segment, and delay each step."""
     word = scene.memory["word"].to_bytes(len(scene.poison), "little")
     after_s = SLOW * scene.timeout_s
     if scene.opens:
@@ -204,12 +204,12 @@ def slow_segments(scene: CanScene) -> list[SayFrame]:
 
 
 def unhurried(scene: CanScene) -> list[SayFrame]:
-    """Each reply takes more than half of a timeout: two of them one after the other are longer than one."""
+    """Delay each reply by more than half of a timeout: two consecutive ones take longer than one."""
     return [scene.reply(data, 0.6 * scene.timeout_s) for data in scene.true]
 
 
 def empty(scene: CanScene) -> list[SayFrame]:
-    """An upload of no byte at all."""
+    """Reply with an upload of zero bytes."""
     if scene.opens:
         scene.memory["segments"] = 0
         return [scene.reply(b"\x41" + scene.request[1:4] + bytes(4))]

@@ -41,15 +41,15 @@ class CanScene:
     memory: dict[str, int] = field(default_factory=dict)
 
     def reply(self, data: bytes, after_s: float = 0.0, *, good: bool = False) -> SayFrame:
-        """An SDO reply of this node."""
+        """Return an SDO reply of this node."""
         return SayFrame(CanFrame(SDO_REPLY + self.node, data), after_s, good)
 
     def honest(self, after_s: float = 0.0) -> list[SayFrame]:
-        """The honest replies, in plain frames."""
+        """Return the correct replies, in plain frames."""
         return [self.reply(data, after_s, good=True) for data in self.true]
 
     def frame(self, base: int, data: bytes) -> SayFrame:
-        """A frame with an identifier of the predefined connection set."""
+        """Return a frame with an identifier of the predefined connection set."""
         return SayFrame(CanFrame(base + self.node, data))
 
 

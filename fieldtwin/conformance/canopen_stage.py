@@ -151,7 +151,7 @@ class CanopenStage:
         return memory["segments"] == case.misses
 
     def _early(self, server: HonestNode, now_ns: int) -> list[bytes]:
-        """The acknowledgement of a sub-block that is not over."""
+        """Return the acknowledgement of a sub-block before its end."""
         case, memory = self._playing, self._memory
         if case is None or memory is None or not case.early or memory.get("segments") != case.early:
             return []

@@ -63,7 +63,7 @@ def bounded_addresses(seen: Observation) -> Finding:
 
 
 def few_connections(seen: Observation) -> Finding:
-    """A master that loses a connection closes its end of it: each that stays open costs the device one."""
+    """Check that a master that loses a connection closes its end: each one that stays open occupies one of the device's."""
     count = most = 0
     for event in seen.events:
         count += isinstance(event, Came) - isinstance(event, Left)

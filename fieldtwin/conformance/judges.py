@@ -63,7 +63,7 @@ def asks_cleanly(seen: Observation) -> Finding | None:
 
 
 def does_not_flood(seen: Observation) -> Finding | None:
-    """Retries and new connections are bounded."""
+    """Check that the numbers of retries and new connections are bounded."""
     span_s = max((seen.until_ns - seen.begun_ns) / NS_PER_S, 0.001)
     for kind, what in ((Asked, "requests"), (Came, "connections")):
         count = sum(isinstance(event, kind) for event in seen.events if event.t_ns >= seen.begun_ns)
@@ -86,7 +86,7 @@ def publishes_nothing_bad(seen: Observation) -> Finding | None:
 
 
 def publishes_good_again(seen: Observation) -> Finding | None:
-    """Once the device is well, its value is seen again."""
+    """Check that the device's value is published again after the device has recovered."""
     if seen.probed and not any(shown.word is seen.last for shown in seen.of(Shown, seen.over_ns)):
         waited = (seen.until_ns - seen.over_ns) / NS_PER_S
         return failed(f"the honest value was not published within {waited:.1f} s after the last odd answer")

@@ -163,7 +163,7 @@ def second_colon(scene: Scene) -> list[Move]:
 
 
 def long_gap(scene: Scene) -> list[Move]:
-    """Two halves, more than the second apart that SL 2.5.2.1 allows."""
+    """Send two halves of a frame, further apart than the second that SL 2.5.2.1 allows."""
     frame = scene.frame(scene.false)
     return [Say(frame[:7]), Say(frame[7:], 1.2)]
 

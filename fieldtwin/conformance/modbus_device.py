@@ -50,7 +50,7 @@ class HonestDevice:
         self._bank.word = value
 
     def answer(self, pdu: bytes, now_ns: int) -> bytes:
-        """The response PDU, empty for silence."""
+        """Return the response PDU, empty for silence."""
         return self._unit.respond(pdu, now_ns) or b""
 
     def answer_with(self, word: int, pdu: bytes, now_ns: int) -> bytes:
@@ -77,7 +77,7 @@ class RtuWire:
         return [(frame[:-2], 0) for frame in self._receiver.feed(data, now_ns)]
 
     def garbage(self) -> int:
-        """Bytes since the last call that belong to no request."""
+        """Return the number of bytes since the last call that belong to no request."""
         new, self._noise = self._receiver.noise_bytes - self._noise, self._receiver.noise_bytes
         return new
 
@@ -99,7 +99,7 @@ class AsciiWire:
         return [(frame[:-1], 0) for frame in self._receiver.feed(data, now_ns)]
 
     def garbage(self) -> int:
-        """Characters since the last call that belong to no request."""
+        """Return the number of characters since the last call that belong to no request."""
         new, self._noise = self._receiver.noise_bytes - self._noise, self._receiver.noise_bytes
         return new
 
@@ -108,7 +108,7 @@ class AsciiWire:
 
 
 def in_ascii(adu: bytes) -> bytes:
-    """A frame of Modbus ASCII around unit id and PDU (SL 2.5.2)."""
+    """Return a frame of Modbus ASCII around unit ID and PDU (SL 2.5.2)."""
     return b":" + (adu + bytes((lrc(adu),))).hex().upper().encode("ascii") + b"\r\n"
 
 
@@ -138,7 +138,7 @@ class MbapWire:
         return found
 
     def garbage(self) -> int:
-        """Bytes since the last call that belong to no request."""
+        """Return the number of bytes since the last call that belong to no request."""
         new, self._garbage = self._garbage, 0
         return new
 

@@ -156,11 +156,11 @@ class Observation:
     patience_s: float = 10.0
 
     def of(self, kind: type[E], since_ns: int = 0, until_ns: int | None = None) -> Iterator[E]:
-        """Events of a kind in a time window, both ends included, in order."""
+        """Yield the events of a kind in a time window, both ends included, in order."""
         for event in self.events:
             if isinstance(event, kind) and since_ns <= event.t_ns and (until_ns is None or event.t_ns <= until_ns):
                 yield event
 
     def since_s(self, t_ns: int) -> float:
-        """Seconds since the misbehaviour began."""
+        """Return the seconds since the misbehaviour began."""
         return (t_ns - self.begun_ns) / NS_PER_S

@@ -156,13 +156,13 @@ class OutputProbe:
         self.on_shown: OnShown = lambda word, text: None
 
     def learn(self, word: Word) -> bool:
-        """The words are printed as they are, or never."""
+        """Return whether `word` was seen; learning ends with both words. The program prints them unchanged or never."""
         if {Word.FIRST, Word.SECOND} <= self._seen:
             self._learns = False
         return word in self._seen
 
     def feed(self, text: str, log: bool = False) -> None:
-        """Something was printed, or logged."""
+        """Add text of the output or of the log."""
         for line in self._lines.feed(text, log):
             self._line(line, log)
 
@@ -207,7 +207,7 @@ class MarkedOutputProbe:
         return self._classifier.learn(word)
 
     def feed(self, text: str, log: bool = False) -> None:
-        """Something was printed, or logged."""
+        """Add text of the output or of the log."""
         for line in self._lines.feed(text, log):
             for reading in self._value.findall(line):
                 known = reading if _ANY_NUMBER.fullmatch(reading) else ""

@@ -33,7 +33,7 @@ class Recorder:
         return self.total - len(self._events)
 
     def since(self, t_ns: int) -> tuple[Event, ...]:
-        """Events from `t_ns` on, in order."""
+        """Return the events from `t_ns` on, in order."""
         found: list[Event] = []
         for event in reversed(self._events):
             if event.t_ns < t_ns:

@@ -79,14 +79,14 @@ def called(result: CaseResult) -> str:
 
 
 def summary(results: Sequence[CaseResult]) -> str:
-    """``31 passed, 1 failed, 2 robustness, 1 field problem, 2 inconclusive, 4 skipped``."""
+    """Return a text such as ``31 passed, 1 failed, 2 robustness, 1 field problem, 2 inconclusive, 4 skipped``."""
     counts = Counter(called(result) for result in results)
     order = ("passed", *FOUND.values(), "error", "inconclusive", "skipped")
     return ", ".join(f"{counts[word]} {word}" for word in order if counts[word]) or "no case was chosen"
 
 
 def as_json(results: Sequence[CaseResult], argv: Sequence[str]) -> list[dict[str, Any]]:
-    """One object a case. `argv` is the command line that was given, for `reproduce`."""
+    """Return one object per case. `argv` is the command line, for `reproduce`."""
     return [
         {
             "id": r.case.id,

@@ -121,7 +121,7 @@ class MasterRun(Generic[C]):
         self.stage.recorder.add(Shown(self.stage.now_ns(), word, text))
 
     def ended(self, status: int) -> None:
-        """The program under test ended by itself."""
+        """Record that the program under test ended by itself."""
         self._ended = Ended(self.stage.now_ns(), status)
         self.stage.recorder.add(self._ended)
 
@@ -133,7 +133,7 @@ class MasterRun(Generic[C]):
     # -- the run --------------------------------------------------------------------------------------------------
 
     async def run(self) -> list[CaseResult]:
-        """Results in the order of the cases. Raises `Unreachable` where no master ever asked."""
+        """Return the results in the order of the cases. Raises `Unreachable` if no master ever sent a request."""
         await self._learn()
         chosen = [case for case in self.cases if case.about.chosen(self.plan.only)]
         for case in [c for c in chosen if c.wants != "nothing"]:
@@ -215,7 +215,7 @@ class MasterRun(Generic[C]):
         return ""
 
     async def _well(self) -> bool:
-        """Two honest answers were given, and their word is seen."""
+        """Wait until correct answers were given and their word was published; return whether both happened."""
         since_ns = self.stage.now_ns()
         return await self._good_again(since_ns)
 

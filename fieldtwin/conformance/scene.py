@@ -73,11 +73,11 @@ class Scene:
         return self.request[1]
 
     def good(self, after_s: float = 0.0) -> Say:
-        """The honest answer in a plain frame."""
+        """Return the correct answer in a plain frame."""
         return Say(self.frame(self.true), after_s, good=True)
 
     def frame(self, pdu: bytes) -> bytes:
-        """A plain frame around any PDU."""
+        """Return a plain frame around any PDU."""
         return self.wire.frame(self.request, self.tag, pdu)
 
     def from_unit(self, unit: int, pdu: bytes) -> bytes:
@@ -90,7 +90,7 @@ class Scene:
         return self.unit % 247 + 1
 
     def refuse(self, code: int, function: int | None = None) -> bytes:
-        """An exception response in a plain frame."""
+        """Return an exception response in a plain frame."""
         return self.frame(bytes(((function or self.function) | 0x80, code)))
 
 

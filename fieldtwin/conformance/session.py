@@ -66,9 +66,9 @@ class Listener:
 
 
 async def judge_modbus_master(options: Options, listener: Listener) -> list[CaseResult]:
-    """Results in the order of the cases. Raises `UsageError`, `Unreachable` or `EndpointBusy`.
+    """Test a Modbus client; return the results in the order of the cases.
 
-    SIGTERM ends it, and the program with it.
+    Raises `UsageError`, `Unreachable` or `EndpointBusy`. SIGTERM ends the test, and the program with it.
     """
     if options.listen.scheme not in ("tcp", "rtu+tcp", "pty", "rtu", "ascii"):
         raise UsageError("where the master is listened for", expected=LISTENING, got=str(options.listen))

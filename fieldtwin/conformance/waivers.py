@@ -60,7 +60,7 @@ class Waivers:
     entries: tuple[Waiver, ...] = ()
 
     def of(self, *ids: str) -> Waiver | None:
-        """The waiver of the first of `ids` that has one."""
+        """Return the waiver of the first of `ids` that has one."""
         for id in ids:
             for waiver in self.entries:
                 if waiver.id == id:

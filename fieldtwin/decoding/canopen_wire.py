@@ -39,7 +39,7 @@ class CanopenWire:
         self._find_pdos()
 
     def feed(self, frame: CanFrame, t_ns: int) -> tuple[str, list[Exchange]]:
-        """A frame, in the order of the trace."""
+        """Add a frame, in the order of the trace."""
         if frame.error:
             return "error frame", []
         if frame.extended:

@@ -45,7 +45,10 @@ class Decoder:
         self._maps: dict[str, TagMap] = {}
 
     def decode(self, event: Event) -> Decoded:
-        """An event in words. Every event of a trace has some; an unknown bus's bytes are shown as they are."""
+        """Describe an event in words.
+
+        Every event of a trace has a description; an unknown bus's bytes are shown unchanged.
+        """
         if event.kind is not Kind.FRAME:
             return Decoded(self._words(event), dict(event.data))
         text, done = self._frame(event)

@@ -33,7 +33,7 @@ class Span:
         return self.table == table and self.address <= address < self.address + self.count
 
     def __str__(self) -> str:
-        """Both ways for registers, ``30001 (input:0) x 2``; ``6010h:01`` for an object."""
+        """Return the address, in both notations for registers: ``30001 (input:0) x 2``; ``6010h:01`` for an object."""
         if self.table == "object":
             return f"{self.address:04X}h:{self.subindex:02X}"
         if self.table == "file":
@@ -129,7 +129,7 @@ class Exchange:
         }
 
     def writes(self, tag: str = "") -> bool:
-        """As `reads`."""
+        """Return whether the exchange writes, as `reads` does."""
         return any(s.access == "write" for s in self.spans) and (not tag or tag in self.tags)
 
 

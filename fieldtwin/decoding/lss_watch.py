@@ -37,7 +37,7 @@ class LssWatch:
         self._open: Exchange | None = None
 
     def feed(self, data: bytes, reply: bool, t_ns: int) -> tuple[str, list[Exchange]]:
-        """A frame of either identifier."""
+        """Add a frame of either identifier."""
         if not data:
             return "LSS without data", []
         return self._reply(data, t_ns) if reply else self._request(data, t_ns)
@@ -47,7 +47,7 @@ class LssWatch:
         return [] if self._open is None else [replace(self._open, problem="pending", reply_text="pending")]
 
     def finish(self) -> list[Exchange]:
-        """Nothing follows."""
+        """Conclude the trace: a request that still waits has no answer."""
         now, self._open = self._open, None
         if now is None:
             return []

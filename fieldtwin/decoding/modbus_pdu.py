@@ -64,12 +64,12 @@ class Answer:
 
 
 def service_of(function: int) -> str:
-    """The standard's name of a function, or its number."""
+    """Return the standard's name of a function, or its number."""
     return SERVICES.get(function, f"function {function:02X}h")
 
 
 def exception_text(code: int) -> str:
-    """``02 illegal data address``."""
+    """Return a text such as ``02 illegal data address``."""
     return f"{code:02X} {ModbusExceptionReply.NAMES.get(code, 'vendor specific')}"
 
 
@@ -123,7 +123,7 @@ def _other(function: int, pdu: bytes) -> Asked:
 
 
 def _file_spans(pdu: bytes) -> list[Span]:
-    """The records of functions 14h and 15h: reference type, file, record, length each (AP 6.14, 6.15)."""
+    """Return the records of functions 14h and 15h: reference type, file, record, length each (AP 6.14, 6.15)."""
     spans, at = [], 2
     while at + 7 <= len(pdu):
         file, record, count = _words(pdu[at + 1 : at + 7])
@@ -152,12 +152,12 @@ def parse_reply(asked: Asked, request: bytes, pdu: bytes) -> Answer:
 
 
 def words(span: Span, data: bytes) -> tuple[int, ...]:
-    """Registers as numbers, bits as 0 and 1, of `Asked.written` or `Answer.read`."""
+    """Return registers as numbers, bits as 0 and 1, from `Asked.written` or `Answer.read`."""
     return tuple(data) if span.table in BIT_TABLES else _words(data)
 
 
 def bits(data: bytes, count: int) -> bytes:
-    """One byte (0 or 1) for each bit: the lowest bit of the first byte is the first (AP 6.1)."""
+    """Return one byte (0 or 1) for each bit: the lowest bit of the first byte is the first (AP 6.1)."""
     return bytes(data[i >> 3] >> (i & 7) & 1 for i in range(min(count, 8 * len(data))))
 
 

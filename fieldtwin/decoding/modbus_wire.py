@@ -296,7 +296,7 @@ def _identified(unit: int, transaction: int | None) -> str:
 
 
 def _shortened(raw: bytes) -> str:
-    """The bytes in hex, the first `STRAY_SHOWN` of them."""
+    """Return the bytes in hex, the first `STRAY_SHOWN` of them."""
     more = f" ... ({_bytes(len(raw))})" if len(raw) > STRAY_SHOWN else ""
     return raw[:STRAY_SHOWN].hex(" ") + more
 

@@ -59,7 +59,7 @@ class NodeMap:
         self.pdos = self._find()
 
     def learn(self, index: int, subindex: int, data: bytes) -> bool:
-        """An object's value was seen; True when it changed the node's PDOs."""
+        """Note an object's observed value; return True when it changed the node's PDOs."""
         if index not in _PARAMETERS or not 1 <= len(data) <= 4:
             return False
         value = int.from_bytes(data, "little")
@@ -72,7 +72,7 @@ class NodeMap:
     def value(
         self, index: int, subindex: int, data: bytes, t_ns: int
     ) -> tuple[dict[str, Scalar | None], Scalar | None]:
-        """Tags by name, and the value: the tag's, or by the EDS's type, or in hex."""
+        """Return tags by name, and the value: the tag's, or by the EDS's type, or in hex."""
         tags = self.tags.of_object(index, subindex, data, t_ns)
         if tags:
             return tags, next(iter(tags.values()))

@@ -74,7 +74,7 @@ class SdoWatch:
         return now
 
     def request(self, data: bytes, t_ns: int) -> Seen:
-        """A frame of the client's."""
+        """Decode a frame of the client."""
         if len(data) < 8:
             return Seen(f"an SDO request of {len(data)} bytes")
         first, kind, now = data[0], data[0] >> 5, self.open
@@ -100,7 +100,7 @@ class SdoWatch:
         return Seen("an SDO request that does not fit its transfer")
 
     def reply(self, data: bytes, t_ns: int) -> Seen:
-        """A frame of the server's."""
+        """Decode a frame of the server."""
         now = self.open
         if len(data) < 4:
             return Seen(f"an SDO reply of {len(data)} byte{'s' * (len(data) != 1)}", stray=True)

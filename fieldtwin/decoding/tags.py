@@ -40,7 +40,7 @@ class TagMap:
         self._scales = {t.scale_by for t in profile.tags.values() if t.scale_by}
 
     def names(self, span: Span) -> list[str]:
-        """Tags, messages and mailboxes that lie in `span` as wholes, and objects of these names."""
+        """Return the tags, messages and mailboxes that lie completely in `span`, and objects by name."""
         if span.table == "object":
             tag = self.by_object.get((span.address, span.subindex))
             return [tag.name] if tag else []
@@ -57,7 +57,7 @@ class TagMap:
         return any(_touches(tag, span) for tag in self._secrets)
 
     def secrets(self, spans: Iterable[Span]) -> frozenset[str]:
-        """`Exchange.secrets` of an exchange that touches `spans`."""
+        """Return `Exchange.secrets` of an exchange that touches `spans`."""
         if not self._secrets:
             return frozenset()
         found = {tag.name for span in spans for tag in self._secrets if _touches(tag, span)}
@@ -87,7 +87,7 @@ class TagMap:
         return {tag.name: self._scaled(tag, decode_little(tag, data, t_ns))}
 
     def show(self, values: dict[str, Scalar | None]) -> str:
-        """``pressure 12.5 dbar, state 1 (sampling)``."""
+        """Return a text such as ``pressure 12.5 dbar, state 1 (sampling)``."""
         return ", ".join(f"{name} {self._show(name, value)}" for name, value in values.items())
 
     def _show(self, name: str, value: Scalar | None) -> str:

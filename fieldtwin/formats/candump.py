@@ -33,7 +33,7 @@ class LeftOut:
 
 
 def line_of(t_ns: int, frame: CanFrame, channel: str = "can0") -> bytes:
-    """A frame's line, newline included. An error frame is written as candump does it: its class with the error flag."""
+    """Return a frame's line, newline included. An error frame is written as candump does: its class with the error flag."""
     seconds, ns = divmod(t_ns, NS_PER_S)
     if frame.error:
         text = f"{frame.can_id | _ERROR_FLAG:08X}#{frame.data.hex().upper()}"
@@ -81,7 +81,7 @@ def read_log(path: Path, left: LeftOut | None = None) -> Iterator[tuple[int, str
 
 
 def _frame(identifier: bytes, body: bytes) -> CanFrame | None:
-    """The frame; None for an error frame, and for an identifier that no frame can have."""
+    """Return the frame; None for an error frame, and for an invalid identifier."""
     can_id, extended = int(identifier, 16), len(identifier) == 8
     if can_id & _ERROR_FLAG or can_id > (0x1FFFFFFF if extended else 0x7FF):
         return None

@@ -176,7 +176,7 @@ class _Lines:
             self._progress(min(self._raw.tell(), self._total), self._total)
 
     def invalid(self, message: str, *, expected: str = "", got: str = "", line: int | None = None) -> FileInvalid:
-        """The error for the present line."""
+        """Return the error for the current line."""
         at = self.number if line is None else line
         return FileInvalid(message, path=str(self.path), line=at, expected=expected, got=got)
 

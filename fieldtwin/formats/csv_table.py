@@ -76,7 +76,7 @@ def import_csv(
 def _copy(
     rows: Iterator[tuple[int, list[str]]], clock: _Clock, chosen: Mapping[str, int], writer: RecordingWriter, path: Path
 ) -> tuple[float, int]:
-    """The last time, and how many fields had no number."""
+    """Copy the rows; return the last time, and the number of fields without a number."""
     bad, last_s = 0, 0.0
     for number, row in rows:
         t_s = clock.seconds(number, row)
@@ -97,7 +97,7 @@ def _open(path: Path) -> BinaryIO:
 
 
 def _rows(path: Path, file: BinaryIO) -> Iterator[tuple[int, list[str]]]:
-    """(line, fields) of each row that is not empty."""
+    """Yield (line, fields) of each row that is not empty."""
     number, delimiter = 0, ""
     while line := file.readline(MAX_LINE + 1):
         number += 1
@@ -122,13 +122,13 @@ def _chain(first: tuple[int, list[str]], rest: Iterator[tuple[int, list[str]]]) 
 
 
 def _split(column: str) -> tuple[str, str]:
-    """(name, unit) of ``pressure (dbar)``."""
+    """Return (name, unit) of ``pressure (dbar)``."""
     found = _NAME.fullmatch(column)
     return (found[1], found[2] or "") if found else (column, "")
 
 
 def _column(names: list[str], wanted: str) -> int:
-    """The place of a column by its name, with or without its unit, or by ``#3``."""
+    """Return the index of a column by its name, with or without its unit, or by ``#3``."""
     if wanted.startswith("#") and wanted[1:].isdigit() and 1 <= int(wanted[1:]) <= len(names):
         return int(wanted[1:]) - 1
     for i, name in enumerate(names):

@@ -45,7 +45,7 @@ class Fragments:
         return self._whole(key, packet)
 
     def finish(self) -> None:
-        """Nothing follows."""
+        """Drop the incomplete packets at the end of the capture."""
         self.given_up += len(self._open)
         self._open.clear()
 

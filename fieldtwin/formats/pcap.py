@@ -91,7 +91,7 @@ def captured_of(line: dict[str, object]) -> Captured:
 
 
 def _frame(text: str, data: bytes, *, error: bool) -> CanFrame:
-    """A frame from candump's notation: ``705#7F``, ``605#R8``, eight digits of identifier for the extended format."""
+    """Parse a frame in candump's notation: ``705#7F``, ``605#R8``, eight digits of identifier for the extended format."""
     identifier, _, body = text.partition("#")
     remote = body.startswith("R")
     dlc = int(body[1:] or "0") if remote else len(data)
@@ -108,7 +108,7 @@ class Packet:
 
 
 def link_type(endpoint: Endpoint) -> int:
-    """The link type of the file that a capture of `endpoint` becomes."""
+    """Return the link type of the file for a capture of `endpoint`."""
     if endpoint.is_can:
         return LINKTYPE_CAN_SOCKETCAN
     return LINKTYPE_ETHERNET if endpoint.scheme == "tcp" else LINKTYPE_USER0
@@ -152,7 +152,7 @@ def write_pcap(path: Path, captured: Iterable[Captured], endpoint: Endpoint, utc
 
 
 def socketcan(frame: CanFrame) -> bytes:
-    """A frame as LINKTYPE_CAN_SOCKETCAN has it: identifier and flags, length, three spare bytes, data."""
+    """Return a frame as LINKTYPE_CAN_SOCKETCAN: identifier and flags, length, three spare bytes, data."""
     flags = frame.extended << 31 | frame.remote << 30 | frame.error << 29
     return struct.pack(">IBxxx", frame.can_id | flags, frame.dlc) + frame.data
 
@@ -163,7 +163,7 @@ Chunk = tuple[int, Direction, bytes]
 
 
 def _turns(chunks: Iterable[Chunk]) -> Iterator[Packet]:
-    """On a line with one master every chunk sent is a frame, and so is all that was received before the next one."""
+    """Yield a packet for each sent chunk of a line, and one for all bytes received before the next."""
     reply, reply_ns = b"", 0
     for t_ns, direction, data in chunks:
         if direction is Direction.RECEIVED:
@@ -182,7 +182,7 @@ def _turns(chunks: Iterable[Chunk]) -> Iterator[Packet]:
 
 
 def _tcp_packets(chunks: Iterable[Chunk]) -> Iterator[Packet]:
-    """The chunks as the segments of one connection that the gateway opened just before the first of them."""
+    """Yield the chunks as segments of one connection that the gateway opened just before the first of them."""
     sequence = {_CLIENT: 1000, _SERVER: 2000}
 
     def segment(t_ns: int, source: bytes, flags: int, data: bytes = b"") -> Packet:
@@ -221,7 +221,7 @@ def _ethernet(source: bytes, target: bytes, tcp: bytes) -> bytes:
 
 
 def internet_checksum(data: bytes) -> int:
-    """The one's complement of the one's complement sum of 16-bit words (RFC 1071)."""
+    """Return the one's complement of the one's complement sum of 16-bit words (RFC 1071)."""
     padded = data + b"\0" * (len(data) % 2)
     total: int = sum(struct.unpack(f">{len(padded) // 2}H", padded))
     while total >> 16:

@@ -50,7 +50,7 @@ class _Asked:
         return 2 if "32-bit" in self.kind else 1
 
     def exchange(self, number: int, cells: dict[int, str], failed: str) -> Exchange:
-        """The poll with these values, or this failure."""
+        """Return the poll with these values, or this failure."""
         registers = self.count * self.width
         address = self.start - 1 if self.start else 0
         request = struct.pack(">BHH", self.function, address, registers)
@@ -126,7 +126,7 @@ def _read_head(asked: _Asked, text: str) -> None:
 
 
 def _number(text: str) -> int:
-    """``0x0003``, ``3``, ``-5``, ``65531 (-5)``."""
+    """Parse ``0x0003``, ``3``, ``-5``, ``65531 (-5)``."""
     first = text.split()[0]
     return int(first, 16) if first.lower().startswith("0x") else int(first)
 

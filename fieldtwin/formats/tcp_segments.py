@@ -153,7 +153,7 @@ class Conversations:
         self._paths: dict[bytes, _Path] = {}
 
     def packet(self, t_ns: int, link: int, data: bytes) -> None:
-        """The next packet of the capture."""
+        """Add the next packet of the capture."""
         self.counters.packets += 1
         if link == LINK_ETHERNET and len(data) >= 54 and data[12:15] == _PLAIN_IP4 and data[23] == _TCP:
             if not self._next_segment(t_ns, data):
@@ -208,7 +208,7 @@ class Conversations:
             self._paths[data[26:38]] = _Path(conversation, sender, segments[sender], segments[other])
 
     def finish(self) -> None:
-        """The capture is over."""
+        """Conclude the capture."""
         self._fragments.finish()
         self.counters.fragments = self._fragments.given_up
         for key in list(self._open):

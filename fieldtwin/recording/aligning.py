@@ -191,7 +191,7 @@ class Dialogue:
             series.wraps = any((request, series.shift) in certain for request in series.asked)
 
     def _expected(self, recorded: Exchange, other: Exchange, seen: dict[Cell, int]) -> Exchange | None:
-        """The recorded exchange with the values of the positions that were found."""
+        """Return the recorded exchange with the values of the positions that were found."""
         both = _values(recorded), _values(other)
         if both[0] is None or both[1] is None or len(both[0][1]) != len(both[1][1]):
             return recorded
@@ -224,7 +224,7 @@ def _values(exchange: Exchange) -> tuple[Span, list[int]] | None:
 
 
 def _reply(function: int, values: Sequence[int]) -> bytes:
-    """The reply to a read with these values (AP 6.1 to 6.4)."""
+    """Return the reply to a read with these values (AP 6.1 to 6.4)."""
     if function in (3, 4):
         data = b"".join(value.to_bytes(2) for value in values)
     else:

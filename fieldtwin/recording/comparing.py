@@ -147,7 +147,7 @@ class Comparer:
         self._unwritten: set[tuple[int, str, int]] = set()
 
     def add(self, recorded: Exchange | None, other: Exchange | None) -> None:
-        """One exchange on both sides; None where a side does not have it."""
+        """Compare one exchange of both sides; None if a side does not have it."""
         result = self._result
         if recorded is None:
             result.extra += other is not None
@@ -275,7 +275,7 @@ class Comparer:
 
 
 def judge_latencies(result: Comparison, kept: Mapping[str, tuple[array[float], array[float]]], rules: Rules) -> None:
-    """The rows of `result.latency` and its `timing`, from the latencies of each service on both sides."""
+    """Fill the rows of `result.latency` and its `timing` from the latencies of each service on both sides."""
     weighed, count = 0.0, 0
     result.latency = []
     for service, (recorded, other) in kept.items():

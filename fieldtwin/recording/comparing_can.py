@@ -61,7 +61,7 @@ class _Side:
         self.began_ns = -1
 
     def transfers(self) -> Iterator[Exchange]:
-        """Once; afterwards `kinds` are complete."""
+        """Yield the transfers, once; afterwards `kinds` is complete."""
         wire = CanopenWire("can", ())
         for t_ns, frame in self._frames:
             self.began_ns = t_ns if self.began_ns < 0 else self.began_ns

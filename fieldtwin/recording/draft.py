@@ -51,7 +51,7 @@ class Drafts:
         self.units: dict[int, _Unit] = {}
 
     def note(self, exchange: Exchange) -> None:
-        """One more exchange of the recording."""
+        """Add one more exchange of the recording."""
         unit = self.units.get(exchange.unit)
         if unit is None:
             if len(self.units) >= MAX_UNITS or exchange.reply == b"":
@@ -103,7 +103,10 @@ class Drafts:
             seen.last = word
 
     def texts(self, name: str, origin: str) -> dict[int, str]:
-        """YAML of a profile for each unit that answered a read or a write. `name` becomes part of the device's name."""
+        """Return the YAML of a profile for each unit that answered a read or a write.
+
+        `name` becomes part of the device's name.
+        """
         made = {unit_id: _text(unit, unit_id, name, origin) for unit_id, unit in sorted(self.units.items())}
         return {unit_id: text for unit_id, text in made.items() if text}
 

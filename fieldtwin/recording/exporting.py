@@ -125,7 +125,7 @@ def _exchange_rows(path: Path) -> Rows:
 
 
 def _tag_rows(path: Path, profile: DeviceProfile, names: list[str]) -> Rows:
-    """A row an exchange: the tags that it carried."""
+    """Yield a row for each exchange: the tags that it carried."""
     tags = TagMap(profile)
     for e in exchanges_of(path):
         asked, found = parse_request(e.request), dict[str, Scalar | None]()

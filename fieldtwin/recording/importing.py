@@ -53,7 +53,10 @@ class TextSummary:
 
 
 def kind_of(path: Path) -> str:
-    """packets, can, csv, cnv, polls or capture. Raises `UsageError`, or `FileInvalid` where the file cannot be read."""
+    """Return packets, can, csv, cnv, polls or capture.
+
+    Raises `UsageError`, or `FileInvalid` where the file cannot be read.
+    """
     name = path.name.lower()
     if name.endswith(CNV):
         return "cnv"
@@ -158,7 +161,7 @@ def _framing(path: Path, endpoint: Endpoint) -> str:
 
 
 def endpoints_of(path: Path) -> list[Endpoint]:
-    """The endpoints of a capture, in the order in which they are met; 64 at most."""
+    """Return the endpoints of a capture, in the order of their first appearance; 64 at most."""
     found: dict[Endpoint, None] = {}
     for captured in _captured(path):
         if len(found) < 64:
@@ -273,7 +276,7 @@ class BadFile:
             self.path.unlink(missing_ok=True)
 
     def keep(self, bad: Bad, endpoint: str = "") -> None:
-        """One more of them."""
+        """Add one more frame."""
         if self._file is None:
             self.path.unlink(missing_ok=True)
             self._file = RotatingFile(self.path)

@@ -34,7 +34,7 @@ Cell = tuple[str, int]
 
 
 def cells_written(request: bytes) -> set[Cell]:
-    """The registers and bits that a request writes."""
+    """Return the registers and bits that a request writes."""
     span = parse_request(request).write_span
     return {(span.table, span.address + i) for i in range(span.count)} if span is not None else set()
 
@@ -119,7 +119,7 @@ class _Kept(Tap):
 
 
 def transfers_of(frames: Frames, node: int | None) -> Iterator[Transfer]:
-    """The SDO transfers of a log, of `node` or of all."""
+    """Yield the SDO transfers of a log, of `node` or of all."""
     wire = CanopenWire("can", ())
     for t_ns, frame in frames:
         for exchange in wire.feed(frame, t_ns)[1]:

@@ -105,7 +105,7 @@ class LogSheet:
     # -- the text -----------------------------------------------------------------------------------------------------
 
     def eds(self, name: str) -> str:
-        """The data sheet; `name` is the product's."""
+        """Return the data sheet; `name` is the product's."""
         indices: dict[int, dict[int, str]] = {}
         for (index, subindex), what in self._objects.items():
             size = next(iter(what.sizes)) if len(what.sizes) == 1 else 0

@@ -50,7 +50,7 @@ class ModbusTalk:
         return self._catch_up()
 
     def finish(self) -> list[Exchange]:
-        """Nothing follows."""
+        """Conclude the conversation."""
         if self.pairer is None and not self.foreign and self._seen and self._known_port:
             self._settle(self._framing_of_port())
             return [*self._catch_up(), *self.finish()]

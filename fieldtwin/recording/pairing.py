@@ -71,7 +71,7 @@ class Pairer(ABC):
 
     @abstractmethod
     def finish(self) -> list[Exchange]:
-        """Nothing follows."""
+        """Conclude the connection: requests that still wait have no answer."""
 
     def lost(self, sent: bool) -> None:  # noqa: B027 - only a stream can lose its place
         """Note that bytes of one direction are missing (a capture dropped packets): an open frame stays incomplete."""
@@ -152,7 +152,7 @@ class MbapPairer(Pairer):
         self._open[transaction] = (t_ns, unit, pdu)
 
     def _give_up(self, found: list[Exchange]) -> None:
-        """The oldest request had no answer, or has waited with its answer."""
+        """Complete the oldest request: it has no answer, or its answer has waited for its turn in order."""
         transaction = next(iter(self._open))
         t_ns, unit, request = self._open.pop(transaction)
         done = self._done.pop(transaction, None)

@@ -222,7 +222,7 @@ async def _rounds(
 
 
 async def _reopened(work: Callable[[], Awaitable[None]], counters: PollCounters, stop: asyncio.Event) -> None:
-    """`work`, again when its connection is lost."""
+    """Run `work`, and run it again when its connection is lost."""
     pause_s = FIRST_PAUSE_S
     while True:
         done = counters.rounds

@@ -108,7 +108,7 @@ class RotatingFile:
 
 
 def part(path: Path, number: int) -> Path:
-    """The name of a recording's part; number 0 is the recording itself."""
+    """Return the name of a recording's part; number 0 is the recording itself."""
     return path.with_name(f"{path.stem}.{number:04d}{path.suffix}") if number else path
 
 
@@ -133,13 +133,13 @@ def oldest_part(path: Path) -> Path:
 
 
 def header_of(path: Path) -> RecordingHeader:
-    """The header of the recording at `path`. Raises `FileInvalid`."""
+    """Return the header of the recording at `path`. Raises `FileInvalid`."""
     with RecordingReader(oldest_part(path)) as reader:
         return reader.header
 
 
 def exchanges_of(path: Path) -> Iterator[Exchange]:
-    """The exchanges of all parts of a recording, in order. Raises `FileInvalid`."""
+    """Yield the exchanges of all parts of a recording, in order. Raises `FileInvalid`."""
     for found in parts_of(path):
         with RecordingReader(found) as reader:
             yield from reader.exchanges()

@@ -68,7 +68,7 @@ class LineSink:
         self._head: dict[str, object] | None = {"started": started, "t_ns": now_ns, "command": words}
 
     def saw(self, direction: Direction, t_ns: int, data: bytes) -> None:
-        """`data` passed in that direction: SENT is towards the device."""
+        """Write `data` that passed in that direction: SENT is towards the device."""
         if self._head is not None:  # written with the first bytes: a tap that was never connected leaves no file
             head, self._head = self._head, None
             self._line(t_ns, head)

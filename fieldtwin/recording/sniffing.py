@@ -45,7 +45,7 @@ class Directions:
         return self.flush()
 
     def flush(self) -> list[tuple[Direction, Frame]]:
-        """Nothing follows."""
+        """Return the remaining bytes as frames at the end."""
         return [self._told(frame) for frame in self._splitter.flush()]
 
     def _told(self, frame: Frame) -> tuple[Direction, Frame]:

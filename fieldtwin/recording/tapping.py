@@ -84,7 +84,7 @@ class LineTap:
         return await PtyEnd.open(path, serial)
 
     async def _serve(self, client: SocketEnd) -> None:
-        """One TCP master after the other."""
+        """Serve one TCP client after the other."""
         try:
             far = await self._connector.open_bytes(self._far)
         except Unreachable as e:
@@ -102,7 +102,7 @@ class LineTap:
             await far.aclose()
 
     async def _carry(self, near: ByteConnection, far: ByteConnection) -> None:
-        """Both ways; ends with the first that is lost."""
+        """Carry bytes both ways until the first connection is lost."""
         ways = [
             asyncio.ensure_future(self._one_way(near, far, Direction.SENT)),
             asyncio.ensure_future(self._one_way(far, near, Direction.RECEIVED)),

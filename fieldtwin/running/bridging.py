@@ -62,7 +62,7 @@ class BridgeOptions:
 
 
 def bridge_config(options: BridgeOptions) -> BridgeConfig:
-    """The bridge that the options ask for: reading functions only, unless writes are allowed; then every function."""
+    """Return the bridge for the options: reading functions only, unless writes are allowed; then every function."""
     functions = frozenset(range(1, 128)) if options.allow_writes else READ_FUNCTIONS
     return BridgeConfig(
         name="bridge",

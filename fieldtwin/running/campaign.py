@@ -103,7 +103,7 @@ def run_seed(campaign: Campaign, seed: int, faults: Sequence[dict[str, Any]] | N
 
 
 def _slim(campaign: Campaign, seed: int) -> ScenarioResult:
-    """Without its events: those of two hundred seeds would not fit into memory. A seed can be run again."""
+    """Run a seed and drop its events: those of two hundred seeds would not fit into memory. A seed can be run again."""
     result = run_seed(campaign, seed)
     return replace(result, trace=(), dropped=0)
 

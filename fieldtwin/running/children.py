@@ -57,7 +57,7 @@ class Child:
         return self._process.poll()
 
     def failure(self) -> ChildFailed | None:
-        """Why it ended, or None while it runs."""
+        """Return why the process ended, or None while it runs."""
         code = self.returncode
         if code is None:
             return None
@@ -88,7 +88,7 @@ class Child:
             return client
 
     async def end(self, timeout_s: float = 1.5) -> int | None:
-        """SIGTERM, then SIGKILL after `timeout_s`; the exit code."""
+        """Send SIGTERM, then SIGKILL after `timeout_s`; return the exit code."""
         if self.returncode is None:
             self._process.terminate()
         deadline = asyncio.get_running_loop().time() + timeout_s

@@ -97,7 +97,7 @@ def _message(tag: str, data: bytes) -> tuple[str, str]:
 
 
 def _input(tag: str, value: Any, bad: set[str]) -> Iterator[tuple[str, str]]:
-    """`bad` has the devices that were silenced."""
+    """Yield the steps of an input. `bad` has the devices that were silenced."""
     device = tag.partition(".")[0]
     if isinstance(value, TagValue):
         if value.quality not in (Quality.GOOD, Quality.BAD):

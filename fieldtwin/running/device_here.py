@@ -142,7 +142,7 @@ class DeviceHost:
         ] = []
 
     def modbus(self, profile: DeviceProfile, recording: Path | None) -> ModbusUnit:
-        """The unit that a Modbus profile describes."""
+        """Return the unit that a Modbus profile describes."""
         self.fault(profile)
         if self._extras.values is not None:
             return self._stated(profile, self._extras.values)
@@ -312,7 +312,7 @@ class DeviceHost:
         bitrate: int | None,
         options: NodeOptions | None = None,
     ) -> None:
-        """A CANopen node on one bus: see `can_here.stand_on_bus`."""
+        """Serve a CANopen node on one bus: see `can_here.stand_on_bus`."""
         wire = only_bus(wires)
         played: SignalPlayer | CanLog | None = None
         if recording is not None and recording.suffix == SUFFIX:

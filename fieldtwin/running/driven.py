@@ -99,7 +99,7 @@ class DrivenRun(ABC):
             self.errors.append(f"nobody caught: {context.get('message')} {context.get('exception') or ''}".strip())
 
     async def _through(self, bench: Timed, loop: VirtualLoop, judge: Callable[[], None]) -> None:
-        """To the end of the run's time, piece by piece."""
+        """Advance to the end of the run's time, piece by piece."""
         while (left_s := self._duration_s - bench.now_s()) > 0:
             await bench.sleep_until_s(bench.now_s() + min(left_s, PIECE_S))
             self.elapsed_s = bench.now_s()

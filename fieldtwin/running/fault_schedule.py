@@ -176,7 +176,7 @@ def _last_s(duration_s: float) -> float:
 def random_schedule(
     system: System, seed: int | str, duration_s: float, wanted: RandomFaults = ANY
 ) -> tuple[dict[str, Any], ...]:
-    """Faults as a fault file has them; the same for the same system, seed, duration and choice."""
+    """Return faults in the form of a fault file; the same for the same system, seed, duration and choice."""
     random = Random(f"faults {seed}")
     choices = [choice for choice in _choices(system, wanted) if choice[2]]
     last_s = _last_s(duration_s)

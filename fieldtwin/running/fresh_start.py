@@ -62,7 +62,7 @@ async def _all_read(gateway: ControlClient, since_ns: int) -> None:
 
 
 async def _not_read(gateway: ControlClient, since_ns: int) -> list[str]:
-    """The devices that are not online, or of which every value is older than that."""
+    """Return the devices that are not online, or whose values are all older than `since_ns`."""
     status: dict[str, Any] = await gateway.call("get")
     tags = (await gateway.call("watch", names=list(status["tags"])))["tags"]
     newest: dict[str, int] = {}

@@ -80,7 +80,10 @@ def judged_watches(instances: int | None) -> Check:
 
 
 def judged_processor(cpus: int, quota: float | None) -> Check:
-    """`quota`: processors that a cgroup gives at most, None for no limit. A quota stops everything until its period is over."""
+    """Judge the processors. `quota`: the processors that a cgroup allows, None for no limit.
+
+    A quota stops all processes until its period is over.
+    """
     if quota is None:
         return Check("processors", Verdict.OK, f"{cpus}, no quota")
     found = f"{cpus}, of which a cgroup gives {quota:g} at most"

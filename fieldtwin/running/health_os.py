@@ -33,7 +33,7 @@ def may_realtime() -> tuple[bool, str]:
 
 
 def most_open_files() -> int | None:
-    """The hard limit; None for no limit."""
+    """Return the hard limit of open files; None for no limit."""
     try:
         import resource
     except ImportError:
@@ -43,14 +43,14 @@ def most_open_files() -> int | None:
 
 
 def kernel_number(name: str) -> int | None:
-    """A number of /proc/sys."""
+    """Return a number of /proc/sys."""
     with suppress(OSError, ValueError):
         return int((Path("/proc/sys") / name).read_text())
     return None
 
 
 def can_interfaces() -> dict[str, bool]:
-    """The kernel's CAN interfaces, and whether each is up."""
+    """Return the kernel's CAN interfaces, and whether each is up."""
     found = {}
     for kind in sorted(Path("/sys/class/net").glob("*/type")):
         with suppress(OSError, ValueError):  # the interface may have been removed
@@ -60,14 +60,14 @@ def can_interfaces() -> dict[str, bool]:
 
 
 def cpu_count() -> int:
-    """Processors that this process may run on."""
+    """Return the number of processors that this process may run on."""
     if sys.platform.startswith("linux"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 def cgroup_quota() -> float | None:
-    """The tightest quota of our cgroup and those above it (v2), or of cgroup v1's, as processors."""
+    """Return the smallest quota of this cgroup and its parents (v2), or of cgroup v1, in processors."""
     found: list[float] = []
     with suppress(OSError):
         for line in Path("/proc/self/cgroup").read_text().splitlines():

@@ -32,7 +32,7 @@ class HostLateness:
             self._any.append((t_s, late_s))
 
     def longest_s(self, since_s: float) -> float:
-        """The longest single delay of any kind that ended after `since_s`."""
+        """Return the longest single delay of any kind that ended after `since_s`."""
         return max((late_s for t_s, late_s in self._any if t_s >= since_s), default=0.0)
 
     def own_s(self, since_s: float) -> float:

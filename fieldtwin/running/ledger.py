@@ -51,11 +51,11 @@ class Ledger:
             os.truncate(path, len(data) - len(rest))
 
     def done(self, what: str) -> set[int]:
-        """The seeds that were run of this, by this version."""
+        """Return the seeds that this version has run of `what`."""
         return {e.seed for e in self.entries if e.what == what and e.version == __version__}
 
     def add(self, what: str, hours: float, result: SeedResult) -> None:
-        """On disk before this returns."""
+        """Add a result, which is on disk when the call returns."""
         entry = Entry(
             what,
             __version__,

@@ -50,7 +50,7 @@ def what_runs(options: Options) -> str:
 
 
 def run_seed(options: Options) -> SeedResult:
-    """One run, whole."""
+    """Make one complete run."""
     run = options.make()
     run.run()
     summary = run.summary()

@@ -85,13 +85,13 @@ class NetworkBench:
         return self.parts[member], local
 
     def now_ns(self) -> int:
-        """Since the start."""
+        """Return the time since the start."""
         return round(self.now_s() * NS_PER_S)
 
     # -- Bench ----------------------------------------------------------------------------------------------------------
 
     def now_s(self) -> float:
-        """The first system began first."""
+        """Return the time of the first system, which began first."""
         return next(iter(self.parts.values())).bench.now_s()
 
     async def sleep_until_s(self, t_s: float) -> None:

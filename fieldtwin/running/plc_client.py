@@ -42,7 +42,7 @@ def _accepts(path: Path) -> bool:
 
 
 def choose(instance: str) -> Path:
-    """The PLC's socket of an instance; without a name, of the only one. Raises `UsageError`, `Unreachable`."""
+    """Return the PLC socket of an instance, or of the only one without a name. Raises `UsageError`, `Unreachable`."""
     found = running_instances()
     if not instance:
         if len(found) > 1:
@@ -81,7 +81,10 @@ async def step_and_wait(call: Callable[..., Awaitable[Any]], count: int, by: str
 
 
 def parse_value(text: str, words: Sequence[str] = ()) -> bool | int | float:
-    """``true``, ``false``, a number in decimal or 0x. Raises `UsageError`; `words` would have been understood, too."""
+    """Parse ``true``, ``false``, or a number in decimal or 0x.
+
+    Raises `UsageError`; `words` are the values that its message lists as expected.
+    """
     if text.lower() in ("true", "false"):
         return text.lower() == "true"
     try:

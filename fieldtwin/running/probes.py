@@ -89,7 +89,7 @@ class Probes:
         return f"the probe {bus.config.name} at {bus.config.endpoint}: {error or 'no answer yet'}"
 
     def changes(self, start_ns: int) -> list[Event]:
-        """TAG events since the last call, in ns since `start_ns`."""
+        """Return the TAG events since the last call, in ns since `start_ns`."""
         events = [Event(t_ns - start_ns, Kind.TAG, name, data) for t_ns, name, data in self._events]
         self._events.clear()
         return events

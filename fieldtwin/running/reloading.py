@@ -51,7 +51,7 @@ async def reload(gateway: ControlClient, plc: ControlClient | None, by: str, *, 
 
 
 def _of_program(source: dict[str, str]) -> dict[str, Any]:
-    """A program's file that is not the one that runs, as a change that a reload cannot take over."""
+    """Return a changed file of a running program as a change that a reload cannot apply."""
     what = f"plc.programs.{source['program']}: its file changed since the PLC read it ({source['cure']})"
     return {"where": source["path"], "what": what, "live": False}
 

@@ -67,7 +67,7 @@ class RunJudge:
             run.attach(benches[name])
 
     async def watch(self) -> None:
-        """Often enough that no journal forgets; until cancelled."""
+        """Check often enough that no journal overflows; until cancelled."""
         while True:
             for name, run in self._runs.items():
                 run.judge(self._benches[name])

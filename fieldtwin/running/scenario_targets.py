@@ -242,7 +242,7 @@ def _with_what_was_in(result: ScenarioResult, bench: ControlBench) -> ScenarioRe
 
 
 def _session(scenario: Scenario, target: Target) -> RunSession:
-    """The system, brought up for this scenario."""
+    """Return the run of the system for this scenario."""
     name = f"test-{os.getpid()}"
     seed = target.seed if target.seed is not None else scenario.form.seed
     plant = target.name == "real"
@@ -262,7 +262,7 @@ def _session(scenario: Scenario, target: Target) -> RunSession:
 
 
 def _field_config(scenario: Scenario, target: Target) -> FieldConfig:
-    """The simulated field devices, for the user's program."""
+    """Return the configuration of the simulated field devices for the user's program."""
     system, file = scenario.system, prototype_of(scenario)
     cans = [name for name, bus in system.buses.items() if bus.endpoint.is_can and target.can]
     return FieldConfig(
@@ -276,7 +276,7 @@ def _field_config(scenario: Scenario, target: Target) -> FieldConfig:
 
 
 async def _running(scenario: Scenario, target: Target) -> Where:
-    """One that runs already, under its name on this host (in its container, for `compose`)."""
+    """Return the access to a running instance, by its name on this host (in its container, for `compose`)."""
     plant = target.name == "real"
     run_dir = runtime_root() / (target.instance or scenario.system.name)
     host, socket, foreign = target.field_host, None, False

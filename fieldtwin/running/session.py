@@ -184,7 +184,7 @@ class RunSession(Started):
                 await self._field.client.call("fault", fault=fault, start_ns=self.started_ns)
 
     async def _start_thread(self, run_dir: Path) -> None:
-        """The plant's side of the digital thread, a watcher of the process image."""
+        """Start the plant's side of the digital thread, which observes the process image."""
         o = self.options
         config = PlantThreadConfig(
             system=str(self.system.path.resolve()),
@@ -407,7 +407,7 @@ class RunSession(Started):
         self.counted_before, self.clients_before = {}, {}
 
     async def _get(self, client: ControlClient | None, name: str, **args: Any) -> dict[str, Any] | None:
-        """The status of a process. One that does not answer is an error of the run; `name` is empty for one watched elsewhere."""
+        """Return the status of a process, and record an error without an answer; `name` is empty if monitored elsewhere."""
         if client is None:
             return None
         try:
@@ -443,7 +443,7 @@ class RunSession(Started):
             pass  # as above; the next query reports a loss
 
     async def reload(self, by: str) -> Reloaded:
-        """The gateway reads its files again (`fieldtwin.running.reloading`); no poll is lost by that."""
+        """Make the gateway read its files again (`fieldtwin.running.reloading`); no poll is lost."""
         if "gateway" not in self._clients:
             raise Unreachable("the gateway is gone")
         # own connection: statuses are queried meanwhile

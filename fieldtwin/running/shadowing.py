@@ -90,7 +90,7 @@ class Shadowing:
         )
 
     async def _thread(self, store: KnowledgeStore, carrier: Carrier) -> ThreadEnd:
-        """This side of the thread: it receives, and has no log to send."""
+        """Return this side of the thread: it receives, and has no log to send."""
         return ThreadEnd(store, carrier, schema_of(self._system), self.clock, on_events=self._arrived, insists=False)
 
     async def run(self, stop: asyncio.Event, for_s: float = 0.0) -> None:

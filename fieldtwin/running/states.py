@@ -56,12 +56,12 @@ class StateWatch:
                 self._reader = None
 
     def knows(self, layout: ImageLayout) -> None:
-        """The names of each program's states are those of this process image."""
+        """Use the names of each program's states in this process image."""
         self._words = state_words(layout, self._programs)
 
     @property
     def programs(self) -> list[str]:
-        """Programs that have named states."""
+        """The programs that have named states."""
         return list(self._words)
 
     @property
@@ -85,7 +85,7 @@ class StateWatch:
                 self.note(program, words[value], now_ns)
 
     def note(self, program: str, state: str, now_ns: int) -> None:
-        """A program is in `state` now."""
+        """Record that a program is in `state` now."""
         self._first_ns = self._first_ns or now_ns
         if self.current.get(program) == state:
             return
@@ -95,5 +95,5 @@ class StateWatch:
             seen.append(((now_ns - self._first_ns) / 1e9, state))
 
     def sequence(self, program: str) -> list[str]:
-        """The states of a program in the order in which it was in them."""
+        """Return the states of a program in the order in which it was in them."""
         return [state for _, state in self.transitions.get(program, [])]

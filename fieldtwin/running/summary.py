@@ -194,7 +194,7 @@ def _devices(gateway: dict[str, Any], field: dict[str, Any]) -> dict[str, Any]:
 
 
 def _exchanges(run: Run) -> dict[str, Any]:
-    """Requests and replies a bus, as counted by the gateway and by the emulators on it."""
+    """Return the requests and replies per bus, as counted by the gateway and by its emulators."""
     gateway, field = run.gateway_status or {}, run.field_status or {}
     out: dict[str, Any] = {}
     for name, bus in gateway.get("buses", {}).items():
@@ -304,7 +304,7 @@ def _device_checks(gateway: dict[str, Any], disturbed: bool) -> list[str]:
 
 
 def _output_checks(gateway: dict[str, Any]) -> list[str]:
-    """An output that the device does not hold at the end, though it may be written and the device is there."""
+    """Return the outputs that an online device does not hold at the end, although they may be written."""
     devices = gateway.get("devices", {})
     return [
         f"{o['tag']}: {o['wanted']:g} was commanded by {o['by']}, and the device does not hold it"

@@ -145,7 +145,7 @@ class Bench:
 
 
 def _as_held(tag: Tag, value: float) -> float | int | bool:
-    """`value` as the tag's type holds it, in engineering units: to the nearest step of an integer."""
+    """Return `value` as the tag's type holds it, in engineering units: rounded to the nearest step of an integer."""
     if tag.type == "bool":
         return bool(value)
     if tag.type.startswith("float") or math.isnan(value) or tag.scale_by is not None:
@@ -155,5 +155,5 @@ def _as_held(tag: Tag, value: float) -> float | int | bool:
 
 
 def new_folder() -> Path:
-    """A folder for a bench, with a path short enough for sockets and links."""
+    """Return a new folder for a bench, with a path short enough for sockets and links."""
     return Path(tempfile.mkdtemp(prefix="ft-test-"))

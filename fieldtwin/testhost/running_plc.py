@@ -103,14 +103,14 @@ class RunningPlc:
         return found
 
     async def tag(self, name: str) -> dict[str, Any]:
-        """One of them now: ``value`` (a state by its name), ``quality``, ``reason``, ``age_s``, ``unit``, ``forced``."""
+        """Return ``value`` (a state by its name), ``quality``, ``reason``, ``age_s``, ``unit``, ``forced`` of a tag."""
         row = (await self._call("image", tags=[name]))["tags"][-1]
         words = dict(row["words"])
         value = row["value"]
         return {**row, "value": words.get(str(value), words.get(value, value)), "words": list(words.values())}
 
     async def steer(self, verb: str, args: dict[str, Any]) -> dict[str, Any]:
-        """One of `STEERING`."""
+        """Execute one of the commands in `STEERING`."""
         if verb not in STEERING:
             raise UsageError(f"no way to steer a PLC: {verb!r}", expected=", ".join(STEERING))
         if verb == "step":

@@ -78,7 +78,7 @@ class Device:
         return self._runner.call("held", id=self._bench, device=self.name, tag=tag)
 
     def fault(self, name: str, **more: Any) -> AbstractContextManager[str]:
-        """``with device.fault("silence"):``; see `Wire.fault`."""
+        """Inject a fault: ``with device.fault("silence"):``; see `Wire.fault`."""
         return self.wire.fault(name, **more)
 
     def __repr__(self) -> str:
@@ -98,7 +98,7 @@ class Prototype:
         self._devices = {name: Device(runner, description["id"], name, description) for name in description["devices"]}
 
     def __getitem__(self, name: str) -> Device:
-        """A device by its name in the system file."""
+        """Return a device by its name in the system file."""
         __tracebackhide__ = True
         try:
             return self._devices[name]
@@ -112,7 +112,7 @@ class Prototype:
         return len(self._devices)
 
     def fault(self, name: str, **more: Any) -> AbstractContextManager[str]:
-        """``with prototype.fault("silence", device="ctd"):``; see `Wire.fault`."""
+        """Inject a fault: ``with prototype.fault("silence", device="ctd"):``; see `Wire.fault`."""
         return self.wire.fault(name, **more)
 
 
@@ -126,7 +126,10 @@ class Plc:
     def __init__(
         self, runner: Runner, source: str, folders: tuple[str, ...] = (), cycle_ms: float = 10.0, *, system: str = ""
     ) -> None:
-        """`source` as in a system file, searched in `folders`; with `system`, the name of one of its programs."""
+        """Load a program.
+
+        `source` is as in a system file, searched in `folders`; with `system`, it names one of its programs.
+        """
         answer = runner.call("program", source=source, folders=list(folders), cycle_ms=cycle_ms, system=system)
         self.id: int = answer["id"]
         self.values: dict[str, Any] = answer["values"]

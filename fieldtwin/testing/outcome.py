@@ -46,7 +46,7 @@ class Outcome:
         return self.verdict == "passed"
 
     def __bool__(self) -> bool:
-        """``assert scenario("file.scenario.yaml")``."""
+        """Return whether the scenario passed, for ``assert scenario("file.scenario.yaml")``."""
         return self.passed
 
     def __str__(self) -> str:

@@ -26,7 +26,7 @@ class Results:
         self._problem = ""
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        """The worst of a test's phases counts."""
+        """Record the worst of a test's phases."""
         if report.when != "call" and report.passed:
             return
         properties = list(report.user_properties)

@@ -224,7 +224,7 @@ def _check(like: dict[str, Any]) -> None:
 
 
 def _keys(more: dict[str, Any]) -> dict[str, Any]:
-    """Keyword arguments as a fault file's keys: ``from_`` is a word of Python's."""
+    """Return keyword arguments as a fault file's keys; ``from_`` stands for ``from``, a Python keyword."""
     return {key.removesuffix("_"): value for key, value in more.items()}
 
 

@@ -31,7 +31,7 @@ from fieldtwin.report.model import Verdict
 from fieldtwin.report.style import style
 
 MOST_LINES = 60
-"""Of one case's bytes."""
+"""Maximum number of lines of one case's bytes."""
 
 
 def write_html(subject: Subject, results: Sequence[DeviceResult], reproduce: str, path: Path) -> None:

@@ -20,7 +20,7 @@ from fieldtwin.gateway.core.errors import Unreachable
 MOST_SPOKEN = 400
 """Maximum number of chunks or frames that are kept of a case; later ones are dropped."""
 MOST_BYTES = 512
-"""Of one chunk."""
+"""Maximum number of bytes that are kept of one chunk."""
 MOST_LOST = 3
 """Number of cases before which the device could not be recovered; then the run stops."""
 

@@ -71,9 +71,10 @@ def by_weight(results: Sequence[R]) -> list[R]:
 
 
 def case_table(results: Sequence[R], does: str, folded: Callable[[R], Markup | str]) -> Markup:
-    """Return the table of all cases; cases for other wires are only named below it.
+    """Return the table of all cases; cases for other transports are only named below it.
 
-    `does` is the heading of what was done in a case, and `folded` returns what follows the reason in its last column.
+    `does` is the heading of the device's actions in a case, and `folded` returns the text after the reason in its last
+    column.
     """
     elsewhere = [r for r in results if r.reason == OTHER_WIRE]
     columns = ("case", "verdict", "basis", "danger", does, "expected", "source", "found")

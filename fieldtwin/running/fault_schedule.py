@@ -25,7 +25,7 @@ MEAN_S = 120.0
 """Mean number of seconds between two faults."""
 SHORTEST_S, LONGEST_S = 0.5, 20.0
 CALM_S = 120.0
-"""Without faults at the end."""
+"""Time in seconds without faults at the end."""
 MOST = 500
 WATER_MEAN_S = 300.0
 LONGEST_IN_WATER_S = 60.0

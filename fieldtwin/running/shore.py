@@ -33,7 +33,7 @@ IDLE_S = 60.0
 KEPT_RESPONSES = 1000
 DEFAULT_SCRIPT = (1, 2, 0, -1)
 SCRIPT_TIMES = (0.1, 0.35, 0.65, 0.82)
-"""When the commands of a script are sent, as parts of the run: time for each state to be seen, and for the last to arrive."""
+"""The times of a script's commands, as parts of the run: enough for each state to be seen, and for the last to arrive."""
 
 
 @dataclass(frozen=True)

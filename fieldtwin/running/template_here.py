@@ -107,7 +107,7 @@ def agree(
 
 
 def _templates_above(*files: Path | None) -> list[Path]:
-    """The folders of the templates that these files are in, however deep."""
+    """Return the folders of the templates that contain these files, at any depth."""
     found: dict[Path, None] = {}
     for file in files:
         if file is not None and file.is_file():

@@ -145,7 +145,7 @@ class VirtualBench(Started):
         return self.loop.now_ns - self.run.started_ns
 
     def note(self, kind: Kind, where: str, data: dict[str, Any]) -> None:
-        """Something happened now."""
+        """Add an event at the current time."""
         self.trace.note(self.now_ns, kind, where, data)
 
     def _commanded(self, period_s: int) -> None:
@@ -166,11 +166,11 @@ class VirtualBench(Started):
         self.note(Kind.REFUSED, entry.tag, refusal_data(entry.describe()))
 
     def _named(self, tag: str, value: Any) -> Any:
-        """A state by its name."""
+        """Return a value; a state is replaced by its name."""
         return self._words[tag].get(value, value) if tag in self._words else value
 
     def states(self) -> dict[str, str]:
-        """Each program's state now, of those that have names."""
+        """Return the current state of each program that has named states."""
         now = {tag.removesuffix(".state"): self._named(tag, self.run.plc.outputs.current(tag)) for tag in self._words}
         return {program: state for program, state in now.items() if isinstance(state, str)}
 

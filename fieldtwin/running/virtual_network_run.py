@@ -40,7 +40,7 @@ class VirtualNetworkOptions:
     trace: Path | None = None
 
     def make(self) -> VirtualNetworkRun:
-        """The run of these options."""
+        """Return the run of these options."""
         return VirtualNetworkRun(self)
 
 
@@ -74,7 +74,7 @@ class VirtualNetworkRun(DrivenRun):
 
     @property
     def scripted(self) -> list[tuple[float, int]]:
-        """When (s) the ship commands which period; empty in a network without a ship."""
+        """The times (s) and periods of the topside modem's commands; empty in a network without one."""
         return [(one.at_s, one.period_s) for one in self.options.commands] if self.network.ship is not None else []
 
     @property

@@ -69,7 +69,7 @@ class VirtualOptions:
     field_host: str = ""
 
     def make(self) -> VirtualRun:
-        """The run of these options."""
+        """Return the run of these options."""
         return VirtualRun(self)
 
 
@@ -122,7 +122,7 @@ class VirtualRun(DrivenRun):
 
     @property
     def scripted(self) -> list[tuple[float, int]]:
-        """When (s) the remote client commands which period; empty where the prototype has no link for that."""
+        """The times (s) and periods of the remote client's commands; empty if the prototype has no link for them."""
         o = self.options
         if not o.commands or all(device.form.far is None for device in self.prototype.devices.values()):
             return []

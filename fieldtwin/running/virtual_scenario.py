@@ -95,12 +95,12 @@ async def _judged(
 
 
 def reproduce(scenario: Scenario, *more: str) -> str:
-    """The one line that runs a scenario again."""
+    """Return the command line that repeats a scenario."""
     profiles = [word for folder in scenario.profiles for word in ("--profiles", str(folder))]
     return shlex.join(["fieldtwin", "test", str(scenario.path), *more, *profiles])
 
 
 def prototype_of(scenario: Scenario) -> Path | None:
-    """The prototype file that it names, if it names one."""
+    """Return the prototype file that the scenario names, if any."""
     named = scenario.form.prototype
     return None if named is None else scenario.path.parent / named

@@ -106,7 +106,7 @@ class WithController(Started):
         )
 
     async def _end_program(self) -> None:
-        """SIGTERM for it and all that it started in its session, SIGKILL after `END_WITHIN_S` seconds."""
+        """Send SIGTERM to the program and its children in its session, and SIGKILL after `END_WITHIN_S` seconds."""
         process = self._process
         assert process is not None
         deadline_s = asyncio.get_running_loop().time() + END_WITHIN_S

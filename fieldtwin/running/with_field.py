@@ -73,7 +73,7 @@ def _word(name: str) -> str:
 
 
 def _of_endpoint(word: str, endpoint: Endpoint) -> dict[str, str]:
-    """FIELDTWIN_`word` and its kin: the short form is a path, HOST:PORT, or a CAN channel."""
+    """Return FIELDTWIN_`word` and related variables: the short form is a path, HOST:PORT, or a CAN channel."""
     parts = {"URL": str(endpoint)}
     if endpoint.is_serial:
         short = endpoint.path

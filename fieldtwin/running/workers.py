@@ -29,7 +29,7 @@ class Workers:
         self._pool = ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"), initializer=_ends_quietly)
 
     def submit(self, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> Future[T]:
-        """Have `work` done by a process that is free, or becomes so; it may be started for that."""
+        """Run `work` in a free process, or in the next one that becomes free; a process may be started for it."""
         with _sigint_held_back():
             return self._pool.submit(work, *args, **kwargs)
 

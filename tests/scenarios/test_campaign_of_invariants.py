@@ -24,7 +24,7 @@ from fieldtwin.running.virtual_scenario import run_virtual
 from fieldtwin.scenarios.form import load_scenario
 from fieldtwin.twin.site.system import load_system
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.timeout(300)]
 
 PROFILE = """device: fieldtwin/well
 source: "made for this test"

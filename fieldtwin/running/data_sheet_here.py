@@ -26,7 +26,7 @@ from fieldtwin.gateway.core.nursery import Nursery
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.recording.log_sheet import LogSheet, nodes_of
 from fieldtwin.running.can_here import only_bus, stand_on_bus
-from fieldtwin.running.until_stopped import until_stopped
+from fieldtwin.running.until_stopped import stop_signal, until_stopped
 
 DEFAULT_NODE_ID = 1
 
@@ -56,12 +56,13 @@ async def run_data_sheet(
     if log is None or options.model is not None:  # a node of a log is known by its recorded behaviour
         print_remarks(path.name, node_remarks(dictionary, node.node_id, node.context.model, options))
     closing: list[SoftBusServer | CanConnection] = []
+    stop = stop_signal()
     try:
         async with Nursery() as nursery:  # inside: servers stop before their connections close
             connection, where = await stand_on_bus(wire, bitrate or dictionary.bit_rate, path.stem, closing)
             nursery.start(serve_node(connection, node, WallClock()), f"node on {wire}")
             talk.print(f"{_named(node)} on {where}", soft_wrap=True)
-            await until_stopped(nursery)
+            await until_stopped(nursery, stop)
     finally:
         for thing in reversed(closing):
             await thing.aclose()

@@ -55,7 +55,7 @@ from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.recording.rotating import exchanges_of, header_of, oldest_part
 from fieldtwin.running.can_here import only_bus, stand_on_bus
 from fieldtwin.running.data_sheet_here import print_remarks
-from fieldtwin.running.until_stopped import until_stopped
+from fieldtwin.running.until_stopped import stop_signal, until_stopped
 from fieldtwin.twin.prototype.field import unit_limits
 from fieldtwin.twin.site.data_files import find_recording
 
@@ -87,6 +87,7 @@ async def run_device(
     CANopen node, `extras` for a Modbus device.
     """
     host = DeviceHost(speed, extras or Extras())
+    stop = stop_signal()
     try:
         async with Nursery() as nursery:  # inside: servers stop before their connections close
             wires = [Endpoint.parse(url) for url in endpoints]
@@ -107,7 +108,7 @@ async def run_device(
             if units:
                 for wire in wires:
                     await host.serve(nursery, units, wire)
-            await until_stopped(nursery)
+            await until_stopped(nursery, stop)
     finally:
         await host.aclose()
         for active in host.put_in:

@@ -8,15 +8,22 @@ import signal
 from fieldtwin.gateway.core.nursery import Nursery
 
 
-async def until_stopped(nursery: Nursery) -> None:
-    """Return at SIGINT or SIGTERM.
+def stop_signal() -> asyncio.Event:
+    """Return an event that SIGINT and SIGTERM set from now on.
+
+    Call this before the program announces where it serves: a caller that reads the announcement may send the signal at once.
+    """
+    stop = asyncio.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    return stop
+
+
+async def until_stopped(nursery: Nursery, stop: asyncio.Event) -> None:
+    """Return when `stop` is set.
 
     Raises the error of a failed child of `nursery` at once, so that no server stops silently.
     """
-    stop = asyncio.Event()
-    loop = asyncio.get_running_loop()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, stop.set)
     stopping = nursery.start(stop.wait(), "until stopped")
     failing = asyncio.ensure_future(nursery.wait())
     try:

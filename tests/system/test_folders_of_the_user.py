@@ -46,6 +46,15 @@ plc:
       source: "python: plc.control:Pump"
       inputs: {level: {tag: tank.level}}
       outputs: {valve: tank.valve}
+    alarm:
+      source: alarm.st
+      inputs: {level: {tag: tank.level}}
+"""
+ALARM = """PROGRAM alarm
+  VAR_INPUT level : REAL; END_VAR
+  VAR high : BOOL; END_VAR
+  high := level > 200.0;
+END_PROGRAM
 """
 PROTOTYPE = """prototype_of: shed.yaml
 unmapped: refuse
@@ -55,7 +64,7 @@ devices: {tank: {model: profile, values: {level: 250}}}
 SCENARIO = """scenario: the user's own program opens the valve
 system: shed.yaml
 steps:
-  - expect: {that: "tank.valve == 1", within: 5s}
+  - expect: {that: "tank.valve == 1 and alarm.high", within: 5s}
 """
 DRIVER_TEST = """import socket
 import gateway_of_mine
@@ -89,6 +98,7 @@ def site(tmp_path: Path) -> Path:
     (tmp_path / "tests" / "test_driver.py").write_text(DRIVER_TEST)
     (tmp_path / "gateway_of_mine.py").write_text("")
     (tmp_path / "tank.yaml").write_text(PROFILE)
+    (tmp_path / "alarm.st").write_text(ALARM)
     (tmp_path / "shed.yaml").write_text(SYSTEM)
     (tmp_path / "shed.prototype.yaml").write_text(PROTOTYPE)
     (tmp_path / "valve.scenario.yaml").write_text(SCENARIO)

@@ -19,9 +19,9 @@ for folder in (ROOT, ROOT / "tests" / "unit"):
 
 from infer_corpus import Map, corpus  # noqa: E402
 
-from fieldtwin.commissioning.infer import Series, infer  # noqa: E402
-from fieldtwin.commissioning.infer_calibration import fitted, kind_of  # noqa: E402
-from fieldtwin.commissioning.infer_fields import Level, Reading  # noqa: E402
+from fieldtwin.commissioning.infer.calibration import fitted, kind_of  # noqa: E402
+from fieldtwin.commissioning.infer.fields import Level, Reading  # noqa: E402
+from fieldtwin.commissioning.infer.infer import Series, infer  # noqa: E402
 
 FIT_SEED, CHECK_SEED = 1, 2
 MOST_BRIER = 0.11

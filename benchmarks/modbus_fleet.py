@@ -29,7 +29,7 @@ from peers import HERE, Goals, cpu_s, peak_mb, python, ratio, rss_mb, start, sto
 
 from fieldtwin.gateway.core.control import ControlClient
 from fieldtwin.gateway.core.endpoint import Endpoint
-from fieldtwin.running.children import Child
+from fieldtwin.run.processes.children import Child
 from fieldtwin.twin.plant.controller import ControllerConfig
 from fieldtwin.twin.plant.mapping import mapped_endpoint, mapping_to_json
 from fieldtwin.twin.plant.physical import image_layout, make_image

@@ -23,8 +23,8 @@ from statistics import median
 
 from peers import Goals
 
+from fieldtwin.capture.recordings.from_packets import PacketImport
 from fieldtwin.gateway.protocols.modbus.crc import with_crc
-from fieldtwin.recording.from_packets import PacketImport
 
 PACKETS_PER_S = 50_000
 SERVERS = 4

@@ -30,7 +30,7 @@ from typing import Any
 
 from peers import Goals, python
 
-from fieldtwin.gateway.core.image import TagKind, TagSpec
+from fieldtwin.gateway.core.image.image import TagKind, TagSpec
 from fieldtwin.plc.binding import InputBinding, image_for
 from fieldtwin.plc.config import PlcConfig, ProgramConfig
 from fieldtwin.twin.plant.physical import make_image
@@ -38,7 +38,7 @@ from fieldtwin.twin.plant.physical import make_image
 ROOT = Path(__file__).resolve().parents[1]
 PRIORITY = 10
 PROGRAM = """
-from fieldtwin.gateway.core.image import TagKind
+from fieldtwin.gateway.core.image.image import TagKind
 from fieldtwin.plc.program import Program, var_input, var_output
 
 class Copy(Program):
@@ -110,7 +110,7 @@ def asked(path: Path) -> dict[str, Any]:
 def reader(image: Path, layout: dict[str, Any]) -> Iterator[None]:
     """A process that takes snapshots of both regions as fast as it can."""
     code = (
-        "import json, mmap, sys\nfrom fieldtwin.gateway.core.image import ImageLayout\n"
+        "import json, mmap, sys\nfrom fieldtwin.gateway.core.image.image import ImageLayout\n"
         "layout = ImageLayout.from_description(json.loads(sys.argv[2]))\n"
         "file = open(sys.argv[1], 'r+b')\nmapped = mmap.mmap(file.fileno(), 0)\n"
         "image = layout.attach(memoryview(mapped))\nreaders = [image.reader(r.name) for r in layout.regions]\n"

@@ -20,7 +20,7 @@ from typing import Any
 
 from peers import Goals
 
-from fieldtwin.gateway.core.image import INPUTS, TagKind, TagSpec
+from fieldtwin.gateway.core.image.image import INPUTS, TagKind, TagSpec
 from fieldtwin.gateway.core.values import Quality, TagValue
 from fieldtwin.plc.binding import BoundProgram, InputBinding, image_for
 from fieldtwin.plc.blocks import CTU, MS, TON

@@ -23,7 +23,7 @@ from statistics import median
 from peers import Goals, ratio
 
 from fieldtwin.emulators.replay.replay import ExchangeReplay
-from fieldtwin.gateway.core.recording import Exchange, RecordingHeader, RecordingReader, RecordingWriter
+from fieldtwin.gateway.core.files.recording import Exchange, RecordingHeader, RecordingReader, RecordingWriter
 
 WRITES_PER_S = 100_000
 LOAD_S = 3.0

@@ -21,7 +21,7 @@ from statistics import median
 
 from peers import Goals, python, ratio
 
-from fieldtwin.commissioning.scan_modbus import ModbusScanner, ScanOptions
+from fieldtwin.commissioning.scan.modbus import ModbusScanner, ScanOptions
 from fieldtwin.emulators.wires.serial_line import SerialPacer
 from fieldtwin.gateway.core.endpoint import SerialSettings
 from fieldtwin.gateway.wallclock import run as run_precise
@@ -33,7 +33,7 @@ from pathlib import Path
 from fieldtwin.emulators.endpoints.pty import PtyEnd
 from fieldtwin.emulators.modbus.bank import MapBank, Span
 from fieldtwin.emulators.modbus.rtu import RtuSlave
-from fieldtwin.emulators.modbus.serve import serve_rtu
+from fieldtwin.emulators.endpoints.modbus_server import serve_rtu
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.endpoint import Endpoint, SerialSettings
 from fieldtwin.gateway.wallclock import WallClock, run

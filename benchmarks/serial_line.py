@@ -27,7 +27,7 @@ from peers import Goals, python, ratio
 from fieldtwin.emulators.wires.serial_line import SerialPacer
 from fieldtwin.gateway.core.control import ControlClient
 from fieldtwin.gateway.core.endpoint import Endpoint, SerialSettings
-from fieldtwin.running.children import Child
+from fieldtwin.run.processes.children import Child
 from fieldtwin.twin.plant.controller import ControllerConfig
 from fieldtwin.twin.plant.mapping import mapped_endpoint, mapping_to_json
 from fieldtwin.twin.plant.physical import image_layout, make_image

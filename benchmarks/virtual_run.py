@@ -23,7 +23,7 @@ from peers import Goals
 
 from fieldtwin.emulators.virtual.clock import VirtualClock
 from fieldtwin.emulators.virtual.loop import VirtualLoop
-from fieldtwin.running.virtual_run import VirtualOptions, VirtualRun
+from fieldtwin.run.virtual.run import VirtualOptions, VirtualRun
 
 ROOT = Path(__file__).resolve().parents[1]
 SHIPPED = ROOT / "profiles" / "systems"

@@ -19,10 +19,10 @@ from statistics import median
 from peers import Goals
 from virtual_run import CASES, faster, system
 
-from fieldtwin.whatif.fork import Fork, answer
-from fieldtwin.whatif.last_known import of_period
-from fieldtwin.whatif.plan import Plan
-from fieldtwin.whatif.state import KnownState
+from fieldtwin.run.what_if.fork import Fork, answer
+from fieldtwin.run.what_if.last_known import of_period
+from fieldtwin.run.what_if.plan import Plan
+from fieldtwin.run.what_if.state import KnownState
 
 HORIZON_S = 6 * 3600.0
 GOAL_S = 25.0

@@ -6,7 +6,7 @@ The names are those of the command list (SPEC ruling 12). Pure; like all emulato
 from __future__ import annotations
 
 from fieldtwin.emulators.replay.requests import CellRequest, parse_request
-from fieldtwin.gateway.core.profile import DeviceProfile, RegisterRange
+from fieldtwin.gateway.core.files.profile import DeviceProfile, RegisterRange
 
 
 class CommandNames:

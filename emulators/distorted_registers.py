@@ -13,7 +13,7 @@ from fieldtwin.emulators.distortion import Distortions
 from fieldtwin.emulators.journal import HeldJournal
 from fieldtwin.emulators.modbus.bank import BIT_TABLES, RegisterBank, Table
 from fieldtwin.emulators.stated import Peek, bytes_of, cells_of, merged, raw_of, touches
-from fieldtwin.gateway.core.profile import DeviceProfile, Tag
+from fieldtwin.gateway.core.files.profile import DeviceProfile, Tag
 
 
 class DistortedRegisters(RegisterBank):

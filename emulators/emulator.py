@@ -21,7 +21,7 @@ from fieldtwin.emulators.modbus.unit import ModbusUnit, UnitLimits, UnitParts
 from fieldtwin.gateway.core.connection import PROTOCOL, Connection
 from fieldtwin.gateway.core.device import Communication, Device, End, wire
 from fieldtwin.gateway.core.errors import UnknownCommand
-from fieldtwin.gateway.core.profile import DeviceProfile
+from fieldtwin.gateway.core.files.profile import DeviceProfile
 from fieldtwin.gateway.core.values import COMMAND, RECORDING
 
 Answer = Callable[[bytes, int], bytes | None]

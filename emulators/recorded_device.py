@@ -23,8 +23,8 @@ from fieldtwin.emulators.stated import bytes_of, cells_of, merged, raw_of
 from fieldtwin.gateway.core.connection import Connection
 from fieldtwin.gateway.core.device import wire
 from fieldtwin.gateway.core.errors import FileInvalid, UnknownCommand
-from fieldtwin.gateway.core.profile import DeviceProfile, Tag
-from fieldtwin.gateway.core.recording import RecordingReader
+from fieldtwin.gateway.core.files.profile import DeviceProfile, Tag
+from fieldtwin.gateway.core.files.recording import RecordingReader
 
 MOST_COUNTED = 4
 """Most registers that a counter may have."""

@@ -17,7 +17,7 @@ from typing import Protocol
 from fieldtwin.emulators.context import UsedUp, WhenUsedUp
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
-from fieldtwin.gateway.core.recording import RecordingReader, SignalRow
+from fieldtwin.gateway.core.files.recording import RecordingReader, SignalRow
 
 MAX_NUMBERS = 16_000_000
 """Most times and values of one track: 128 MB, or 46 hours of three signals at 24 Hz. A longer recording is refused."""

@@ -15,7 +15,7 @@ from fieldtwin.emulators.modbus.fifo import MOST_READ, FifoQueues
 from fieldtwin.emulators.modbus.file_records import FileRecords
 from fieldtwin.emulators.modbus.identification import Identification
 from fieldtwin.emulators.modbus.unit import UnitParts
-from fieldtwin.gateway.core.profile import DeviceProfile, Effect, Tag
+from fieldtwin.gateway.core.files.profile import DeviceProfile, Effect, Tag
 
 Peek = Callable[[Table, int], int]
 """Returns the value of one cell without the effects of a read."""

@@ -11,24 +11,24 @@ from typing import TYPE_CHECKING, Any
 from fieldtwin.__about__ import __version__
 
 if TYPE_CHECKING:
+    from fieldtwin.commissioning.scan.node_scan import scan_can_bus as scan_can_bus
     from fieldtwin.gateway.core.errors import FieldtwinError as FieldtwinError
-    from fieldtwin.gateway.core.profile import load_profile as load_profile
-    from fieldtwin.running.node_scan import scan_can_bus as scan_can_bus
-    from fieldtwin.running.options import RunOptions as RunOptions
-    from fieldtwin.running.session import RunSession as RunSession
-    from fieldtwin.running.summary import summarise as summarise
+    from fieldtwin.gateway.core.files.profile import load_profile as load_profile
+    from fieldtwin.run.live.options import RunOptions as RunOptions
+    from fieldtwin.run.live.session import RunSession as RunSession
+    from fieldtwin.run.live.summary import summarise as summarise
     from fieldtwin.twin.prototype.file import load_prototype as load_prototype
     from fieldtwin.twin.site.system import load_system as load_system
 
 _PUBLIC = {
     "FieldtwinError": "fieldtwin.gateway.core.errors",
-    "RunOptions": "fieldtwin.running.options",
-    "RunSession": "fieldtwin.running.session",
-    "load_profile": "fieldtwin.gateway.core.profile",
+    "RunOptions": "fieldtwin.run.live.options",
+    "RunSession": "fieldtwin.run.live.session",
+    "load_profile": "fieldtwin.gateway.core.files.profile",
     "load_prototype": "fieldtwin.twin.prototype.file",
     "load_system": "fieldtwin.twin.site.system",
-    "scan_can_bus": "fieldtwin.running.node_scan",
-    "summarise": "fieldtwin.running.summary",
+    "scan_can_bus": "fieldtwin.commissioning.scan.node_scan",
+    "summarise": "fieldtwin.run.live.summary",
 }
 
 __all__ = [

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid
-from fieldtwin.gateway.core.image import ImageLayout, TagKind, TagSpec, process_image
+from fieldtwin.gateway.core.image.image import ImageLayout, TagKind, TagSpec, process_image
 from fieldtwin.gateway.core.values import Scalar
 from fieldtwin.plc.program import Program, Role, Variable
 

@@ -12,7 +12,7 @@ from typing import Any
 import msgspec
 
 from fieldtwin.gateway.core.errors import FileInvalid
-from fieldtwin.gateway.core.image import ImageLayout
+from fieldtwin.gateway.core.image.image import ImageLayout
 from fieldtwin.plc.binding import BoundProgram, InputBinding, load_program
 from fieldtwin.plc.start import StartPolicy
 

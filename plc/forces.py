@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from math import isfinite
 
 from fieldtwin.gateway.core.errors import EndpointBusy, UsageError
-from fieldtwin.gateway.core.image import TagKind, TagSpec
+from fieldtwin.gateway.core.image.image import TagKind, TagSpec
 from fieldtwin.gateway.core.values import Scalar
 
 MAX_FORCES = 256

@@ -35,7 +35,7 @@ from typing import Any
 
 from fieldtwin.gateway.core.control import ControlServer
 from fieldtwin.gateway.core.errors import FileInvalid, Unreachable, UsageError
-from fieldtwin.gateway.core.image import Image
+from fieldtwin.gateway.core.image.image import Image
 from fieldtwin.plc.acts import Acts
 from fieldtwin.plc.config import PlcConfig
 from fieldtwin.plc.realtime import RealtimeReport, StuckAlarm, monotonic_ns, prepare, run_task, utc_ns

@@ -26,7 +26,7 @@ from typing import Any, ClassVar
 import msgspec
 
 from fieldtwin.gateway.core.errors import Blame, Bug, FieldtwinError
-from fieldtwin.gateway.core.image import Message, TagKind
+from fieldtwin.gateway.core.image.image import Message, TagKind
 from fieldtwin.gateway.core.values import Scalar, TagValue
 
 MESSAGE_BYTES = 256

@@ -23,7 +23,7 @@ from typing import Any
 
 from fieldtwin.gateway.core.clock import NS_PER_MS
 from fieldtwin.gateway.core.errors import UsageError
-from fieldtwin.gateway.core.image import Message, TagKind
+from fieldtwin.gateway.core.image.image import Message, TagKind
 from fieldtwin.gateway.core.values import Quality, Reason, TagValue
 from fieldtwin.plc.blocks import FunctionBlock
 from fieldtwin.plc.program import Outbox, Program, ProgramFailed, Role, ScanInfo

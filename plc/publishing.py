@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from fieldtwin.gateway.core.errors import FileInvalid
-from fieldtwin.gateway.core.image import (
+from fieldtwin.gateway.core.image.image import (
     INPUTS,
     OUTPUTS,
     Image,

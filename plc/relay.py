@@ -16,9 +16,9 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
+from fieldtwin.gateway.core.concurrency.events import Consumer, Producer
 from fieldtwin.gateway.core.errors import Bug, Desync
-from fieldtwin.gateway.core.events import Consumer, Producer
-from fieldtwin.gateway.core.image import Message, TagKind
+from fieldtwin.gateway.core.image.image import Message, TagKind
 from fieldtwin.gateway.core.statemachine import STATE_CODES, EventStateMachine, encode_period
 from fieldtwin.gateway.core.values import COMMAND, DATA, RESPONSE, Scalar
 from fieldtwin.plc.program import Outbox, Program, ScanInfo, message_input, message_output, var_local, var_output

@@ -19,7 +19,7 @@ from typing import Any
 
 from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
 from fieldtwin.gateway.core.errors import Bug, FieldtwinError, FileInvalid, UsageError
-from fieldtwin.gateway.core.image import INPUTS, Image, TagSpec
+from fieldtwin.gateway.core.image.image import INPUTS, Image, TagSpec
 from fieldtwin.gateway.core.values import Quality, Reason, Scalar, TagValue
 from fieldtwin.plc.binding import BoundProgram
 from fieldtwin.plc.config import PlcConfig, TaskSpec

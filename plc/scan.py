@@ -20,7 +20,7 @@ from typing import Any
 
 from fieldtwin.gateway.core.clock import NS_PER_MS
 from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid
-from fieldtwin.gateway.core.image import INPUTS, Image, Message, RegionReader, TagKind, TagSpec
+from fieldtwin.gateway.core.image.image import INPUTS, Image, Message, RegionReader, TagKind, TagSpec
 from fieldtwin.gateway.core.values import NEVER, Quality, Reason, Scalar, TagValue
 from fieldtwin.plc.binding import BoundProgram, InputBinding, substitute
 from fieldtwin.plc.program import (

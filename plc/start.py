@@ -21,7 +21,7 @@ from typing import Any, Literal
 
 from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
 from fieldtwin.gateway.core.errors import Blame, FieldtwinError
-from fieldtwin.gateway.core.image import INPUTS, Image, TagKind
+from fieldtwin.gateway.core.image.image import INPUTS, Image, TagKind
 from fieldtwin.gateway.core.values import Quality, Reason
 from fieldtwin.plc.binding import BoundProgram
 from fieldtwin.plc.forces import Forces

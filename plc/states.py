@@ -24,7 +24,7 @@ from typing import Any, ClassVar
 
 from fieldtwin.gateway.core.clock import NS_PER_MS
 from fieldtwin.gateway.core.errors import Bug, UsageError
-from fieldtwin.gateway.core.image import TagKind
+from fieldtwin.gateway.core.image.image import TagKind
 from fieldtwin.gateway.core.values import Scalar
 from fieldtwin.plc.program import Program, ScanInfo, var_local
 

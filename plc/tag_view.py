@@ -13,7 +13,7 @@ from fnmatch import fnmatchcase
 from typing import Any
 
 from fieldtwin.gateway.core.errors import UsageError
-from fieldtwin.gateway.core.image import INPUTS, OUTPUTS, Image, TagSpec
+from fieldtwin.gateway.core.image.image import INPUTS, OUTPUTS, Image, TagSpec
 from fieldtwin.gateway.core.values import Quality, TagValue
 from fieldtwin.plc.forces import Force
 from fieldtwin.plc.runner import Runner

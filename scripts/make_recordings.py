@@ -19,7 +19,7 @@ if str(ROOT) not in sys.path:  # run as a file, the checkout's packages are not 
     sys.path.insert(0, str(ROOT))
 
 from fieldtwin.emulators.models import cast, tilt  # noqa: E402
-from fieldtwin.gateway.core.recording import RecordingHeader, RecordingWriter, SignalInfo  # noqa: E402
+from fieldtwin.gateway.core.files.recording import RecordingHeader, RecordingWriter, SignalInfo  # noqa: E402
 
 DEFAULT_SEED = 1
 Rows = Iterable[tuple[float, Sequence[float]]]

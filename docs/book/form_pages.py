@@ -6,9 +6,9 @@ import json
 from pathlib import Path
 from typing import Any
 
-from fieldtwin.cli.schema_command import SCHEMAS
+from fieldtwin.cli.system.schema_command import SCHEMAS
 from fieldtwin.emulators.faults.registry import FAULTS
-from fieldtwin.gateway.core.profile import load_profile
+from fieldtwin.gateway.core.files.profile import load_profile
 
 KINDS = {
     "system": "The plant: buses, devices, programs. `NAME.yaml`",

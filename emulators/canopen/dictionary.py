@@ -23,7 +23,7 @@ from fieldtwin.emulators.canopen.entries import DictionaryObject as DictionaryOb
 from fieldtwin.emulators.canopen.entries import Entry as Entry
 from fieldtwin.emulators.canopen.entries import Key as Key
 from fieldtwin.gateway.core.errors import FileInvalid
-from fieldtwin.gateway.core.input_file import read_input
+from fieldtwin.gateway.core.files.input_file import read_input
 
 MAX_EDS_BYTES = 8 * 1024 * 1024
 """A larger EDS or DCF file is a mistake; the largest known one has 2 MB."""

@@ -13,8 +13,8 @@ from typing import Protocol, runtime_checkable
 from fieldtwin.emulators.canopen.node import CanopenNode
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.clock import NS_PER_S, Clock
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.connection import CanConnection
-from fieldtwin.gateway.core.nursery import Nursery
 
 Poke = Callable[[int], list[CanFrame]]
 """An event inside the device: called with the time, it returns the frames that the node then sends."""

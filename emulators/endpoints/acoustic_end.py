@@ -15,8 +15,8 @@ from pathlib import Path
 
 from fieldtwin.emulators.wires.acoustic import AcousticMedium
 from fieldtwin.gateway.core.clock import Clock
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.errors import Desync, EndpointBusy, FieldtwinError, Unreachable
-from fieldtwin.gateway.core.nursery import Nursery
 
 ROOM = 2
 """Packets that a modem hands over before the first is accepted."""

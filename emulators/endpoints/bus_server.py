@@ -16,6 +16,7 @@ import errno
 import socket
 from typing import Any, cast
 
+from fieldtwin.emulators.client_counts import ClientCounts, Counts
 from fieldtwin.emulators.endpoints.bus_hello import (
     FD_VERSION,
     VERSION,
@@ -27,7 +28,6 @@ from fieldtwin.emulators.endpoints.bus_hello import (
     unpack_hello,
 )
 from fieldtwin.emulators.endpoints.bus_runner import BusRunner
-from fieldtwin.emulators.endpoints.client_counts import ClientCounts, Counts
 from fieldtwin.emulators.wires.can_faults import Rule
 from fieldtwin.gateway.core.can_error import overrun_frame
 from fieldtwin.gateway.core.canframe import FD_RECORD_SIZE, RECORD_SIZE, CanFrame, pack_record, unpack_record

@@ -15,7 +15,7 @@ from fieldtwin.emulators.endpoints.socket_end import SocketEnd
 from fieldtwin.emulators.faults.engine import WireFaults, in_time
 from fieldtwin.emulators.faults.fault import Active, Hang, Outcome, Piece, WireFault
 from fieldtwin.emulators.faults.frames import FLUSH_S, Assembler, Frame, Way
-from fieldtwin.emulators.virtual.wire import MemoryEnd
+from fieldtwin.emulators.virtual.memory_stream import MemoryEnd
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.connection import PROTOCOL, ByteConnection
 from fieldtwin.gateway.core.errors import ConnectionLost, FieldtwinError

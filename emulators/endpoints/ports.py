@@ -1,6 +1,6 @@
 """The places where emulators can be reached: a field simulator gets its serial ports, listeners and buses here.
 
-`OsPorts` provides those of the operating system; `fieldtwin.emulators.virtual.ports` provides ones in memory. A device
+`OsPorts` provides those of the operating system; `fieldtwin.emulators.endpoints.memory_ports` provides ones in memory. A device
 cannot tell the difference.
 """
 

@@ -16,7 +16,7 @@ from typing import Any, ClassVar, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from fieldtwin.emulators.faults.frames import Frame, Way
-from fieldtwin.gateway.core.profile import Tag
+from fieldtwin.gateway.core.files.profile import Tag
 
 
 class Hang(Enum):

@@ -6,21 +6,24 @@ from importlib import import_module
 
 from fieldtwin.emulators.faults.fault import Fault
 from fieldtwin.gateway.core.errors import UsageError
-from fieldtwin.gateway.core.nearest import did_you_mean
+from fieldtwin.gateway.core.files.nearest import did_you_mean
 
-_FILES = """
-drop delay jitter duplicate reorder split pause coalesce corrupt_bits corrupt_crc corrupt_length wrong_unit wrong_function
-wrong_transaction fewer_registers
-truncate garbage noise echo late_reply exception busy silence half_open reset disconnect wrong_baud wrong_parity
-collision lost_frame error_frame bus_off duplicate_node sdo_abort sdo_toggle lost_segment heartbeat_loss heartbeat_late emcy_burst
-sync_jitter boot_storm late_frame short_frame odd_sdo odd_heartbeat stuck drift spike nan out_of_range set_value
+_MODULES = """
+loss.drop timing.delay timing.jitter loss.duplicate timing.reorder timing.split timing.pause timing.coalesce
+damage.corrupt_bits damage.corrupt_crc damage.corrupt_length modbus.wrong_unit modbus.wrong_function modbus.wrong_transaction
+modbus.fewer_registers damage.truncate damage.garbage damage.noise damage.echo timing.late_reply modbus.exception modbus.busy
+loss.silence loss.half_open loss.reset loss.disconnect damage.wrong_baud damage.wrong_parity damage.collision
+canopen.lost_frame canopen.error_frame canopen.bus_off canopen.duplicate_node canopen.sdo_abort canopen.sdo_toggle
+canopen.lost_segment canopen.heartbeat_loss canopen.heartbeat_late canopen.emcy_burst canopen.sync_jitter canopen.boot_storm
+canopen.late_frame canopen.short_frame canopen.odd_sdo canopen.odd_heartbeat values.stuck values.drift values.spike
+values.nan values.out_of_range values.set_value
 """
 
 
 def _load() -> dict[str, type[Fault]]:
     found: dict[str, type[Fault]] = {}
-    for file in _FILES.split():
-        module = import_module(f"fieldtwin.emulators.faults.{file}")
+    for name in _MODULES.split():
+        module = import_module(f"fieldtwin.emulators.faults.{name}")
         for kind in vars(module).values():
             if isinstance(kind, type) and issubclass(kind, Fault) and kind.__module__ == module.__name__:
                 found[kind.name] = kind

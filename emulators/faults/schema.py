@@ -19,8 +19,8 @@ from fieldtwin.emulators.faults.fault import Aim, Fault, Kind
 from fieldtwin.emulators.faults.registry import fault_class
 from fieldtwin.emulators.faults.wrong_aim import WrongAim
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
-from fieldtwin.gateway.core.nearest import did_you_mean
-from fieldtwin.gateway.core.yaml_file import Key, YamlFile, expected_value, load
+from fieldtwin.gateway.core.files.nearest import did_you_mean
+from fieldtwin.gateway.core.files.yaml_file import Key, YamlFile, expected_value, load
 
 _AIM_KEYS = tuple(info.alias or name for name, info in Aim.model_fields.items())
 _NOT_OF = {

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from fieldtwin.emulators.endpoints.client_counts import Counts
+from fieldtwin.emulators.client_counts import Counts
 from fieldtwin.emulators.modbus.line import Exchange
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.errors import Desync, UsageError

@@ -15,7 +15,7 @@ from fieldtwin.emulators.canopen.node_data import NodeData
 from fieldtwin.emulators.canopen.service import AnswersReads, Source
 from fieldtwin.emulators.distortion import Distortions
 from fieldtwin.emulators.models.played_objects import whole
-from fieldtwin.gateway.core.profile import Tag
+from fieldtwin.gateway.core.files.profile import Tag
 
 
 class DistortedObjects:

@@ -24,7 +24,7 @@ from fieldtwin.emulators.replay.can_log import CanLog
 from fieldtwin.emulators.replay.objects import recorded_objects
 from fieldtwin.emulators.signals import Signals
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
-from fieldtwin.gateway.core.profile import DeviceProfile
+from fieldtwin.gateway.core.files.profile import DeviceProfile
 
 
 @dataclass(frozen=True, slots=True)

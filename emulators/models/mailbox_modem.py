@@ -18,7 +18,7 @@ from fieldtwin.emulators.modbus.bank import IllegalValue, MapBank, RegisterBank,
 from fieldtwin.emulators.models.packet_link import TAME, Incoming, Outgoing, PacketLink, Untamed
 from fieldtwin.emulators.stated import bytes_of, cells_held
 from fieldtwin.gateway.core.errors import FileInvalid
-from fieldtwin.gateway.core.profile import Box, DeviceProfile, RegisterRange, Tag
+from fieldtwin.gateway.core.files.profile import Box, DeviceProfile, RegisterRange, Tag
 
 LAST_SEQUENCE = 0xFFFF
 RECEIVED = 64

@@ -12,7 +12,7 @@ from fieldtwin.emulators.distortion import Distortions
 from fieldtwin.emulators.journal import HeldJournal
 from fieldtwin.emulators.signals import Signals
 from fieldtwin.gateway.core.errors import FileInvalid
-from fieldtwin.gateway.core.profile import Tag
+from fieldtwin.gateway.core.files.profile import Tag
 
 Key = tuple[int, int]
 

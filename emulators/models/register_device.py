@@ -15,7 +15,7 @@ from fieldtwin.emulators.modbus.bank import IllegalValue, MapBank, RegisterBank,
 from fieldtwin.emulators.modbus.unit import Handler, ModbusUnit
 from fieldtwin.emulators.stated import Effects, bytes_of, cells_held, cells_of, fits, merged, spans_of, touches
 from fieldtwin.gateway.core.errors import FileInvalid
-from fieldtwin.gateway.core.profile import DeviceProfile, OwnFunction, Tag
+from fieldtwin.gateway.core.files.profile import DeviceProfile, OwnFunction, Tag
 
 _WHOLE = re.compile(r"[1-9][0-9]{0,18}|0|0x[0-9a-fA-F]{1,16}")
 

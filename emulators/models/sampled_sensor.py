@@ -19,7 +19,7 @@ from fieldtwin.emulators.signals import Signals
 from fieldtwin.emulators.stated import bytes_of, cells_held, touches
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.errors import FileInvalid
-from fieldtwin.gateway.core.profile import DeviceProfile, Tag
+from fieldtwin.gateway.core.files.profile import DeviceProfile, Tag
 
 STANDBY, SAMPLING, OFF = 0, 1, 2
 MAX_CATCH_UP = 3600

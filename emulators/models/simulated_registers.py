@@ -8,7 +8,7 @@ from fieldtwin.emulators.modbus.bank import Table
 from fieldtwin.emulators.models.register_device import StatedRegisters
 from fieldtwin.emulators.signals import Signals
 from fieldtwin.gateway.core.errors import FileInvalid
-from fieldtwin.gateway.core.profile import DeviceProfile
+from fieldtwin.gateway.core.files.profile import DeviceProfile
 
 
 class SimulatedRegisters(StatedRegisters):

@@ -14,7 +14,7 @@ from typing import BinaryIO
 from fieldtwin.emulators.context import WhenUsedUp
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.errors import FileInvalid
-from fieldtwin.gateway.core.input_file import open_input
+from fieldtwin.gateway.core.files.input_file import open_input
 
 _LINE = re.compile(
     r"\((\d+\.\d+)\)\s+\S+\s+([0-9A-F]{3}|[0-9A-F]{8})#(R[0-8]?|(?:[0-9A-F]{2}){0,8})(?:\s+[RT])?", re.IGNORECASE

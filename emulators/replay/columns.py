@@ -15,7 +15,7 @@ from typing import overload
 
 from fieldtwin.emulators.context import Recorded
 from fieldtwin.emulators.replay.requests import CellRequest
-from fieldtwin.gateway.core.recording import Exchange
+from fieldtwin.gateway.core.files.recording import Exchange
 from fieldtwin.gateway.core.values import RECORDING
 
 BESIDE = 32

@@ -19,7 +19,7 @@ from fieldtwin.emulators.replay.columns import BESIDE, CellValues, Column, Merge
 from fieldtwin.emulators.replay.counters import Counters
 from fieldtwin.emulators.replay.requests import CellRequest
 from fieldtwin.emulators.replay.situation import Cell, Situations
-from fieldtwin.gateway.core.recording import Exchange
+from fieldtwin.gateway.core.files.recording import Exchange
 from fieldtwin.gateway.core.values import COMMAND, RECORDING
 
 TABLE_CODES: dict[Table, int] = {"coil": 0, "discrete": 1, "holding": 3, "input": 4}

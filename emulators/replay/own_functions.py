@@ -10,7 +10,7 @@ from fieldtwin.emulators.codec import encode
 from fieldtwin.emulators.modbus.bank import IllegalValue
 from fieldtwin.emulators.modbus.unit import Handler
 from fieldtwin.emulators.replay.unit import ReplayUnit
-from fieldtwin.gateway.core.profile import DeviceProfile, OwnFunction
+from fieldtwin.gateway.core.files.profile import DeviceProfile, OwnFunction
 
 
 def add_own_functions(unit: ReplayUnit, profile: DeviceProfile) -> None:

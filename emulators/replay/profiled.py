@@ -16,7 +16,7 @@ from fieldtwin.emulators.replay.replay import Answer, ExchangeReplay
 from fieldtwin.emulators.replay.requests import CellRequest
 from fieldtwin.emulators.replay.unit import ReplayUnit
 from fieldtwin.emulators.stated import Effects, cells_of, parts_of
-from fieldtwin.gateway.core.profile import DeviceProfile
+from fieldtwin.gateway.core.files.profile import DeviceProfile
 
 _CELL_FUNCTIONS = frozenset({0x01, 0x02, 0x03, 0x04, 0x05, 0x06, 0x0F, 0x10})
 _COUNTING = frozenset({0x08, 0x0B, 0x0C})

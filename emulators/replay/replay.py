@@ -34,7 +34,7 @@ from fieldtwin.emulators.replay.learning import (
 from fieldtwin.emulators.replay.requests import CellRequest
 from fieldtwin.emulators.replay.situation import Cell
 from fieldtwin.gateway.core.errors import Bug
-from fieldtwin.gateway.core.recording import Exchange, RecordingReader
+from fieldtwin.gateway.core.files.recording import Exchange, RecordingReader
 from fieldtwin.gateway.core.values import COMMAND
 
 

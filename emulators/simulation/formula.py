@@ -14,7 +14,7 @@ from collections.abc import Callable, Collection, Mapping
 from random import Random
 
 from fieldtwin.gateway.core.errors import UsageError
-from fieldtwin.gateway.core.nearest import did_you_mean
+from fieldtwin.gateway.core.files.nearest import did_you_mean
 
 Values = Mapping[str, float]
 Compute = Callable[[Values], float]

@@ -6,7 +6,7 @@ import struct
 
 from fieldtwin.emulators.codec import decode
 from fieldtwin.emulators.modbus.bank import BIT_TABLES
-from fieldtwin.gateway.core.profile import Tag
+from fieldtwin.gateway.core.files.profile import Tag
 
 _FLOATS = {"float32": "<f", "float64": "<d"}
 

@@ -167,7 +167,7 @@ class VirtualLoop(asyncio.AbstractEventLoop):
         return future
 
     def alarm(self, delay_s: float) -> asyncio.Future[None]:
-        """Do the same as `sleeper`, in seconds from now (`fieldtwin.gateway.core.alarm`).
+        """Do the same as `sleeper`, in seconds from now (`fieldtwin.gateway.core.concurrency.timeout`).
 
         The caller may set the future earlier.
         """

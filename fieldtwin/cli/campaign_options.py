@@ -12,7 +12,7 @@ from fieldtwin.cli.options import Duration
 from fieldtwin.gateway.core.errors import UsageError
 
 if TYPE_CHECKING:
-    from fieldtwin.running.fault_schedule import RandomFaults
+    from fieldtwin.run.virtual.fault_schedule import RandomFaults
 
 
 def _each(context: click.Context, param: click.Parameter, value: str) -> tuple[str, ...]:
@@ -76,7 +76,7 @@ class Choice(NamedTuple):
                 )
             return None
         # Here, because it loads emulators, which a plant does not need.
-        from fieldtwin.running.fault_schedule import MEAN_S, RandomFaults
+        from fieldtwin.run.virtual.fault_schedule import MEAN_S, RandomFaults
 
         return RandomFaults(MEAN_S if self.every_s is None else self.every_s, self.kinds, self.aims)
 

@@ -17,56 +17,74 @@ from typing import Any, NoReturn
 import click
 
 from fieldtwin.__about__ import __version__
-from fieldtwin.cli.unheard import VERDICTS, talk_unheard, to_nowhere, verdict_unheard
+from fieldtwin.cli.broken_pipe import VERDICTS, talk_unheard, to_nowhere, verdict_unheard
 
 COMMANDS = {
-    "run": ("fieldtwin.cli.run_command", "Run a system: the plant, or its prototype."),
-    "reload": ("fieldtwin.cli.reload_command", "Let a running instance read its files again, between two polls."),
-    "emulate": ("fieldtwin.cli.emulate_command", "Emulate the field side of a system, or one device."),
+    "run": ("fieldtwin.cli.run.run_command", "Run a system: the plant, or its prototype."),
+    "reload": ("fieldtwin.cli.run.reload_command", "Let a running instance read its files again, between two polls."),
+    "emulate": ("fieldtwin.cli.emulate.emulate_command", "Emulate the field side of a system, or one device."),
     "plc": (
-        "fieldtwin.cli.plc_command",
+        "fieldtwin.cli.run.plc_command",
         "Look into a running PLC: tags, forces, steps, reasons; draw and prove programs.",
     ),
-    "shore": ("fieldtwin.cli.shore_command", "The far end of a system's transmitter: send commands, show responses."),
+    "shore": (
+        "fieldtwin.cli.run.topside_command",
+        "The far end of a system's transmitter: send commands, show responses.",
+    ),
     "shadow": (
-        "fieldtwin.cli.shadow_command",
+        "fieldtwin.cli.twin.shadow_command",
         "A digital shadow: watch a plant from elsewhere, and compare it with its model.",
     ),
-    "twin": ("fieldtwin.cli.twin_command", "A digital twin: a shadow with a way back, that plans and commands."),
-    "link": ("fieldtwin.cli.link_command", "The emulated connection on its own: a serial port carried over TCP."),
-    "bridge": ("fieldtwin.cli.bridge_command", "Modbus TCP clients to units on a serial line, or the other way round."),
-    "can-bus": ("fieldtwin.cli.can_bus_command", "A software CAN bus on a TCP port."),
-    "check": ("fieldtwin.cli.check_command", "Judge a Modbus or CANopen device, or master: verdicts, waivers."),
-    "line": ("fieldtwin.cli.line_command", "Look at a wire before anything is sent, and rank what may be wrong."),
-    "scan": ("fieldtwin.cli.scan_command", "Find the units or nodes on a wire: listen first, then ask, paced."),
+    "twin": ("fieldtwin.cli.twin.twin_command", "A digital twin: a shadow with a way back, that plans and commands."),
+    "link": (
+        "fieldtwin.cli.emulate.link_command",
+        "The emulated connection on its own: a serial port carried over TCP.",
+    ),
+    "bridge": (
+        "fieldtwin.cli.emulate.bridge_command",
+        "Modbus TCP clients to units on a serial line, or the other way round.",
+    ),
+    "can-bus": ("fieldtwin.cli.emulate.can_bus_command", "A software CAN bus on a TCP port."),
+    "check": ("fieldtwin.cli.test.check_command", "Judge a Modbus or CANopen device, or master: verdicts, waivers."),
+    "line": (
+        "fieldtwin.cli.device.line_command",
+        "Look at a wire before anything is sent, and rank what may be wrong.",
+    ),
+    "scan": ("fieldtwin.cli.device.scan_command", "Find the units or nodes on a wire: listen first, then ask, paced."),
     "identify": (
-        "fieldtwin.cli.identify_command",
+        "fieldtwin.cli.device.identify_command",
         "Ask a device what it is, and say which profile fits, and how surely.",
     ),
-    "read": ("fieldtwin.cli.read_command", "Read values of one device, by name or address."),
-    "write": ("fieldtwin.cli.write_command", "Write values of one device: asked for, read back, put back."),
-    "watch": ("fieldtwin.cli.watch_command", "Live values of one device, with sparklines; a picture of them."),
-    "dump": ("fieldtwin.cli.dump_command", "Read all that a device holds: values, holes, limits, latency."),
-    "report": ("fieldtwin.cli.report_command", "A site acceptance document from dumps, comparisons and checks."),
-    "record": ("fieldtwin.cli.record_command", "Record a device, a line between two ports, or a CAN bus."),
-    "diff": ("fieldtwin.cli.diff_command", "Two dumps, or a dump and a profile: what differs, by name."),
-    "infer": ("fieldtwin.cli.infer_command", "Guess a profile from dumps taken over time, and say how sure it is."),
-    "compare": ("fieldtwin.cli.compare_command", "Hold a device, or a recording, against a recording."),
-    "import": ("fieldtwin.cli.import_command", "Turn foreign files into recordings."),
-    "export": ("fieldtwin.cli.export_command", "Turn recordings into CSV, Parquet, candump logs or pcap."),
-    "what-if": ("fieldtwin.cli.what_if_command", "Fork a prototype from what is known, and see what comes of a plan."),
-    "test": ("fieldtwin.cli.test_command", "Run scenarios against a prototype, and judge it."),
-    "test-host": ("fieldtwin.cli.test_host_command", "Emulated devices for tests, over stdin and stdout."),
-    "with": ("fieldtwin.cli.with_command", "Run any command against the emulated field; end with its exit status."),
-    "faults": ("fieldtwin.cli.faults_command", "List the faults that can be put on wires and into devices."),
+    "read": ("fieldtwin.cli.device.read_command", "Read values of one device, by name or address."),
+    "write": ("fieldtwin.cli.device.write_command", "Write values of one device: asked for, read back, put back."),
+    "watch": ("fieldtwin.cli.device.watch_command", "Live values of one device, with sparklines; a picture of them."),
+    "dump": ("fieldtwin.cli.device.dump_command", "Read all that a device holds: values, holes, limits, latency."),
+    "report": ("fieldtwin.cli.system.report_command", "A site acceptance document from dumps, comparisons and checks."),
+    "record": ("fieldtwin.cli.recordings.record_command", "Record a device, a line between two ports, or a CAN bus."),
+    "diff": ("fieldtwin.cli.device.diff_command", "Two dumps, or a dump and a profile: what differs, by name."),
+    "infer": (
+        "fieldtwin.cli.device.infer_command",
+        "Guess a profile from dumps taken over time, and say how sure it is.",
+    ),
+    "compare": ("fieldtwin.cli.recordings.compare_command", "Hold a device, or a recording, against a recording."),
+    "import": ("fieldtwin.cli.recordings.import_command", "Turn foreign files into recordings."),
+    "export": ("fieldtwin.cli.recordings.export_command", "Turn recordings into CSV, Parquet, candump logs or pcap."),
+    "what-if": (
+        "fieldtwin.cli.twin.what_if_command",
+        "Fork a prototype from what is known, and see what comes of a plan.",
+    ),
+    "test": ("fieldtwin.cli.test.test_command", "Run scenarios against a prototype, and judge it."),
+    "test-host": ("fieldtwin.cli.test.worker_command", "Emulated devices for tests, over stdin and stdout."),
+    "with": ("fieldtwin.cli.run.with_command", "Run any command against the emulated field; end with its exit status."),
+    "faults": ("fieldtwin.cli.emulate.faults_command", "List the faults that can be put on wires and into devices."),
     "template": (
-        "fieldtwin.cli.template_command",
+        "fieldtwin.cli.system.template_command",
         "A system and all that it takes, as one file: pack, check, compare, unpack.",
     ),
-    "draw": ("fieldtwin.cli.draw_command", "Draw a system's wires, and who hangs on each: text, or SVG."),
-    "trace": ("fieldtwin.cli.trace_command", "What happened in a run: frames in words, JSON, or waveforms."),
-    "schema": ("fieldtwin.cli.schema_command", "Print the JSON schema of a kind of file."),
-    "doctor": ("fieldtwin.cli.doctor_command", "Check what this computer can do, and say what to change."),
+    "draw": ("fieldtwin.cli.system.draw_command", "Draw a system's wires, and who hangs on each: text, or SVG."),
+    "trace": ("fieldtwin.cli.recordings.trace_command", "What happened in a run: frames in words, JSON, or waveforms."),
+    "schema": ("fieldtwin.cli.system.schema_command", "Print the JSON schema of a kind of file."),
+    "doctor": ("fieldtwin.cli.system.doctor_command", "Check what this computer can do, and say what to change."),
 }
 SECTIONS = {
     "Run a system, or parts of it": (
@@ -147,7 +165,7 @@ def cli() -> None:
 
 def main() -> None:
     """The console script. Never shows a traceback unless FIELDTWIN_TRACEBACK is set."""
-    from fieldtwin.cli.plain_letters import write_plainly
+    from fieldtwin.cli.ascii_output import write_plainly
     from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid
 
     write_plainly()

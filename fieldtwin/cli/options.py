@@ -56,7 +56,7 @@ class Duration(_OfFloat):
 
 junit_flavour_option = click.option(
     "--junit-flavour",
-    type=click.Choice(["common", "jenkins"]),  # the values of fieldtwin.report.junit.Flavour
+    type=click.Choice(["common", "jenkins"]),  # the values of fieldtwin.reports.junit.Flavour
     default="common",
     show_default=True,
     help="With --junit: jenkins writes only what the schema of Jenkins' xUnit plugin (junit-10.xsd) allows.",

@@ -7,8 +7,8 @@ import sys
 import click
 from rich.markup import escape
 
-from fieldtwin.cli.talk import talk
-from fieldtwin.running.template_here import Ask, Stranger
+from fieldtwin.console import talk
+from fieldtwin.run.template import Ask, Stranger
 
 SHOWN = 5
 

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Any, Literal, Protocol
 
-from fieldtwin.conformance.case import Danger
+from fieldtwin.conformance.core.case import Danger
 from fieldtwin.gateway.core.errors import FieldtwinError
-from fieldtwin.report.model import Struck
-from fieldtwin.scenarios.trace import Trace
+from fieldtwin.results.model import Struck
+from fieldtwin.results.trace import Trace
 
 
 class Can(Enum):

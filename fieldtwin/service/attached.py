@@ -11,9 +11,9 @@ import sys
 from dataclasses import dataclass
 from types import TracebackType
 
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.errors import FieldtwinError
-from fieldtwin.gateway.core.nursery import Nursery
-from fieldtwin.running.session import RunSession
+from fieldtwin.run.live.session import RunSession
 from fieldtwin.service.events import Event, Priority, changes
 from fieldtwin.service.exposition import render
 from fieldtwin.service.journal import EventLog, Format

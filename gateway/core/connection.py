@@ -19,8 +19,8 @@ from collections.abc import Awaitable, Callable, Coroutine
 from enum import Enum
 from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
-from fieldtwin.gateway.core.alarm import alarm, ring
 from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.concurrency.timeout import alarm, ring
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import Bug, ConnectionLost, FieldtwinError
 

@@ -15,7 +15,7 @@ import re
 from enum import Enum
 from typing import ClassVar
 
-from fieldtwin.gateway.core.visible import visible
+from fieldtwin.gateway.core.escaping import visible
 
 
 class Blame(Enum):

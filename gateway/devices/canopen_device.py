@@ -15,7 +15,7 @@ from functools import partial
 from fieldtwin.gateway.core.clock import Clock
 from fieldtwin.gateway.core.connection import PROTOCOL, CanConnection
 from fieldtwin.gateway.core.errors import Bug, NotAllowed, SdoAborted, WrongDevice
-from fieldtwin.gateway.core.profile import Tag
+from fieldtwin.gateway.core.files.profile import Tag
 from fieldtwin.gateway.core.values import COMMAND, DATA, MEASUREMENT, Reason, TagValue
 from fieldtwin.gateway.devices.canopen_rpdo import BITS, Rpdo, is_gap, tags_in, usable
 from fieldtwin.gateway.devices.codec import decode_little, encode, reorder

@@ -10,7 +10,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 from fieldtwin.gateway.core.canframe import CanFrame
-from fieldtwin.gateway.core.profile import Tag
+from fieldtwin.gateway.core.files.profile import Tag
 from fieldtwin.gateway.protocols.canopen.configure import PdoConfig
 from fieldtwin.gateway.protocols.canopen.pdo import PdoEntry, PdoMapping
 

@@ -13,7 +13,7 @@ import struct
 from msgspec.structs import replace
 
 from fieldtwin.gateway.core.errors import NotAllowed
-from fieldtwin.gateway.core.profile import REGISTERS_OF, Tag
+from fieldtwin.gateway.core.files.profile import REGISTERS_OF, Tag
 from fieldtwin.gateway.core.values import Quality, Reason, Scalar, TagValue
 
 _FORMATS = {

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from fieldtwin.gateway.core.endpoint import Endpoint
-from fieldtwin.gateway.core.profile import DeviceProfile
+from fieldtwin.gateway.core.files.profile import DeviceProfile
 from fieldtwin.gateway.devices.canopen_config import CanopenBusConfig, CanopenNodeConfig
 
 

@@ -9,9 +9,9 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from typing import ClassVar, Protocol
 
+from fieldtwin.gateway.core.concurrency.events import Consumer, Producer
 from fieldtwin.gateway.core.connection import PROTOCOL, ByteConnection, CanConnection
 from fieldtwin.gateway.core.errors import Bug, DeviceRefused, FileInvalid, NotAllowed, UnknownCommand
-from fieldtwin.gateway.core.events import Consumer, Producer
 from fieldtwin.gateway.core.values import COMMAND, DATA, Reason, TagValue
 from fieldtwin.gateway.devices.config import DeviceConfig
 

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
-from fieldtwin.gateway.core.profile import DeviceProfile, Message, RegisterRange, Tag
+from fieldtwin.gateway.core.files.profile import DeviceProfile, Message, RegisterRange, Tag
 
 ILLEGAL_ADDRESS, TOO_LONG = 0x02, 0x03
 """Exceptions (AP 7) which show that a read covered a gap, and that it was too long."""

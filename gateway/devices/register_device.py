@@ -16,7 +16,7 @@ from typing import Any
 from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
 from fieldtwin.gateway.core.connection import PROTOCOL, ByteConnection
 from fieldtwin.gateway.core.errors import Bug, ModbusExceptionReply, NotAllowed, VerifyFailed, WrongDevice
-from fieldtwin.gateway.core.profile import RegisterRange, Tag
+from fieldtwin.gateway.core.files.profile import RegisterRange, Tag
 from fieldtwin.gateway.core.values import COMMAND, DATA, MEASUREMENT, Quality, Reason, TagValue
 from fieldtwin.gateway.devices.codec import apply_scale, decode, encode
 from fieldtwin.gateway.devices.config import DeviceConfig

@@ -15,7 +15,7 @@ import struct
 
 from fieldtwin.gateway.core.connection import PROTOCOL
 from fieldtwin.gateway.core.errors import Desync, FileInvalid, NotAllowed
-from fieldtwin.gateway.core.profile import Box
+from fieldtwin.gateway.core.files.profile import Box
 from fieldtwin.gateway.core.values import COMMAND, DATA
 from fieldtwin.gateway.devices.config import DeviceConfig
 from fieldtwin.gateway.devices.driver import TagSink

@@ -10,26 +10,26 @@ from dataclasses import dataclass, field
 
 from fieldtwin.gateway.connections.listeners import TcpListener
 from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S, Clock
+from fieldtwin.gateway.core.concurrency.events import Consumer
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.connection import Connector, Listen
-from fieldtwin.gateway.core.events import Consumer
-from fieldtwin.gateway.core.image import Image
-from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.core.image.image import Image
 from fieldtwin.gateway.core.values import DATA, Reason
 from fieldtwin.gateway.devices.canopen_device import CanopenDriver
 from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig
 from fieldtwin.gateway.devices.register_device import RegisterDriver, SensorDriver
 from fieldtwin.gateway.devices.transmitter import TransmitterDriver
-from fieldtwin.gateway.runtime.audit import AuditLog
-from fieldtwin.gateway.runtime.bridge import Bridge, BridgeConfig
-from fieldtwin.gateway.runtime.canopen_bus import CanopenBus
+from fieldtwin.gateway.runtime.audit_log import AuditLog
+from fieldtwin.gateway.runtime.bridge.bridge import Bridge, BridgeConfig
+from fieldtwin.gateway.runtime.buses.canopen_bus import CanopenBus
+from fieldtwin.gateway.runtime.buses.modbus_bus import ModbusBus
 from fieldtwin.gateway.runtime.image_io import ImageExchange
-from fieldtwin.gateway.runtime.mailbox_pump import MailboxPump
-from fieldtwin.gateway.runtime.modbus_bus import ModbusBus
-from fieldtwin.gateway.runtime.output import Output
-from fieldtwin.gateway.runtime.outputs import OutputWriter
+from fieldtwin.gateway.runtime.mailboxes.acked_commands import TakenFile
+from fieldtwin.gateway.runtime.mailboxes.pump import MailboxPump
+from fieldtwin.gateway.runtime.outputs.output import Output
+from fieldtwin.gateway.runtime.outputs.outputs import OutputWriter
 from fieldtwin.gateway.runtime.serve import ServeConfig, TagServer
 from fieldtwin.gateway.runtime.tags import TagTable
-from fieldtwin.gateway.runtime.taken import TakenFile
 from fieldtwin.gateway.store.exchange_log import ExchangeLog
 
 PLC_GRACE_NS = 10 * NS_PER_S

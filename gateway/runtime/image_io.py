@@ -10,8 +10,8 @@ from __future__ import annotations
 from collections.abc import Container, Mapping, Sequence
 
 from fieldtwin.gateway.core.clock import NS_PER_MS
-from fieldtwin.gateway.core.events import Consumer
-from fieldtwin.gateway.core.image import (
+from fieldtwin.gateway.core.concurrency.events import Consumer
+from fieldtwin.gateway.core.image.image import (
     INPUTS,
     OUTPUTS,
     Image,

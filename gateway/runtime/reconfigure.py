@@ -13,9 +13,9 @@ from dataclasses import replace
 
 import msgspec
 
-from fieldtwin.gateway.core.profile import DeviceProfile
+from fieldtwin.gateway.core.files.profile import DeviceProfile
 from fieldtwin.gateway.core.values import Quality, Reason, TagValue
-from fieldtwin.gateway.runtime.coming import AnyDriver, Coming
+from fieldtwin.gateway.runtime.buses.pending_config import AnyDriver, Coming
 from fieldtwin.gateway.runtime.gateway import Gateway, GatewayConfig, stale_limits
 
 OF_DECODING = frozenset({Reason.NONE, Reason.OUT_OF_RANGE, Reason.NOT_A_NUMBER, Reason.SENTINEL})

@@ -32,10 +32,10 @@ from fieldtwin.gateway.protocols.modbus.server import (
     examine,
     exception_pdu,
 )
-from fieldtwin.gateway.runtime.audit import AuditLog
-from fieldtwin.gateway.runtime.bridge_audit import WriteRecord
-from fieldtwin.gateway.runtime.bridge_policy import EVERYONE, Network, within
-from fieldtwin.gateway.runtime.bridge_tcp import Answer, Caller, TcpFront
+from fieldtwin.gateway.runtime.audit_log import AuditLog
+from fieldtwin.gateway.runtime.bridge.audit import WriteRecord
+from fieldtwin.gateway.runtime.bridge.policy import EVERYONE, Network, within
+from fieldtwin.gateway.runtime.bridge.tcp import Answer, Caller, TcpFront
 from fieldtwin.gateway.runtime.serve_codec import REGISTERS, not_a_number, pack, unpack
 from fieldtwin.gateway.runtime.tags import TagTable
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from fieldtwin.gateway.devices.transmitter import TransmitterDriver
-from fieldtwin.gateway.runtime.canopen_bus import CanopenBus
+from fieldtwin.gateway.runtime.buses.canopen_bus import CanopenBus
 from fieldtwin.gateway.runtime.gateway import Gateway
 
 

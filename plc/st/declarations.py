@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
-from fieldtwin.gateway.core.image_layout import MAX_DEPTH, MAX_MESSAGE_BYTES
+from fieldtwin.gateway.core.image.layout import MAX_DEPTH, MAX_MESSAGE_BYTES
 from fieldtwin.plc.blocks import BLOCKS
 from fieldtwin.plc.program import MESSAGE_BYTES, MESSAGE_DEPTH
 from fieldtwin.plc.st import tree as t

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
-from fieldtwin.gateway.core.image import TagKind
-from fieldtwin.gateway.core.input_file import read_input
+from fieldtwin.gateway.core.files.input_file import read_input
+from fieldtwin.gateway.core.image.image import TagKind
 from fieldtwin.gateway.core.values import Scalar
 from fieldtwin.plc.program import Place, Program, Role, ScanInfo, Variable, message_input, message_output
 from fieldtwin.plc.st import types as ty

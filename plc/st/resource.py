@@ -11,7 +11,7 @@ import copy
 from collections.abc import Callable
 from typing import Any, NoReturn
 
-from fieldtwin.gateway.core.image import Message
+from fieldtwin.gateway.core.image.image import Message
 from fieldtwin.gateway.core.values import Quality, TagValue
 from fieldtwin.plc.blocks import BLOCKS, FunctionBlock
 from fieldtwin.plc.program import Outbox, ScanInfo, ScanTooLong

@@ -7,20 +7,20 @@ from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import TypeVar
 
+from fieldtwin.emulators.endpoints.memory_ports import MemoryNet
+from fieldtwin.emulators.endpoints.modbus_server import serve_mbap, serve_rtu, serve_udp
 from fieldtwin.emulators.modbus.ascii import AsciiSlave
 from fieldtwin.emulators.modbus.bank import MapBank, Span
 from fieldtwin.emulators.modbus.fifo import FifoQueues
 from fieldtwin.emulators.modbus.identification import Identification
 from fieldtwin.emulators.modbus.mbap import MbapSlave
 from fieldtwin.emulators.modbus.rtu import RtuSlave
-from fieldtwin.emulators.modbus.serve import serve_mbap, serve_rtu, serve_udp
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.emulators.virtual.clock import VirtualClock
 from fieldtwin.emulators.virtual.loop import VirtualLoop
-from fieldtwin.emulators.virtual.ports import MemoryNet
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.connection import ByteConnection
 from fieldtwin.gateway.core.endpoint import Endpoint
-from fieldtwin.gateway.core.nursery import Nursery
 
 T = TypeVar("T")
 

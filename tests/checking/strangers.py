@@ -17,11 +17,11 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from fieldtwin.checking.device_case import DeviceResult
-from fieldtwin.checking.modbus_cases import CASES
-from fieldtwin.checking.modbus_session import ModbusOptions, check_modbus, traits_of
-from fieldtwin.checking.run import Plan
-from fieldtwin.conformance.case import Danger
+from fieldtwin.conformance.core.case import Danger
+from fieldtwin.conformance.devices.device_case import DeviceResult
+from fieldtwin.conformance.devices.modbus.cases import CASES
+from fieldtwin.conformance.devices.modbus.session import ModbusOptions, check_modbus, traits_of
+from fieldtwin.conformance.devices.run import Plan
 from fieldtwin.emulators.endpoints.pty import PtyEnd
 from fieldtwin.gateway.connections.os_connector import OsConnector
 from fieldtwin.gateway.core.connection import ByteConnection

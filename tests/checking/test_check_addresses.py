@@ -9,13 +9,13 @@ from __future__ import annotations
 import pytest
 from devices_in_memory import on_modbus
 
-from fieldtwin.checking.modbus_session import ModbusOptions, check_modbus
-from fieldtwin.checking.run import Plan
-from fieldtwin.cli.check_device_command import _cell
+from fieldtwin.cli.test.check_device_command import _cell
+from fieldtwin.conformance.devices.modbus.session import ModbusOptions, check_modbus
+from fieldtwin.conformance.devices.run import Plan
+from fieldtwin.emulators.endpoints.memory_ports import MemoryNet
 from fieldtwin.emulators.modbus.bank import MapBank, Span
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.emulators.virtual.clock import VirtualClock
-from fieldtwin.emulators.virtual.ports import MemoryNet
 from fieldtwin.gateway.core.errors import UsageError
 
 

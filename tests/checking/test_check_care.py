@@ -10,20 +10,20 @@ import pytest
 from click.testing import CliRunner, Result
 from devices_in_memory import make_unit, on_modbus
 
-from fieldtwin.checking.device_case import DeviceResult
-from fieldtwin.checking.modbus_cases import CASES
-from fieldtwin.checking.modbus_session import ModbusOptions, check_modbus
-from fieldtwin.checking.modbus_wire import READS, WRITES, ModbusWire
-from fieldtwin.checking.paper import canopen_on_paper, modbus_on_paper
-from fieldtwin.checking.run import Plan
-from fieldtwin.cli.check_command import command
-from fieldtwin.conformance.case import Danger
+from fieldtwin.cli.test.check_command import command
+from fieldtwin.conformance.core.case import Danger
+from fieldtwin.conformance.devices.device_case import DeviceResult
+from fieldtwin.conformance.devices.dry_run import canopen_on_paper, modbus_on_paper
+from fieldtwin.conformance.devices.modbus.cases import CASES
+from fieldtwin.conformance.devices.modbus.connection import READS, WRITES, ModbusWire
+from fieldtwin.conformance.devices.modbus.session import ModbusOptions, check_modbus
+from fieldtwin.conformance.devices.run import Plan
+from fieldtwin.emulators.endpoints.memory_ports import MemoryNet
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.emulators.virtual.clock import VirtualClock
-from fieldtwin.emulators.virtual.ports import MemoryNet
 from fieldtwin.gateway.core.connection import ByteConnection
 from fieldtwin.gateway.core.errors import Bug, NotAllowed, Unreachable, UsageError
-from fieldtwin.report.model import Verdict
+from fieldtwin.results.model import Verdict
 
 URL = "tcp://127.0.0.1:0"
 
@@ -179,7 +179,7 @@ def test_a_dry_run_on_every_wire(wire: str) -> None:
 
 
 def test_a_dry_run_of_a_node(tmp_path: Path) -> None:
-    from fieldtwin.checking.canopen_session import CanopenOptions
+    from fieldtwin.conformance.devices.canopen.session import CanopenOptions
 
     plan = Plan(at_most=Danger.DISRUPT, has=frozenset({"object", "i-know"}))
     checked = canopen_on_paper(CanopenOptions("can:socketcan/can0", 5, plan, may_write=((0x2000, 0), (0x2100, 3))))
@@ -194,7 +194,7 @@ def test_lists() -> None:
 
 
 def test_the_docs_have_every_case() -> None:
-    from fieldtwin.checking.canopen_cases import CASES as CANOPEN_CASES
+    from fieldtwin.conformance.devices.canopen.cases import CASES as CANOPEN_CASES
 
     text = (Path(__file__).parents[2] / "docs" / "conformance.md").read_text()
     for case in (*CASES, *CANOPEN_CASES):

@@ -12,10 +12,10 @@ import pytest
 from click.testing import CliRunner, Result
 from devices_in_memory import make_unit
 
-from fieldtwin.cli.check_command import command
+from fieldtwin.cli.test.check_command import command
+from fieldtwin.emulators.endpoints.modbus_server import serve_mbap
 from fieldtwin.emulators.endpoints.socket_end import SocketListener
 from fieldtwin.emulators.modbus.mbap import MbapSlave
-from fieldtwin.emulators.modbus.serve import serve_mbap
 from fieldtwin.gateway.core.connection import ByteConnection
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import FileInvalid

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fieldtwin.checking.modbus_frames import Answer, framed, mbap, replies
+from fieldtwin.conformance.devices.modbus.frames import Answer, framed, mbap, replies
 
 FRAMINGS = ("rtu", "ascii", "mbap")
 units = st.integers(0, 255)

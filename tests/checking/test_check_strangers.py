@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 from strangers import check_all, version_of
 
-from fieldtwin.checking.device_case import DeviceResult
-from fieldtwin.report.model import Verdict
+from fieldtwin.conformance.devices.device_case import DeviceResult
+from fieldtwin.results.model import Verdict
 
 pytestmark = [
     pytest.mark.interop,

@@ -6,14 +6,14 @@ import pytest
 import wrong_devices as wrong
 from devices_in_memory import on_modbus
 
-from fieldtwin.checking.device_case import DeviceResult
-from fieldtwin.checking.modbus_session import ModbusOptions, check_modbus
-from fieldtwin.checking.run import Plan
-from fieldtwin.conformance.case import Danger
+from fieldtwin.conformance.core.case import Danger
+from fieldtwin.conformance.devices.device_case import DeviceResult
+from fieldtwin.conformance.devices.modbus.session import ModbusOptions, check_modbus
+from fieldtwin.conformance.devices.run import Plan
+from fieldtwin.emulators.endpoints.memory_ports import MemoryNet
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.emulators.virtual.clock import VirtualClock
-from fieldtwin.emulators.virtual.ports import MemoryNet
-from fieldtwin.report.model import Verdict
+from fieldtwin.results.model import Verdict
 
 HAS = frozenset({"holding", "coil", "i-know"})
 

@@ -16,25 +16,26 @@ from click.testing import CliRunner
 from devices_in_memory import make_unit, on_modbus
 from wrong_devices import twisted
 
-from fieldtwin.checking import canopen_cases, modbus_cases
-from fieldtwin.checking.device_case import DeviceCase, DeviceResult
-from fieldtwin.checking.html import overall, render_html
-from fieldtwin.checking.modbus_session import ModbusOptions, check_modbus
-from fieldtwin.checking.results import as_json, as_report
-from fieldtwin.checking.run import Plan
-from fieldtwin.checking.subject import Subject
-from fieldtwin.cli.check_view import style_of
-from fieldtwin.cli.report_command import command as report
-from fieldtwin.conformance.case import Basis, failed, passed
-from fieldtwin.conformance.results import exit_code
+from fieldtwin.cli.system.report_command import command as report
+from fieldtwin.cli.test.check_view import style_of
+from fieldtwin.conformance.core.case import Basis, failed, passed
+from fieldtwin.conformance.core.results import exit_code
+from fieldtwin.conformance.devices.canopen import cases as canopen_cases
+from fieldtwin.conformance.devices.device_case import DeviceCase, DeviceResult
+from fieldtwin.conformance.devices.modbus import cases as modbus_cases
+from fieldtwin.conformance.devices.modbus.session import ModbusOptions, check_modbus
+from fieldtwin.conformance.devices.results import as_json, as_report
+from fieldtwin.conformance.devices.run import Plan
+from fieldtwin.emulators.endpoints.memory_ports import MemoryNet
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.emulators.virtual.clock import VirtualClock
-from fieldtwin.emulators.virtual.ports import MemoryNet
 from fieldtwin.gateway.core.connection import ByteConnection
 from fieldtwin.gateway.core.errors import ConnectionLost
 from fieldtwin.gateway.protocols.modbus.crc import crc16, with_crc
-from fieldtwin.report.junit import render_junit
-from fieldtwin.report.model import Verdict
+from fieldtwin.reports.conformance.device import overall, render_html
+from fieldtwin.reports.junit import render_junit
+from fieldtwin.results.model import Verdict
+from fieldtwin.results.subject import Subject
 
 CASES: tuple[DeviceCase[object], ...] = (*modbus_cases.CASES, *canopen_cases.CASES)  # type: ignore[arg-type]
 CLAUSE = re.compile(r"^(?:(?:SL|AP|TG) )?\d+(?:\.\d+)*(?:$|[;,])")

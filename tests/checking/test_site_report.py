@@ -13,21 +13,21 @@ from click.testing import CliRunner, Result
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fieldtwin.checking.device_case import DeviceResult, Spoken
-from fieldtwin.checking.html import render_html as render_check
-from fieldtwin.checking.modbus_cases import CASES
-from fieldtwin.checking.results import as_json, as_report
-from fieldtwin.checking.subject import Subject
-from fieldtwin.cli.compare_command import command as compare
-from fieldtwin.cli.diff_command import command as diff
-from fieldtwin.cli.report_command import command
-from fieldtwin.conformance.case import failed, inconclusive, passed, skipped
+from fieldtwin.cli.device.diff_command import command as diff
+from fieldtwin.cli.recordings.compare_command import command as compare
+from fieldtwin.cli.system.report_command import command
+from fieldtwin.conformance.core.case import failed, inconclusive, passed, skipped
+from fieldtwin.conformance.devices.device_case import DeviceResult, Spoken
+from fieldtwin.conformance.devices.modbus.cases import CASES
+from fieldtwin.conformance.devices.results import as_json, as_report
 from fieldtwin.gateway.core.connection import Direction
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
-from fieldtwin.report.junit import render_junit
-from fieldtwin.sitereport.html import render_html
-from fieldtwin.sitereport.reading import read_site
-from fieldtwin.sitereport.reading_dump import dump_piece
+from fieldtwin.reports.conformance.device import render_html as render_check
+from fieldtwin.reports.junit import render_junit
+from fieldtwin.reports.site.html import render_html
+from fieldtwin.reports.site.reading import read_site
+from fieldtwin.reports.site.reading_dump import dump_piece
+from fieldtwin.results.subject import Subject
 
 ROOT = Path(__file__).parents[2]
 NASTY = "<script>alert('1')</script>"

@@ -6,21 +6,21 @@ import asyncio
 from collections.abc import Callable, Coroutine
 from pathlib import Path
 
-from fieldtwin.conformance.canopen_cases import CASES as CANOPEN_CASES
-from fieldtwin.conformance.canopen_cases import SILENT as CANOPEN_SILENT
-from fieldtwin.conformance.canopen_stage import CanopenStage
-from fieldtwin.conformance.modbus_cases import CASES, SILENT
-from fieldtwin.conformance.modbus_stage import Stage, traits, wire_for
-from fieldtwin.conformance.observation import Word
-from fieldtwin.conformance.probe import Classifier
-from fieldtwin.conformance.results import CaseResult
-from fieldtwin.conformance.run import MasterRun, Plan
+from fieldtwin.conformance.clients.canopen.cases import CASES as CANOPEN_CASES
+from fieldtwin.conformance.clients.canopen.cases import SILENT as CANOPEN_SILENT
+from fieldtwin.conformance.clients.canopen.hostile_node import CanopenStage
+from fieldtwin.conformance.clients.modbus.cases import CASES, SILENT
+from fieldtwin.conformance.clients.modbus.hostile_server import Stage, traits, wire_for
+from fieldtwin.conformance.clients.probe import Classifier
+from fieldtwin.conformance.clients.run import MasterRun, Plan
+from fieldtwin.conformance.core.observation import Word
+from fieldtwin.conformance.core.results import CaseResult
+from fieldtwin.emulators.endpoints.memory_ports import MemoryNet
 from fieldtwin.emulators.virtual.clock import VirtualClock
 from fieldtwin.emulators.virtual.loop import VirtualLoop
-from fieldtwin.emulators.virtual.ports import MemoryNet
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import FieldtwinError, ReplyTimeout
-from fieldtwin.gateway.core.nursery import Nursery
 from fieldtwin.gateway.protocols.canopen.master import CanopenMaster
 from fieldtwin.gateway.protocols.canopen.nmt import NmtCommand, NodeEvent
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient

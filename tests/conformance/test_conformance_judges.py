@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import pytest
 
-from fieldtwin.conformance import judges
-from fieldtwin.conformance.canopen_cases import CASES as CANOPEN_CASES
-from fieldtwin.conformance.canopen_judges import legal_nmt, legal_sync, takes_the_switch
-from fieldtwin.conformance.case import Judge
-from fieldtwin.conformance.habits import (
+from fieldtwin.conformance.clients import checks as judges
+from fieldtwin.conformance.clients.canopen.cases import CASES as CANOPEN_CASES
+from fieldtwin.conformance.clients.canopen.checks import legal_nmt, legal_sync, takes_the_switch
+from fieldtwin.conformance.clients.habits import (
     bounded_addresses,
     broadcasts_wait,
     few_connections,
     legal_requests,
     no_broadcast_reads,
 )
-from fieldtwin.conformance.modbus_cases import CASES
-from fieldtwin.conformance.observation import (
+from fieldtwin.conformance.clients.modbus.cases import CASES
+from fieldtwin.conformance.core.case import Judge
+from fieldtwin.conformance.core.observation import (
     Asked,
     Came,
     Ended,
@@ -31,7 +31,7 @@ from fieldtwin.conformance.observation import (
     Word,
 )
 from fieldtwin.gateway.core.clock import NS_PER_S
-from fieldtwin.report.model import Verdict
+from fieldtwin.results.model import Verdict
 
 READ = bytes((17, 3, 0, 107, 0, 2))
 S = NS_PER_S

@@ -15,14 +15,14 @@ import pytest
 from masters_in_memory import Publish, judge
 from test_strange_masters_judged import CANOPEN, run_check
 
-from fieldtwin.conformance.observation import Word
-from fieldtwin.conformance.probe import Classifier, MarkedOutputProbe, OutputProbe
+from fieldtwin.conformance.clients.probe import Classifier, MarkedOutputProbe, OutputProbe
+from fieldtwin.conformance.core.observation import Word
+from fieldtwin.emulators.endpoints.memory_ports import MemoryNet
 from fieldtwin.emulators.modbus.rtu_receiver import crc16, with_crc
 from fieldtwin.emulators.virtual.clock import VirtualClock
-from fieldtwin.emulators.virtual.ports import MemoryNet
 from fieldtwin.gateway.core.connection import ByteConnection
 from fieldtwin.gateway.core.endpoint import Endpoint
-from fieldtwin.report.model import Verdict
+from fieldtwin.results.model import Verdict
 
 pytestmark = pytest.mark.long
 

@@ -18,15 +18,15 @@ import pytest
 from masters_in_memory import judge, ours
 from test_strange_masters_judged import environment
 
-from fieldtwin.checking import canopen_cases as canopen_devices
-from fieldtwin.checking import modbus_cases as modbus_devices
-from fieldtwin.checking.master_html import render_master_html
-from fieldtwin.cli.check_view import listed, print_results, style_of, why
-from fieldtwin.conformance.canopen_cases import CASES as CANOPEN_MASTERS
-from fieldtwin.conformance.case import OTHER_WIRE, OWN, About, Basis, failed, passed, skipped
-from fieldtwin.conformance.modbus_cases import CASES as MODBUS_MASTERS
-from fieldtwin.conformance.results import CaseResult, as_json, as_report, exit_code
-from fieldtwin.report.junit import render_junit
+from fieldtwin.cli.test.check_view import listed, print_results, style_of, why
+from fieldtwin.conformance.clients.canopen.cases import CASES as CANOPEN_MASTERS
+from fieldtwin.conformance.clients.modbus.cases import CASES as MODBUS_MASTERS
+from fieldtwin.conformance.core.case import OTHER_WIRE, OWN, About, Basis, failed, passed, skipped
+from fieldtwin.conformance.core.results import CaseResult, as_json, as_report, exit_code
+from fieldtwin.conformance.devices.canopen import cases as canopen_devices
+from fieldtwin.conformance.devices.modbus import cases as modbus_devices
+from fieldtwin.reports.conformance.client import render_master_html
+from fieldtwin.reports.junit import render_junit
 
 MASTERS: dict[str, About] = {case.about.id: case.about for case in (*MODBUS_MASTERS, *CANOPEN_MASTERS)}
 DEVICES: tuple[About, ...] = (*modbus_devices.CASES, *canopen_devices.CASES)

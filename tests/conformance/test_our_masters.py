@@ -16,14 +16,14 @@ from masters_in_memory import (
     ours,
 )
 
-from fieldtwin.conformance.modbus_cases import CASES
-from fieldtwin.conformance.results import CaseResult
+from fieldtwin.conformance.clients.modbus.cases import CASES
+from fieldtwin.conformance.core.results import CaseResult
+from fieldtwin.emulators.endpoints.memory_ports import MemoryNet
 from fieldtwin.emulators.virtual.clock import VirtualClock
-from fieldtwin.emulators.virtual.ports import MemoryNet
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import ConnectionLost, FieldtwinError, WireError
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient
-from fieldtwin.report.model import Verdict
+from fieldtwin.results.model import Verdict
 
 NOT_ITS_BUSINESS = {
     "MB-021": "polls no sooner than its timeout",

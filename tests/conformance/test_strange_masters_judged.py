@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 
-from fieldtwin.conformance.canopen_cases import CASES as CANOPEN_CASES
-from fieldtwin.conformance.modbus_cases import CASES
+from fieldtwin.conformance.clients.canopen.cases import CASES as CANOPEN_CASES
+from fieldtwin.conformance.clients.modbus.cases import CASES
 
 ROOT = Path(__file__).parents[2]
 

@@ -16,8 +16,8 @@ from xml.etree import ElementTree as ET
 import pytest
 from test_strange_masters_judged import CANOPEN, environment
 
-from fieldtwin.conformance.evidence import reproduce
-from fieldtwin.decoding.canopen_wire import CanopenWire
+from fieldtwin.capture.decoding.canopen_bus import CanopenWire
+from fieldtwin.conformance.core.evidence import reproduce
 from fieldtwin.gateway.core.canframe import CanFrame
 
 TAKES_ALL = """

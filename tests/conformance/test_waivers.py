@@ -9,14 +9,14 @@ from xml.etree import ElementTree as ET
 
 import pytest
 
-from fieldtwin.conformance.case import Finding, failed, passed, skipped
-from fieldtwin.conformance.modbus_cases import CASES
-from fieldtwin.conformance.results import CaseResult, as_json, as_report, exit_code, waive
-from fieldtwin.conformance.waivers import Waivers, read_waivers
+from fieldtwin.conformance.clients.modbus.cases import CASES
+from fieldtwin.conformance.core.case import Finding, failed, passed, skipped
+from fieldtwin.conformance.core.results import CaseResult, as_json, as_report, exit_code, waive
+from fieldtwin.conformance.core.waivers import Waivers, read_waivers
 from fieldtwin.gateway.core.errors import FileInvalid
-from fieldtwin.gateway.core.yaml_file import parse
-from fieldtwin.report.junit import write_junit
-from fieldtwin.report.model import Verdict
+from fieldtwin.gateway.core.files.yaml_file import parse
+from fieldtwin.reports.junit import write_junit
+from fieldtwin.results.model import Verdict
 
 KNOWN = {"MB-013", "MB-015", "MB-015a"}
 CASE = next(c.about for c in CASES if c.about.id == "MB-015a")

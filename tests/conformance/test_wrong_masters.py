@@ -8,14 +8,14 @@ from collections.abc import Callable
 import pytest
 from masters_in_memory import LAZY_S, Publish, judge, judge_canopen
 
+from fieldtwin.emulators.endpoints.memory_ports import MemoryNet
 from fieldtwin.emulators.modbus.rtu_receiver import crc16, with_crc
 from fieldtwin.emulators.virtual.clock import VirtualClock
-from fieldtwin.emulators.virtual.ports import MemoryNet
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.connection import ByteConnection
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import ConnectionLost
-from fieldtwin.report.model import Verdict
+from fieldtwin.results.model import Verdict
 
 REQUEST = bytes((17, 3, 0, 107, 0, 2))
 TIMEOUT_S = 0.2

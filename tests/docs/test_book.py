@@ -19,7 +19,7 @@ import stage as book
 
 import fieldtwin
 from fieldtwin.cli.main import COMMANDS
-from fieldtwin.cli.schema_command import SCHEMAS
+from fieldtwin.cli.system.schema_command import SCHEMAS
 
 
 def test_links_between_files_lead_somewhere():

@@ -15,12 +15,12 @@ from typing import Any
 
 from fieldtwin.emulators.virtual.loop import VirtualLoop
 from fieldtwin.gateway.core.clock import NS_PER_S
-from fieldtwin.gateway.core.image import TagKind
-from fieldtwin.gateway.runtime.canopen_bus import CanopenBus
+from fieldtwin.gateway.core.image.image import TagKind
+from fieldtwin.gateway.runtime.buses.canopen_bus import CanopenBus
 from fieldtwin.plc.program import Program, ScanInfo, var_input, var_local, var_output
-from fieldtwin.running.virtual_bench import VirtualBench
-from fieldtwin.running.virtual_run import VirtualOptions, VirtualRun
-from fieldtwin.scenarios.trace import Event, Kind
+from fieldtwin.results.trace import Event, Kind
+from fieldtwin.run.benches.virtual_bench import VirtualBench
+from fieldtwin.run.virtual.run import VirtualOptions, VirtualRun
 
 LASTS_S, AFTER_S, FIRST_S = 2.0, 2.6, 5.0
 ROW_S = LASTS_S + AFTER_S

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from fieldtwin.report.model import Verdict
-from fieldtwin.running.virtual_scenario import run_virtual
-from fieldtwin.scenarios.form import load_scenario
+from fieldtwin.results.model import Verdict
+from fieldtwin.run.targets.virtual_scenario import run_virtual
+from fieldtwin.scenarios.language.form import load_scenario
 
 FOLDER = Path(__file__).parent / "scenarios"
 FILES = sorted(FOLDER.glob("*.scenario.yaml"))

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from fieldtwin.cli.faults_command import command
+from fieldtwin.cli.emulate.faults_command import command
 from fieldtwin.emulators.faults.frames import Framing
 from fieldtwin.emulators.faults.json_schema import fault_defs
 from fieldtwin.emulators.faults.on_link import wire_faults

@@ -13,7 +13,7 @@ from faults_rig import Seen, through
 
 from fieldtwin.emulators.faults.registry import FAULTS
 from fieldtwin.gateway.core.errors import UsageError
-from fieldtwin.running.virtual_bench import VirtualBench
+from fieldtwin.run.benches.virtual_bench import VirtualBench
 
 NOBODY: frozenset[str] = frozenset()
 

@@ -12,6 +12,7 @@ from support import eventually, run
 
 from fieldtwin.emulators.endpoints.faulty import FaultyEnd
 from fieldtwin.emulators.endpoints.faulty_udp import FaultyDatagrams
+from fieldtwin.emulators.endpoints.modbus_server import serve_udp
 from fieldtwin.emulators.endpoints.ports import OsPorts
 from fieldtwin.emulators.endpoints.pty import PtyEnd
 from fieldtwin.emulators.faults.frames import Framing
@@ -19,7 +20,6 @@ from fieldtwin.emulators.faults.on_link import wire_faults
 from fieldtwin.emulators.link import Link
 from fieldtwin.emulators.modbus.bank import MapBank, Span
 from fieldtwin.emulators.modbus.mbap import MbapSlave
-from fieldtwin.emulators.modbus.serve import serve_udp
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.connection import ByteConnection

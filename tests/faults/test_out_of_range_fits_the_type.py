@@ -11,19 +11,19 @@ from pathlib import Path
 
 import pytest
 
-from fieldtwin.emulators.faults.of_device import DeviceFaults, check_device
+from fieldtwin.emulators.device_faults import DeviceFaults, check_device
 from fieldtwin.emulators.faults.schema import load_faults, parse_fault
 from fieldtwin.emulators.recorded_device import RecordedDevice
 from fieldtwin.emulators.replay.replay import ExchangeReplay
 from fieldtwin.emulators.stated import cells_of
 from fieldtwin.gateway.core.connection import RS232Connection
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
-from fieldtwin.gateway.core.profile import load_profile
-from fieldtwin.gateway.core.recording import Exchange
-from fieldtwin.report.model import Verdict
-from fieldtwin.running.fault_schedule import RandomFaults, random_schedule
-from fieldtwin.running.scenario_targets import Target, run_scenario
-from fieldtwin.scenarios.form import load_scenario
+from fieldtwin.gateway.core.files.profile import load_profile
+from fieldtwin.gateway.core.files.recording import Exchange
+from fieldtwin.results.model import Verdict
+from fieldtwin.run.targets.scenario_targets import Target, run_scenario
+from fieldtwin.run.virtual.fault_schedule import RandomFaults, random_schedule
+from fieldtwin.scenarios.language.form import load_scenario
 from fieldtwin.twin.prototype.fault_aims import target
 
 PROFILE = """device: fieldtwin/tank

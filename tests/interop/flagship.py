@@ -17,22 +17,22 @@ from support import eventually
 from fieldtwin.gateway.connections.os_connector import OsConnector
 from fieldtwin.gateway.connections.tap import Captured, CaptureTap, TappedConnector
 from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.connection import Direction
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import DeviceRefused, FieldtwinError
-from fieldtwin.gateway.core.nursery import Nursery
 from fieldtwin.gateway.core.values import Quality
 from fieldtwin.gateway.devices.canopen_device import CanopenDriver
 from fieldtwin.gateway.devices.register_device import RegisterDriver
 from fieldtwin.gateway.devices.transmitter import TransmitterDriver
-from fieldtwin.gateway.runtime.audit import AuditLog
-from fieldtwin.gateway.runtime.canopen_bus import CanopenBus
+from fieldtwin.gateway.runtime.audit_log import AuditLog
+from fieldtwin.gateway.runtime.buses.canopen_bus import CanopenBus
+from fieldtwin.gateway.runtime.buses.modbus_bus import Job, ModbusBus
 from fieldtwin.gateway.runtime.gateway import Gateway
-from fieldtwin.gateway.runtime.modbus_bus import Job, ModbusBus
 from fieldtwin.gateway.runtime.tags import TagTable
 from fieldtwin.gateway.store.exchange_log import ExchangeLog
 from fieldtwin.gateway.wallclock import WallClock
-from fieldtwin.running.children import Child
+from fieldtwin.run.processes.children import Child
 from fieldtwin.twin.plant.mapping import MappedConnector
 from fieldtwin.twin.plant.physical import attached, gateway_config, image_layout, make_image, plc_config
 from fieldtwin.twin.site.system import System, load_system

@@ -24,11 +24,11 @@ from conversation import Conversation
 from support import eventually
 
 from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.endpoint import Endpoint
-from fieldtwin.gateway.core.nursery import Nursery
 from fieldtwin.gateway.wallclock import WallClock
-from fieldtwin.running.children import Child
-from fieldtwin.running.shore import Shore
+from fieldtwin.run.processes.children import Child
+from fieldtwin.run.processes.topside import Shore
 from fieldtwin.twin.plant.mapping import mapped_endpoint
 from fieldtwin.twin.prototype.field_process import FieldConfig
 from fieldtwin.twin.site.system import load_system

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 from tshark import dissect, needs_tshark
 
-from fieldtwin.decoding.decoder import exchanges, frame_events
-from fieldtwin.decoding.exchange import Exchange
+from fieldtwin.capture.decoding.decoder import exchanges, frame_events
+from fieldtwin.capture.decoding.exchange import Exchange
 from fieldtwin.gateway.connections.tap import Captured
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.connection import Direction

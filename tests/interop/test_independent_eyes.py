@@ -13,7 +13,7 @@ import pytest
 from held import Held
 from tshark import dissect, needs_tshark
 
-from fieldtwin.formats.pcap import read_capture
+from fieldtwin.capture.formats.pcap import read_capture
 from fieldtwin.gateway.connections.tap import Captured
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.endpoint import Endpoint

@@ -19,14 +19,14 @@ from targets import SYSTEM, at_time, device, field_side, recording
 
 from fieldtwin.emulators.link import run_link
 from fieldtwin.gateway.connections.os_connector import OsConnector
+from fieldtwin.gateway.core.concurrency.events import Consumer
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import FieldtwinError
-from fieldtwin.gateway.core.events import Consumer
-from fieldtwin.gateway.core.nursery import Nursery
 from fieldtwin.gateway.core.values import DATA
 from fieldtwin.gateway.devices.config import BusConfig
 from fieldtwin.gateway.devices.register_device import SensorDriver
-from fieldtwin.gateway.runtime.modbus_bus import Job, ModbusBus
+from fieldtwin.gateway.runtime.buses.modbus_bus import Job, ModbusBus
 from fieldtwin.gateway.runtime.tags import TagTable
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.twin.site.system import load_system

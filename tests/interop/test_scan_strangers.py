@@ -16,10 +16,10 @@ import pytest
 from support import run
 from targets import socat_pair
 
-from fieldtwin.commissioning.identify_modbus import identify_modbus
-from fieldtwin.commissioning.matching import Sureness
-from fieldtwin.commissioning.scan_modbus import ModbusScan, ModbusScanner, ScanOptions
-from fieldtwin.gateway.core.profile import load_profile
+from fieldtwin.commissioning.identify.matching import Sureness
+from fieldtwin.commissioning.identify.modbus import identify_modbus
+from fieldtwin.commissioning.scan.modbus import ModbusScan, ModbusScanner, ScanOptions
+from fieldtwin.gateway.core.files.profile import load_profile
 
 HERE = Path(__file__).parent
 PEERS = [

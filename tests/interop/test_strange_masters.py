@@ -16,18 +16,18 @@ import pytest
 from support import run
 from tshark import dissect
 
+from fieldtwin.emulators.endpoints.modbus_server import serve_mbap, serve_rtu
 from fieldtwin.emulators.endpoints.pty import PtyEnd
 from fieldtwin.emulators.endpoints.socket_end import SocketListener
 from fieldtwin.emulators.modbus.ascii import AsciiSlave
 from fieldtwin.emulators.modbus.bank import MapBank, Span
 from fieldtwin.emulators.modbus.mbap import MbapSlave
 from fieldtwin.emulators.modbus.rtu import RtuSlave
-from fieldtwin.emulators.modbus.serve import serve_mbap, serve_rtu
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.connections.tap import Captured
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.connection import Direction
 from fieldtwin.gateway.core.endpoint import Endpoint
-from fieldtwin.gateway.core.nursery import Nursery
 from fieldtwin.gateway.wallclock import WallClock
 
 pytestmark = pytest.mark.interop

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from fieldtwin.formats.pcap import write_pcap
+from fieldtwin.capture.formats.pcap import write_pcap
 from fieldtwin.gateway.connections.tap import Captured
 from fieldtwin.gateway.core.endpoint import Endpoint
 

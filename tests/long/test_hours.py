@@ -13,9 +13,9 @@ from pathlib import Path
 
 import pytest
 
-from fieldtwin.running.fault_schedule import RandomFaults
-from fieldtwin.running.many_seeds import run_seeds
-from fieldtwin.running.virtual_run import VirtualOptions
+from fieldtwin.run.campaigns.many_seeds import run_seeds
+from fieldtwin.run.virtual.fault_schedule import RandomFaults
+from fieldtwin.run.virtual.run import VirtualOptions
 
 pytestmark = [pytest.mark.long, pytest.mark.timeout(3600)]
 HOURS = int(os.environ.get("FIELDTWIN_LONG_HOURS", "100"))

@@ -10,11 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from packets import read, values
 
+from fieldtwin.capture.recordings.comparing import Comparer, Comparison, Rules, Tolerance, pairs_of, request_of
+from fieldtwin.capture.recordings.comparing_can import compare_logs
 from fieldtwin.gateway.core.canframe import CanFrame
-from fieldtwin.gateway.core.profile import DeviceProfile, load_profile
-from fieldtwin.gateway.core.recording import Exchange
-from fieldtwin.recording.comparing import Comparer, Comparison, Rules, Tolerance, pairs_of, request_of
-from fieldtwin.recording.comparing_can import compare_logs
+from fieldtwin.gateway.core.files.profile import DeviceProfile, load_profile
+from fieldtwin.gateway.core.files.recording import Exchange
 
 MS = 1_000_000
 

@@ -12,12 +12,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fieldtwin.capture.recordings.aligning import _overlaps
+from fieldtwin.capture.recordings.comparing import Comparer, Comparison, Rules, Tolerance
+from fieldtwin.commissioning.record.comparing import compare_device
 from fieldtwin.emulators.context import WhenUsedUp
 from fieldtwin.emulators.replay.replay import ExchangeReplay
-from fieldtwin.gateway.core.recording import Exchange
-from fieldtwin.recording.aligning import _overlaps
-from fieldtwin.recording.comparing import Comparer, Comparison, Rules, Tolerance
-from fieldtwin.recording.live_comparing import compare_device
+from fieldtwin.gateway.core.files.recording import Exchange
 
 READ = bytes.fromhex("03 0000 0002")
 ONE = bytes.fromhex("03 0000 0001")

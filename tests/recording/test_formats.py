@@ -12,17 +12,23 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from fieldtwin.formats.can_files import SUFFIXES, read_can_file
-from fieldtwin.formats.candump import LeftOut, line_of, read_log
-from fieldtwin.formats.csv_table import import_csv
-from fieldtwin.formats.poll_text import read_polls
+from fieldtwin.capture.formats.can_files import SUFFIXES, read_can_file
+from fieldtwin.capture.formats.candump import LeftOut, line_of, read_log
+from fieldtwin.capture.formats.csv_table import import_csv
+from fieldtwin.capture.formats.poll_text import read_polls
+from fieldtwin.capture.recordings.exporting import export
+from fieldtwin.capture.recordings.importing import import_can, import_polls, kind_of
+from fieldtwin.capture.recordings.rotating_file import exchanges_of
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid, UsageError
-from fieldtwin.gateway.core.profile import load_profile
-from fieldtwin.gateway.core.recording import Exchange, RecordingHeader, RecordingReader, encode_exchange, encode_header
-from fieldtwin.recording.exporting import export
-from fieldtwin.recording.importing import import_can, import_polls, kind_of
-from fieldtwin.recording.rotating import exchanges_of
+from fieldtwin.gateway.core.files.profile import load_profile
+from fieldtwin.gateway.core.files.recording import (
+    Exchange,
+    RecordingHeader,
+    RecordingReader,
+    encode_exchange,
+    encode_header,
+)
 
 ROOT = Path(__file__).parents[2]
 TSHARK = shutil.which("tshark")
@@ -353,7 +359,7 @@ def test_packed_blocks_and_lines_without_an_end_take_no_memory(tmp_path: Path) -
 def test_the_summary_of_an_import_as_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     from click.testing import CliRunner
 
-    from fieldtwin.cli.import_command import command
+    from fieldtwin.cli.recordings.import_command import command
 
     path = table(tmp_path, "t,a\n0,1\n1,2\n")
     result = CliRunner().invoke(command, [str(path), "-o", str(tmp_path / "r.jsonl"), "--json"], standalone_mode=False)

@@ -12,11 +12,11 @@ from pathlib import Path
 
 import pytest
 
-from fieldtwin.gateway.core.recording import RecordingHeader, RecordingWriter, SignalInfo
-from fieldtwin.recording.exporting import export
-from fieldtwin.report.html import render_html
-from fieldtwin.report.junit import render_junit
-from fieldtwin.report.model import Report, ScenarioResult, Verdict
+from fieldtwin.capture.recordings.exporting import export
+from fieldtwin.gateway.core.files.recording import RecordingHeader, RecordingWriter, SignalInfo
+from fieldtwin.reports.junit import render_junit
+from fieldtwin.reports.run.html import render_html
+from fieldtwin.results.model import Report, ScenarioResult, Verdict
 from fieldtwin.service.exposition import Family, render
 
 FORMULAS = ("=1+1", "+1+1", "-1+1", "@SUM(A1)", "\t=1+1", "\r=1+1", '=HYPERLINK("http://x","y")')

@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from fieldtwin.cli.infer_command import command
-from fieldtwin.commissioning.recorded_passes import dump_of_recording
+from fieldtwin.cli.device.infer_command import command
+from fieldtwin.commissioning.infer.recorded_passes import dump_of_recording
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
-from fieldtwin.gateway.core.recording import Exchange, RecordingHeader, encode_exchange, encode_header
+from fieldtwin.gateway.core.files.recording import Exchange, RecordingHeader, encode_exchange, encode_header
 
 HEADER = RecordingHeader(version=1, device="sniffed/line", kind="exchanges", source="measured")
 FAST, SLOW = bytes.fromhex("0300000002"), bytes.fromhex("0400100001")

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import pytest
 
+from fieldtwin.capture.formats.candump import line_of
+from fieldtwin.capture.recordings.log_sheet import LogSheet, nodes_of
 from fieldtwin.emulators.canopen.dictionary import parse_eds
 from fieldtwin.emulators.canopen.node import CanopenNode, NodeContext
 from fieldtwin.emulators.replay.can_log import read_can_log
 from fieldtwin.emulators.replay.objects import RecordedObjects
-from fieldtwin.formats.candump import line_of
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.errors import UsageError
-from fieldtwin.recording.log_sheet import LogSheet, nodes_of
 
 MS = 1_000_000
 Log = list[tuple[int, CanFrame]]

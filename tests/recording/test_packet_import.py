@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 from packets import CLIENT, SERVER, SYN, Talk, mbap, pcap, pcapng, read, tcp, udp6, values, write
 from test_pairing import crc
 
-from fieldtwin.formats.packet_file import PacketFile
-from fieldtwin.formats.pcap import read_capture
+from fieldtwin.capture.formats.packet_file import PacketFile
+from fieldtwin.capture.formats.pcap import read_capture
+from fieldtwin.capture.recordings.from_packets import PacketImport, PacketSummary
 from fieldtwin.gateway.core.errors import FileInvalid
-from fieldtwin.gateway.core.profile import load_profile
-from fieldtwin.gateway.core.recording import Exchange, RecordingReader
-from fieldtwin.recording.from_packets import PacketImport, PacketSummary
+from fieldtwin.gateway.core.files.profile import load_profile
+from fieldtwin.gateway.core.files.recording import Exchange, RecordingReader
 
 
 def exchanges(path: Path) -> list[Exchange]:

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from packets import mbap, read, values
 
-from fieldtwin.gateway.core.recording import Exchange
-from fieldtwin.recording.pairing import Bad, MbapPairer, OneWirePairer, Pairer, SerialPairer
+from fieldtwin.capture.recordings.pairing import Bad, MbapPairer, OneWirePairer, Pairer, SerialPairer
+from fieldtwin.gateway.core.files.recording import Exchange
 
 MS = 1_000_000
 

@@ -15,11 +15,17 @@ from typing import Any
 import pytest
 from click.testing import CliRunner
 
-from fieldtwin.cli.compare_command import command as compare
-from fieldtwin.cli.export_command import command as export
-from fieldtwin.cli.record_command import command as record
+from fieldtwin.cli.recordings.compare_command import command as compare
+from fieldtwin.cli.recordings.export_command import command as export
+from fieldtwin.cli.recordings.record_command import command as record
 from fieldtwin.gateway.core.errors import FileInvalid, NotAllowed, Unreachable, UsageError
-from fieldtwin.gateway.core.recording import Exchange, RecordingHeader, RecordingReader, encode_exchange, encode_header
+from fieldtwin.gateway.core.files.recording import (
+    Exchange,
+    RecordingHeader,
+    RecordingReader,
+    encode_exchange,
+    encode_header,
+)
 
 ROOT = Path(__file__).parents[2]
 

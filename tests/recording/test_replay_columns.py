@@ -12,7 +12,7 @@ from packets import read, values
 from fieldtwin.emulators.context import WhenUsedUp
 from fieldtwin.emulators.replay import learning
 from fieldtwin.emulators.replay.replay import ExchangeReplay, NeverRecorded
-from fieldtwin.gateway.core.recording import Exchange
+from fieldtwin.gateway.core.files.recording import Exchange
 
 
 def asked(request: bytes, reply: bytes | None, t_s: float = 0.0, unit: int = 1) -> Exchange:

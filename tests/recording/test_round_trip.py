@@ -17,33 +17,17 @@ from pymodbus.server import ModbusTcpServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 from support import eventually, run
 
-from fieldtwin.commissioning.reading import target_of
-from fieldtwin.emulators.canopen.serve import serve_node
-from fieldtwin.emulators.context import WhenUsedUp
-from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
-from fieldtwin.emulators.models.emulated_node import emulated_node
-from fieldtwin.emulators.replay.can_log import CanLog
-from fieldtwin.emulators.replay.replay import NeverRecorded
-from fieldtwin.emulators.signals import SignalPlayer, SignalTrack
-from fieldtwin.formats.candump import read_log
-from fieldtwin.formats.pcap import read_capture
-from fieldtwin.gateway.connections.os_connector import OsConnector
-from fieldtwin.gateway.core.canframe import CanFrame
-from fieldtwin.gateway.core.connection import Direction
-from fieldtwin.gateway.core.endpoint import Endpoint
-from fieldtwin.gateway.core.errors import Unreachable, UsageError
-from fieldtwin.gateway.core.nursery import Nursery
-from fieldtwin.gateway.core.profile import load_profile
-from fieldtwin.gateway.core.recording import Exchange, RecordingHeader, encode_exchange, encode_header
-from fieldtwin.gateway.protocols.modbus.client import ModbusClient
-from fieldtwin.gateway.protocols.modbus.requests import ReadRegisters
-from fieldtwin.gateway.wallclock import WallClock
-from fieldtwin.recording.asking import asker_at
-from fieldtwin.recording.comparing import Comparer, Comparison, Rules, pairs_of, request_of
-from fieldtwin.recording.comparing_can import Frames, compare_logs
-from fieldtwin.recording.importing import import_capture
-from fieldtwin.recording.live_comparing import compare_device
-from fieldtwin.recording.polling import (
+from fieldtwin.capture.formats.candump import read_log
+from fieldtwin.capture.formats.pcap import read_capture
+from fieldtwin.capture.recordings.comparing import Comparer, Comparison, Rules, pairs_of, request_of
+from fieldtwin.capture.recordings.comparing_can import Frames, compare_logs
+from fieldtwin.capture.recordings.importing import import_capture
+from fieldtwin.capture.recordings.rotating_file import RotatingFile, exchanges_of, part, parts_of
+from fieldtwin.capture.recordings.sinks import CanLogSink, ExchangeSink, LineSink
+from fieldtwin.commissioning.access.reading import target_of
+from fieldtwin.commissioning.record.asking import asker_at
+from fieldtwin.commissioning.record.comparing import compare_device
+from fieldtwin.commissioning.record.polling import (
     PollCounters,
     ProfileRound,
     Round,
@@ -52,10 +36,26 @@ from fieldtwin.recording.polling import (
     record_node,
     record_polls,
 )
-from fieldtwin.recording.rotating import RotatingFile, exchanges_of, part, parts_of
-from fieldtwin.recording.sinks import CanLogSink, ExchangeSink, LineSink
-from fieldtwin.recording.tapping import LineTap
-from fieldtwin.running.device_here import DeviceHost, as_it_was_recorded
+from fieldtwin.commissioning.record.tapping import LineTap
+from fieldtwin.emulators.canopen.serve import serve_node
+from fieldtwin.emulators.context import WhenUsedUp
+from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
+from fieldtwin.emulators.models.emulated_node import emulated_node
+from fieldtwin.emulators.replay.can_log import CanLog
+from fieldtwin.emulators.replay.replay import NeverRecorded
+from fieldtwin.emulators.signals import SignalPlayer, SignalTrack
+from fieldtwin.gateway.connections.os_connector import OsConnector
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
+from fieldtwin.gateway.core.connection import Direction
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import Unreachable, UsageError
+from fieldtwin.gateway.core.files.profile import load_profile
+from fieldtwin.gateway.core.files.recording import Exchange, RecordingHeader, encode_exchange, encode_header
+from fieldtwin.gateway.protocols.modbus.client import ModbusClient
+from fieldtwin.gateway.protocols.modbus.requests import ReadRegisters
+from fieldtwin.gateway.wallclock import WallClock
+from fieldtwin.run.emulate.device import DeviceHost, as_it_was_recorded
 
 ROOT = Path(__file__).parents[2]
 HEADER = RecordingHeader(version=1, device="a/b", kind="exchanges", source="measured")
@@ -410,8 +410,8 @@ def test_a_killed_recorder_loses_the_last_record_at_most(tmp_path: Path) -> None
     """Records are counted by their content; the recorder says each number before it writes it."""
     program = (
         "import sys; from pathlib import Path\n"
-        "from fieldtwin.recording.rotating import RotatingFile\n"
-        "from fieldtwin.gateway.core.recording import *\n"
+        "from fieldtwin.capture.recordings.rotating_file import RotatingFile\n"
+        "from fieldtwin.gateway.core.files.recording import *\n"
         "head = encode_header(RecordingHeader(version=1, device='a/b', kind='exchanges', source='measured'))\n"
         "file = RotatingFile(Path(sys.argv[1]), head, max_bytes=20_000)\n"
         "for n in range(10**9):\n"

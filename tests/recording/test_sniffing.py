@@ -14,12 +14,12 @@ from pathlib import Path
 import pytest
 from support import eventually, run
 
+from fieldtwin.capture.recordings.rotating_file import exchanges_of
+from fieldtwin.commissioning.record.sniffing import Directions
 from fieldtwin.emulators.endpoints.pty import PtyEnd
 from fieldtwin.gateway.core.connection import Direction
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.protocols.modbus.crc import with_crc
-from fieldtwin.recording.rotating import exchanges_of
-from fieldtwin.recording.sniffing import Directions
 
 TALK = [
     ("01 03 0000 0002", "01 03 04 0001 0002"),

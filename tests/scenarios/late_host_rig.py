@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from fieldtwin.emulators.virtual.loop import VirtualLoop
-from fieldtwin.report.model import ScenarioResult
-from fieldtwin.running.virtual_bench import VirtualBench
-from fieldtwin.scenarios.form import load_scenario
-from fieldtwin.scenarios.runner import Runner
-from fieldtwin.scenarios.trace import Trace
+from fieldtwin.results.model import ScenarioResult
+from fieldtwin.results.trace import Trace
+from fieldtwin.run.benches.virtual_bench import VirtualBench
+from fieldtwin.scenarios.judging.runner import Runner
+from fieldtwin.scenarios.language.form import load_scenario
 from fieldtwin.twin.prototype.file import load_prototype
 
 HEAD = "scenario: a test\nsystem: observatory\n"

@@ -13,15 +13,15 @@ from xml.etree import ElementTree as ET
 import pytest
 from click.testing import CliRunner
 
-from fieldtwin.cli.run_command import command as run_command
-from fieldtwin.cli.test_command import command as judge_command
+from fieldtwin.cli.run.run_command import command as run_command
+from fieldtwin.cli.test.test_command import command as judge_command
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
-from fieldtwin.report.model import Verdict
-from fieldtwin.running.campaign import Campaign, run_campaign, run_seed, verdict_of
-from fieldtwin.running.confirming import CONFIRMED
-from fieldtwin.running.fault_schedule import RandomFaults, random_schedule
-from fieldtwin.running.virtual_scenario import run_virtual
-from fieldtwin.scenarios.form import load_scenario
+from fieldtwin.results.model import Verdict
+from fieldtwin.run.campaigns.campaign import Campaign, run_campaign, run_seed, verdict_of
+from fieldtwin.run.campaigns.confirming import CONFIRMED
+from fieldtwin.run.targets.virtual_scenario import run_virtual
+from fieldtwin.run.virtual.fault_schedule import RandomFaults, random_schedule
+from fieldtwin.scenarios.language.form import load_scenario
 from fieldtwin.twin.site.system import load_system
 
 pytestmark = [pytest.mark.long, pytest.mark.timeout(300)]

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from fieldtwin.cli.run_command import command
+from fieldtwin.cli.run.run_command import command
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from fieldtwin.report.model import Verdict
-from fieldtwin.running.virtual_scenario import run_virtual
-from fieldtwin.scenarios.form import load_scenario
-from fieldtwin.scenarios.words import WORDS, ScenarioForm
+from fieldtwin.results.model import Verdict
+from fieldtwin.run.targets.virtual_scenario import run_virtual
+from fieldtwin.scenarios.language.form import load_scenario
+from fieldtwin.scenarios.language.words import WORDS, ScenarioForm
 
 PAGE = (Path(__file__).resolve().parents[2] / "docs" / "scenarios.md").read_text()
 

@@ -10,8 +10,8 @@ from xml.etree import ElementTree as ET
 import pytest
 from click.testing import CliRunner
 
-from fieldtwin.cli import test_command
-from fieldtwin.scenarios.last_exchanges import MOST
+from fieldtwin.cli.test import test_command
+from fieldtwin.scenarios.judging.last_exchanges import MOST
 
 pytest_plugins = ["pytester"]
 PROFILE = """device: fieldtwin/tank

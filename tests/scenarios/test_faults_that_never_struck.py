@@ -13,13 +13,13 @@ from xml.etree import ElementTree as ET
 import pytest
 from click.testing import CliRunner
 
-from fieldtwin.cli.run_command import command as run_command
-from fieldtwin.cli.test_command import command as judge_command
-from fieldtwin.report.html import write_html
-from fieldtwin.report.junit import write_junit
-from fieldtwin.report.model import Report, ScenarioResult, Verdict
-from fieldtwin.running.scenario_targets import Target, run_scenario
-from fieldtwin.scenarios.form import load_scenario
+from fieldtwin.cli.run.run_command import command as run_command
+from fieldtwin.cli.test.test_command import command as judge_command
+from fieldtwin.reports.junit import write_junit
+from fieldtwin.reports.run.html import write_html
+from fieldtwin.results.model import Report, ScenarioResult, Verdict
+from fieldtwin.run.targets.scenario_targets import Target, run_scenario
+from fieldtwin.scenarios.language.form import load_scenario
 
 GOOD = "  - wait: {until: \"quality(inclinometer.slope_long) == 'good'\", within: 10s}\n"
 CLEARED = "  - clear: f\n"

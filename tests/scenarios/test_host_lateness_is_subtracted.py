@@ -13,16 +13,16 @@ import pytest
 from click.testing import CliRunner
 from late_host_rig import HEAD, judged_on
 
-from fieldtwin.cli import test_command
-from fieldtwin.report.html import render_html
-from fieldtwin.report.junit import render_junit
-from fieldtwin.report.model import Report, ScenarioResult, Verdict
-from fieldtwin.running import scenario_targets
-from fieldtwin.running.host_lateness import HostLateness
-from fieldtwin.running.scenario_targets import Target, run_scenario
-from fieldtwin.running.virtual_bench import VirtualBench
+from fieldtwin.cli.test import test_command
+from fieldtwin.reports.junit import render_junit
+from fieldtwin.reports.run.html import render_html
+from fieldtwin.results.model import Report, ScenarioResult, Verdict
+from fieldtwin.run.benches.host_lateness import HostLateness
+from fieldtwin.run.benches.virtual_bench import VirtualBench
+from fieldtwin.run.targets import scenario_targets
+from fieldtwin.run.targets.scenario_targets import Target, run_scenario
 from fieldtwin.scenarios.bench import Can
-from fieldtwin.scenarios.form import load_scenario
+from fieldtwin.scenarios.language.form import load_scenario
 
 REACTS = "steps:\n  - pause: 1s\n  - send: {period_s: 1}\n  - expect: {that: \"relay.state == 'ACTIVE'\", within: %s}\n"
 

@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 from click.testing import CliRunner
 
-from fieldtwin.cli.run_command import command as run_command
-from fieldtwin.cli.test_command import command as judge_command
+from fieldtwin.cli.run.run_command import command as run_command
+from fieldtwin.cli.test.test_command import command as judge_command
 from fieldtwin.gateway.core.errors import UsageError
-from fieldtwin.running.confirming import CONFIRMED
+from fieldtwin.run.campaigns.confirming import CONFIRMED
 
 SYSTEMS = Path(__file__).resolve().parents[2] / "profiles" / "systems"
 SCENARIO = """scenario: every observatory goes to work

@@ -9,12 +9,12 @@ import pytest
 from click.testing import CliRunner
 from late_host_rig import HEAD, judged_on
 
-from fieldtwin.cli.test_command import command
-from fieldtwin.conformance.waivers import Waiver, Waivers
-from fieldtwin.report.model import ScenarioResult, Verdict
-from fieldtwin.running.virtual_bench import VirtualBench
+from fieldtwin.cli.test.test_command import command
+from fieldtwin.conformance.core.waivers import Waiver, Waivers
+from fieldtwin.results.model import ScenarioResult, Verdict
+from fieldtwin.run.benches.virtual_bench import VirtualBench
 from fieldtwin.scenarios.bench import Can
-from fieldtwin.scenarios.waiving import all_well, waive
+from fieldtwin.scenarios.judging.waiving import all_well, waive
 
 
 class LateBench(VirtualBench):

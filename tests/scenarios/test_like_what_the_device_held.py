@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from fieldtwin.report.model import Verdict
-from fieldtwin.running.scenario_targets import Target, run_scenario
-from fieldtwin.scenarios.expectation import held_since
-from fieldtwin.scenarios.form import load_scenario
+from fieldtwin.results.model import Verdict
+from fieldtwin.run.targets.scenario_targets import Target, run_scenario
+from fieldtwin.scenarios.judging.expectation import held_since
+from fieldtwin.scenarios.language.form import load_scenario
 
 HELD = [(1.0, b"a"), (2.0, b"b"), (3.0, b"c")]
 

@@ -10,9 +10,9 @@ import pytest
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "unit"))
 from fan_hall import hall
 
-from fieldtwin.report.model import Verdict
-from fieldtwin.running.virtual_scenario import run_virtual
-from fieldtwin.scenarios.form import load_scenario
+from fieldtwin.results.model import Verdict
+from fieldtwin.run.targets.virtual_scenario import run_virtual
+from fieldtwin.scenarios.language.form import load_scenario
 
 STEPS = """
 scenario: a sensor that is out of its range from the start

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from fieldtwin.report.model import Verdict
-from fieldtwin.running.scenario_targets import Target, run_scenario
-from fieldtwin.scenarios.form import load_scenario
+from fieldtwin.results.model import Verdict
+from fieldtwin.run.targets.scenario_targets import Target, run_scenario
+from fieldtwin.scenarios.language.form import load_scenario
 
 PROFILE = """device: own/heater
 source: "this test"

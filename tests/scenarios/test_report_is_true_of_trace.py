@@ -15,13 +15,13 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from fieldtwin.decoding.decoder import exchanges
-from fieldtwin.report.model import CheckResult, ScenarioResult, Verdict
-from fieldtwin.running.scenario_targets import Target, run_scenario
-from fieldtwin.running.virtual_scenario import run_virtual
-from fieldtwin.scenarios.expression import Expression
-from fieldtwin.scenarios.form import Scenario, load_scenario
-from fieldtwin.scenarios.trace import Event, Kind
+from fieldtwin.capture.decoding.decoder import exchanges
+from fieldtwin.results.model import CheckResult, ScenarioResult, Verdict
+from fieldtwin.results.trace import Event, Kind
+from fieldtwin.run.targets.scenario_targets import Target, run_scenario
+from fieldtwin.run.targets.virtual_scenario import run_virtual
+from fieldtwin.scenarios.language.expression import Expression
+from fieldtwin.scenarios.language.form import Scenario, load_scenario
 
 SYSTEM = Path(__file__).parents[1] / "faults" / "scenarios" / "line.yaml"
 NS = 1_000_000_000

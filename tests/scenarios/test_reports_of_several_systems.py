@@ -13,7 +13,7 @@ from xml.etree import ElementTree as ET
 import pytest
 from click.testing import CliRunner
 
-from fieldtwin.cli.test_command import command
+from fieldtwin.cli.test.test_command import command
 
 PROFILE = """device: fieldtwin/TANK
 source: "made for this test"

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fieldtwin.gateway.core.errors import UsageError
-from fieldtwin.scenarios.expression import Expression
+from fieldtwin.scenarios.language.expression import Expression
 
 KNOWN = ["ctd.pressure", "ctd.status", "relay.state"]
 NOW: dict[tuple[str, str], Any] = {

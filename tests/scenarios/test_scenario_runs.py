@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from fieldtwin.cli.test_command import command
+from fieldtwin.cli.test.test_command import command
 from fieldtwin.gateway.core.errors import FileInvalid
-from fieldtwin.report.model import ScenarioResult, Verdict
-from fieldtwin.running.virtual_scenario import run_virtual
-from fieldtwin.scenarios.about import danger_of
-from fieldtwin.scenarios.form import load_scenario
+from fieldtwin.results.model import ScenarioResult, Verdict
+from fieldtwin.run.targets.virtual_scenario import run_virtual
+from fieldtwin.scenarios.language.about import danger_of
+from fieldtwin.scenarios.language.form import load_scenario
 
 SHIPPED = sorted((Path(__file__).resolve().parents[2] / "profiles" / "systems").glob("*.scenario.yaml"))
 

@@ -13,12 +13,12 @@ import pytest
 from click.testing import CliRunner
 from tank_plant import write_plant
 
-from fieldtwin.cli.run_command import command as run_command
-from fieldtwin.report.model import ScenarioResult, Verdict
-from fieldtwin.running.confirming import CONFIRMED
-from fieldtwin.running.shrink import same_failure, smallest
-from fieldtwin.running.virtual_scenario import run_virtual
-from fieldtwin.scenarios.form import load_scenario
+from fieldtwin.cli.run.run_command import command as run_command
+from fieldtwin.results.model import ScenarioResult, Verdict
+from fieldtwin.run.campaigns.confirming import CONFIRMED
+from fieldtwin.run.campaigns.shrink import same_failure, smallest
+from fieldtwin.run.targets.virtual_scenario import run_virtual
+from fieldtwin.scenarios.language.form import load_scenario
 
 PLANT = """fieldtwin: 1
 system: plant

@@ -13,15 +13,15 @@ from xml.etree import ElementTree as ET
 import pytest
 from tank_plant import DIVIDES_BY_ZERO, PLANT, PROTOTYPE, write_plant
 
-from fieldtwin.report.html import write_html
-from fieldtwin.report.junit import write_junit
-from fieldtwin.report.model import Report, ScenarioResult, Verdict
-from fieldtwin.running.scenario_targets import Target, run_scenario
-from fieldtwin.scenarios.form import load_scenario
+from fieldtwin.reports.junit import write_junit
+from fieldtwin.reports.run.html import write_html
+from fieldtwin.results.model import Report, ScenarioResult, Verdict
+from fieldtwin.run.targets.scenario_targets import Target, run_scenario
+from fieldtwin.scenarios.language.form import load_scenario
 
 WELL = DIVIDES_BY_ZERO.replace("3 / zero > 3", "FALSE AND zero > level")
 LATER = DIVIDES_BY_ZERO.replace("3 / zero > 3", "100 / (level - 7) > 1000")
-PYTHON = """from fieldtwin.gateway.core.image import TagKind
+PYTHON = """from fieldtwin.gateway.core.image.image import TagKind
 from fieldtwin.plc.program import Program, ScanInfo, var_input, var_local
 
 

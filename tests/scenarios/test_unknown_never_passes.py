@@ -14,10 +14,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fieldtwin.report.model import ScenarioResult, Verdict
-from fieldtwin.running.virtual_scenario import run_virtual
-from fieldtwin.scenarios.expression import Expression
-from fieldtwin.scenarios.form import load_scenario
+from fieldtwin.results.model import ScenarioResult, Verdict
+from fieldtwin.run.targets.virtual_scenario import run_virtual
+from fieldtwin.scenarios.language.expression import Expression
+from fieldtwin.scenarios.language.form import load_scenario
 
 NAMES = ("a.x", "b.y", "c.z")
 NUMBERS = st.sampled_from(

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from fieldtwin.report.model import ScenarioResult, Verdict
-from fieldtwin.running.scenario_targets import Target, run_scenario
-from fieldtwin.scenarios.form import load_scenario
+from fieldtwin.results.model import ScenarioResult, Verdict
+from fieldtwin.run.targets.scenario_targets import Target, run_scenario
+from fieldtwin.scenarios.language.form import load_scenario
 
 ACTIVE = "  - send: {period_s: 1}\n  - wait: {until: \"quality(ctd.pressure) == 'good'\", within: 15s}\n"
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from fieldtwin.gateway.core.errors import FileInvalid
-from fieldtwin.report.model import ScenarioResult, Verdict
-from fieldtwin.running.virtual_scenario import run_virtual
-from fieldtwin.scenarios.form import load_scenario
+from fieldtwin.results.model import ScenarioResult, Verdict
+from fieldtwin.run.targets.virtual_scenario import run_virtual
+from fieldtwin.scenarios.language.form import load_scenario
 
 ACTIVE = "  - send: {period_s: 1}\n  - wait: {until: \"quality(ctd.pressure) == 'good'\", within: 15s}\n"
 SILENT_AT_ONCE = "  - fault: {name: silence, device: ctd}\n  - pause: 1ms\n"

@@ -9,9 +9,9 @@ import pytest
 from click.testing import CliRunner
 
 from fieldtwin.cli.main import cli
-from fieldtwin.report.model import Verdict
-from fieldtwin.running.scenario_targets import Target, run_scenario
-from fieldtwin.scenarios.form import load_scenario
+from fieldtwin.results.model import Verdict
+from fieldtwin.run.targets.scenario_targets import Target, run_scenario
+from fieldtwin.scenarios.language.form import load_scenario
 from fieldtwin.twin.site.system import load_system
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -18,11 +18,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from spec_rig import CHECKOUT, CLOCK, SYSTEMS, observatory
 
+from fieldtwin.capture.recordings.importing import import_capture
 from fieldtwin.emulators.models.sampled_sensor import SampledSensor
 from fieldtwin.emulators.signals import SignalPlayer, SignalTrack
 from fieldtwin.gateway.core.clock import NS_PER_S
-from fieldtwin.gateway.core.recording import RecordingReader, shown
-from fieldtwin.recording.importing import import_capture
+from fieldtwin.gateway.core.files.recording import RecordingReader, shown
 from fieldtwin.twin.site.system import load_system
 
 WITNESS = """
@@ -209,7 +209,7 @@ def test_prose_3_ACTIVE_samples_at_the_commanded_period_and_OFF_and_STANDBY_take
 CAST = SignalTrack.load(CHECKOUT / "recordings" / "cast.jsonl")
 
 PROGRAM = """
-from fieldtwin.gateway.core.image import TagKind
+from fieldtwin.gateway.core.image.image import TagKind
 from fieldtwin.plc.program import Program, ScanInfo, var_output
 
 

@@ -17,22 +17,28 @@ from spec_rig import CHECKOUT, CLOCK, Rig, observatory, rig
 from support import eventually, run
 from wire_rig import Crossed, relay, strange_device
 
-from fieldtwin.cli.compare_command import command as compare_command
-from fieldtwin.cli.shadow_command import print_shadow
+from fieldtwin.cli.recordings.compare_command import command as compare_command
+from fieldtwin.cli.twin.shadow_command import print_shadow
 from fieldtwin.emulators.distorted_registers import DistortedRegisters
 from fieldtwin.emulators.replay.replay import ExchangeReplay
 from fieldtwin.emulators.replay.unit import ReplayUnit
 from fieldtwin.gateway.connections.listeners import TcpListener
+from fieldtwin.gateway.core.concurrency.events import Consumer, Producer
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.endpoint import Endpoint
-from fieldtwin.gateway.core.events import Consumer, Producer
-from fieldtwin.gateway.core.nursery import Nursery
-from fieldtwin.gateway.core.recording import Exchange, RecordingHeader, RecordingReader, RecordingWriter
+from fieldtwin.gateway.core.files.recording import Exchange, RecordingHeader, RecordingReader, RecordingWriter
 from fieldtwin.gateway.core.statemachine import decode_period, encode_period
 from fieldtwin.gateway.core.values import COMMAND, MEASUREMENT, RESPONSE, STATUS, Quality, Reason
 from fieldtwin.gateway.devices.transmitter import TransmitterDriver
 from fieldtwin.gateway.store.event import Event, Kind
 from fieldtwin.gateway.store.sqlite_knowledge import SqliteKnowledge, in_place
-from fieldtwin.running.shadowing import Shadowing
+from fieldtwin.run.shadow.shadow import Shadowing
+from fieldtwin.run.what_if.asked import objection
+from fieldtwin.run.what_if.asking import Asked
+from fieldtwin.run.what_if.fork import Fork, answer
+from fieldtwin.run.what_if.last_known import of_period
+from fieldtwin.run.what_if.plan import Plan
+from fieldtwin.run.what_if.state import KnownState
 from fieldtwin.twin.model.mape.execute import Bounds
 from fieldtwin.twin.model.mape.messages import SeenMeasurement, SeenStatus
 from fieldtwin.twin.model.mape.plan import Rule, RulePlanner
@@ -48,12 +54,6 @@ from fieldtwin.twin.thread.end import ThreadEnd
 from fieldtwin.twin.thread.frames import ACK, ASK, REFUSED
 from fieldtwin.twin.thread.tcp import WHO, TcpListening
 from fieldtwin.twin.thread.thread import schema_of
-from fieldtwin.whatif.asked import objection
-from fieldtwin.whatif.asking import Asked
-from fieldtwin.whatif.fork import Fork, answer
-from fieldtwin.whatif.last_known import of_period
-from fieldtwin.whatif.plan import Plan
-from fieldtwin.whatif.state import KnownState
 
 # -- 1: the driver cannot tell an emulator from the device ----------------------------------------------------------------
 

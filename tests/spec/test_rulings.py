@@ -13,20 +13,20 @@ from click.testing import CliRunner
 from spec_rig import CHECKOUT, CLOCK, observatory, rig
 from support import run
 
-from fieldtwin.cli.write_command import command as write_command
+from fieldtwin.cli.device.write_command import command as write_command
 from fieldtwin.emulators.virtual.loop import VirtualLoop
 from fieldtwin.emulators.virtual.seal import sealed
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import NotAllowed
-from fieldtwin.gateway.core.image import INPUTS, OUTPUTS
-from fieldtwin.gateway.core.nursery import Nursery
-from fieldtwin.gateway.core.profile import load_profile
+from fieldtwin.gateway.core.files.profile import load_profile
+from fieldtwin.gateway.core.image.image import INPUTS, OUTPUTS
 from fieldtwin.gateway.core.values import COMMAND, Quality, Reason
 from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig
 from fieldtwin.gateway.runtime.gateway import make_driver
 from fieldtwin.gateway.runtime.tags import TagTable
 from fieldtwin.plc.runner import Runner
-from fieldtwin.running.shore import Shore
+from fieldtwin.run.processes.topside import Shore
 from fieldtwin.twin.model.shadow import DigitalShadow
 from fieldtwin.twin.model.thread_process import ReceivingEnd
 from fieldtwin.twin.model.variables import Variable

@@ -13,11 +13,11 @@ from support import run
 
 from fieldtwin.emulators.emulator import EmulatedCommunication, SensorEmulator
 from fieldtwin.emulators.link import Link
+from fieldtwin.gateway.core.concurrency.events import Consumer
 from fieldtwin.gateway.core.connection import PROTOCOL
 from fieldtwin.gateway.core.device import Communication
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import CommandListMismatch
-from fieldtwin.gateway.core.events import Consumer
 from fieldtwin.gateway.core.values import DATA
 from fieldtwin.twin.prototype.file import load_prototype
 from fieldtwin.twin.prototype.prototype import DigitalTwinPrototype

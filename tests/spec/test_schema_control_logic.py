@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from spec_rig import observatory
 
+from fieldtwin.gateway.core.concurrency.events import Consumer, Producer
 from fieldtwin.gateway.core.errors import Bug, Desync
-from fieldtwin.gateway.core.events import Consumer, Producer
 from fieldtwin.gateway.core.statemachine import encode_period
 from fieldtwin.gateway.core.values import COMMAND, MEASUREMENT, RESPONSE
 from fieldtwin.plc.relay import LOG_CAPACITY, ControlLogic, DataLog, LogEntry, Relay

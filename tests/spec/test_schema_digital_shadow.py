@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from shadow_rig import DECLARED, NOW_MS, Hands, status, value
 
-from fieldtwin.cli.shadow_command import told_of
-from fieldtwin.gateway.core.events import Consumer, Producer
+from fieldtwin.cli.twin.shadow_command import told_of
+from fieldtwin.gateway.core.concurrency.events import Consumer, Producer
 from fieldtwin.gateway.core.statemachine import STATE_CODES, delta
 from fieldtwin.gateway.core.values import DATA, STATUS, Quality, Reason
 from fieldtwin.gateway.store.event import Event, Kind

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from shadow_rig import DECLARED, NOW_MS, Hands, status, value
 
-from fieldtwin.gateway.core.events import Consumer, Producer
+from fieldtwin.gateway.core.concurrency.events import Consumer, Producer
 from fieldtwin.gateway.core.statemachine import decode_period, delta, encode_period
 from fieldtwin.gateway.core.values import COMMAND, DATA, Quality, Reason
 from fieldtwin.gateway.store.event import Kind

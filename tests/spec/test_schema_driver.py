@@ -13,10 +13,10 @@ from support import run
 
 from fieldtwin.emulators.distorted_registers import DistortedRegisters
 from fieldtwin.gateway.connections.os_connector import OsConnector
+from fieldtwin.gateway.core.concurrency.events import Consumer, Producer
 from fieldtwin.gateway.core.connection import PROTOCOL, ByteConnection, RS232Connection, TCPConnection
 from fieldtwin.gateway.core.errors import Bug, FileInvalid, UnknownCommand
-from fieldtwin.gateway.core.events import Consumer, Producer
-from fieldtwin.gateway.core.profile import Box
+from fieldtwin.gateway.core.files.profile import Box
 from fieldtwin.gateway.core.values import COMMAND, DATA, MEASUREMENT, RESPONSE
 from fieldtwin.gateway.devices.driver import DeviceDriver
 from fieldtwin.gateway.devices.register_device import SensorDriver

@@ -18,7 +18,7 @@ from fieldtwin.emulators.replay.unit import ReplayUnit
 from fieldtwin.gateway.core.connection import PROTOCOL, Connection, RS232Connection, TCPConnection
 from fieldtwin.gateway.core.device import Device, End, Sensor, wire
 from fieldtwin.gateway.core.errors import Bug, UnknownCommand
-from fieldtwin.gateway.core.recording import Exchange
+from fieldtwin.gateway.core.files.recording import Exchange
 from fieldtwin.gateway.core.values import COMMAND, RECORDING
 
 CTD = observatory()[0].devices["ctd"].profile

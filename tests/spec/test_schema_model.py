@@ -23,7 +23,7 @@ from fieldtwin.gateway.core.statemachine import (
     encode_period,
 )
 from fieldtwin.gateway.core.values import COMMAND, Quality, Reason, Scalar
-from fieldtwin.running.states import expected_states
+from fieldtwin.run.processes.states import expected_states
 from fieldtwin.twin.model.model import DigitalModel
 from fieldtwin.twin.model.variables import Variable, Variables
 from fieldtwin.twin.plant.declared import declared_variables

@@ -13,7 +13,7 @@ from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.devices.canopen_device import CanopenDriver
 from fieldtwin.gateway.devices.register_device import SensorDriver
 from fieldtwin.gateway.devices.transmitter import TransmitterDriver
-from fieldtwin.gateway.runtime.audit import AuditLog
+from fieldtwin.gateway.runtime.audit_log import AuditLog
 from fieldtwin.gateway.runtime.gateway import Gateway
 from fieldtwin.gateway.store.exchange_log import ExchangeLog
 from fieldtwin.plc.relay import ControlLogic, Relay

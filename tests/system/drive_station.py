@@ -58,7 +58,7 @@ END_PROGRAM
 """Asks for 60 Hz in line 5, and starts the drive."""
 
 TOO_FAST_PYTHON = """\
-from fieldtwin.gateway.core.image import TagKind
+from fieldtwin.gateway.core.image.image import TagKind
 from fieldtwin.plc.program import Program, ScanInfo, var_input, var_output
 
 

@@ -17,13 +17,13 @@ from pymodbus.client import AsyncModbusTcpClient
 from support import eventually, run
 
 from fieldtwin.cli.main import main
+from fieldtwin.emulators.endpoints.modbus_server import serve_rtu
 from fieldtwin.emulators.endpoints.pty import PtyEnd
 from fieldtwin.emulators.modbus.bank import MapBank, Span
 from fieldtwin.emulators.modbus.rtu import RtuSlave
-from fieldtwin.emulators.modbus.serve import serve_rtu
 from fieldtwin.emulators.modbus.unit import ModbusUnit
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.endpoint import Endpoint
-from fieldtwin.gateway.core.nursery import Nursery
 from fieldtwin.gateway.wallclock import WallClock
 
 LINE = "baudrate=115200&frame=8N1"

@@ -15,16 +15,16 @@ import pytest
 from procs import fieldtwin, no_tracebacks, wait_for
 from support import run
 
+from fieldtwin.emulators.endpoints.modbus_server import serve_mbap
 from fieldtwin.emulators.endpoints.socket_end import SocketListener
 from fieldtwin.emulators.modbus.bank import MapBank, Span
 from fieldtwin.emulators.modbus.mbap import MbapSlave
-from fieldtwin.emulators.modbus.serve import serve_mbap
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.connections.serial_line import SerialConnection
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.endpoint import Endpoint
-from fieldtwin.gateway.core.nursery import Nursery
 from fieldtwin.gateway.wallclock import WallClock
-from fieldtwin.running.bridge_cable import BridgeCable
+from fieldtwin.run.live.bridge_cable import BridgeCable
 
 LINE = "baudrate=115200&frame=8N1"
 SYSTEM = """

@@ -39,7 +39,7 @@ devices: {drive: {model: profile}, io: {model: profile}}
 PROGRAM = '''\
 """Brings the drive to Operation enabled, one arrow of CiA 402 at a time, and lights a lamp while it turns."""
 
-from fieldtwin.gateway.core.image import TagKind
+from fieldtwin.gateway.core.image.image import TagKind
 from fieldtwin.plc.program import Program, ScanInfo, var_input, var_output
 
 NEXT = {0x40: 6, 0x21: 7, 0x23: 15, 0x27: 15, 0x08: 128}

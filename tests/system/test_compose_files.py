@@ -23,9 +23,9 @@ from procs import CHECKOUT, fieldtwin, free_port, no_tracebacks, run_to_end, wai
 from fieldtwin.cli.main import cli
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import UsageError
-from fieldtwin.running.field_contact import reachable
-from fieldtwin.running.shadowing import Shadowing
-from fieldtwin.running.twinning import Twinning
+from fieldtwin.run.processes.field_contact import reachable
+from fieldtwin.run.shadow.shadow import Shadowing
+from fieldtwin.run.shadow.twin import Twinning
 from fieldtwin.twin.prototype.file import load_prototype
 from fieldtwin.twin.site.system import load_system
 

@@ -16,7 +16,7 @@ import pytest
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 NOT_OURS = 'raise ImportError("a module of the user was taken for one of fieldtwin")\n'
-PUMP = """from fieldtwin.gateway.core.image import TagKind
+PUMP = """from fieldtwin.gateway.core.image.image import TagKind
 from fieldtwin.plc.program import Program, ScanInfo, var_input, var_output
 
 

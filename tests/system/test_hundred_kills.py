@@ -164,7 +164,7 @@ def test_simulated_field_devices_come_back_on_their_ports_and_pseudo_terminals(t
         f"can0=can:fieldtwin/127.0.0.1:{can}", "--listen", f"lan=tcp://127.0.0.1:{lan}",
     )  # fmt: skip
     field = Asking(("127.0.0.1", port))
-    imports = "fieldtwin.cli.emulate_command,fieldtwin.twin.prototype.field_process"
+    imports = "fieldtwin.cli.emulate.emulate_command,fieldtwin.twin.prototype.field_process"
     with victim("fieldtwin", *words, root=root, imports=imports) as it:
         while it.starts < KILLS:
             it.start()
@@ -198,7 +198,8 @@ def test_both_ends_of_a_digital_thread_have_the_same_log_in_the_end(tmp_path: Pa
         (root / "thread.json").write_text(json.dumps(config))
         follow = ("twin", "observatory", "--from", place, "--instance", "tt", "--json")
         here, there = (root / name / "knowledge.sqlite" for name in ("t", "tt"))
-        imports = "fieldtwin.twin.thread.end,fieldtwin.cli.twin_command,fieldtwin.running.twinning,fieldtwin.twin.plant.physical"
+        parts = ("twin.thread.end", "cli.twin.twin_command", "run.shadow.twin", "twin.plant.physical")
+        imports = ",".join(f"fieldtwin.{part}" for part in parts)
         with (
             victim(
                 "fieldtwin.twin.thread.plant_thread",
@@ -247,7 +248,7 @@ def test_a_whole_run_leaves_no_process_and_the_next_one_starts(tmp_path: Path) -
     """The supervisor is killed: its processes make the outputs safe and end by themselves."""
     root = tmp_path / "r"
     words = ("run", "observatory", "--prototype", "--commands", "none", "--json")
-    imports = "fieldtwin.cli.run_command,fieldtwin.running.session"
+    imports = "fieldtwin.cli.run.run_command,fieldtwin.run.live.session"
     with victim("fieldtwin", *words, root=root, imports=imports) as it:
         gateway = Asking(str(root / "observatory" / "gateway.sock"))
         while it.starts < KILLS_OF_A_RUN:

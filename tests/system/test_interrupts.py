@@ -14,7 +14,7 @@ from support import eventually, run
 ROOT = Path(__file__).parents[2]
 PROBE = r"""
 import os
-from fieldtwin.running.workers import Workers
+from fieldtwin.run.processes.workers import Workers
 from slow import work
 
 if __name__ == "__main__":

@@ -14,9 +14,9 @@ from typing import Any
 import pytest
 from well_site import write_program, write_site
 
-from fieldtwin.report.model import Verdict
-from fieldtwin.running.scenario_targets import Target, run_scenario
-from fieldtwin.scenarios.form import load_scenario
+from fieldtwin.results.model import Verdict
+from fieldtwin.run.targets.scenario_targets import Target, run_scenario
+from fieldtwin.scenarios.language.form import load_scenario
 
 pytestmark = pytest.mark.long
 

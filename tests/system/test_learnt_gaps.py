@@ -39,7 +39,7 @@ devices: {meter: {recording: ./meter.jsonl, at_end: loop}}
 {"t":0.3,"unit":1,"req":"0300000007","rep":"8302","lat":0.004}
 """,
     "watcher.py": """
-from fieldtwin.gateway.core.image import TagKind
+from fieldtwin.gateway.core.image.image import TagKind
 from fieldtwin.plc.program import Program, ScanInfo, var_input
 
 

@@ -13,8 +13,8 @@ import pytest
 from procs import CHECKOUT, fieldtwin, free_port, no_tracebacks, run_to_end, wait_for
 
 from fieldtwin.gateway.core.errors import UsageError
-from fieldtwin.running.control_bench import ControlBench, Where
-from fieldtwin.scenarios.trace import Trace
+from fieldtwin.results.trace import Trace
+from fieldtwin.run.benches.control_bench import ControlBench, Where
 from fieldtwin.twin.site.system import load_system
 
 HERE = CHECKOUT / "examples" / "own-plc"

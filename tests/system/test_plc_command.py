@@ -12,7 +12,7 @@ from procs import fieldtwin, wait_for
 
 from fieldtwin.cli.main import cli
 from fieldtwin.gateway.core.errors import FieldtwinError, Unreachable, UsageError
-from fieldtwin.gateway.core.yaml_file import parse
+from fieldtwin.gateway.core.files.yaml_file import parse
 
 
 def plc(*args: str) -> str:
@@ -114,7 +114,7 @@ def test_values_and_bad_inputs_of_a_counterexample_are_steps(tmp_path: Path) -> 
     text = text.replace("outputs: {period_s: ctd.sample_period_s, response: modem.outbox}", "outputs: {}")
     (tmp_path / "site.yaml").write_text(text, encoding="utf-8")
     (tmp_path / "winch.py").write_text(
-        "from fieldtwin.gateway.core.image import TagKind\nfrom fieldtwin.plc.program import var_input\n"
+        "from fieldtwin.gateway.core.image.image import TagKind\nfrom fieldtwin.plc.program import var_input\n"
         "from fieldtwin.plc.states import StateMachine, StateTable, Transition\n\n\nclass Winch(StateMachine):\n"
         "    depth = var_input(TagKind.REAL)\n    table = StateTable(\n"
         "        Transition('UP', 'DOWN', when='depth is not None and depth < 5'),\n"

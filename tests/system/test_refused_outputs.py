@@ -15,12 +15,12 @@ from click.testing import CliRunner
 from drive_station import SYSTEM, TOO_FAST, TOO_FAST_PYTHON, scenario, written
 from procs import fieldtwin, no_tracebacks, run_to_end, wait_for
 
-from fieldtwin.cli.test_command import command as judging
-from fieldtwin.cli.trace_command import command as showing
-from fieldtwin.report.model import Verdict
-from fieldtwin.running.virtual_run import VirtualOptions, VirtualRun
-from fieldtwin.running.virtual_scenario import run_virtual
-from fieldtwin.scenarios.form import load_scenario
+from fieldtwin.cli.recordings.trace_command import command as showing
+from fieldtwin.cli.test.test_command import command as judging
+from fieldtwin.results.model import Verdict
+from fieldtwin.run.targets.virtual_scenario import run_virtual
+from fieldtwin.run.virtual.run import VirtualOptions, VirtualRun
+from fieldtwin.scenarios.language.form import load_scenario
 
 
 def summary_of(system: Path, trace: Path | None = None) -> dict[str, object]:

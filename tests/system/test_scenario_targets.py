@@ -69,7 +69,7 @@ devices:
   ctd: {{profile: ctd-reference, bus: lan, unit: 1, poll: {{values: {{every_ms: 500}}, status: {{every_ms: 200}}}}}}
 plc: {{programs: {{lamp: {{source: "python: shed_lamp:Lamp", inputs: {{status: {{tag: ctd.status}}}}}}}}}}
 """
-LAMP = """from fieldtwin.gateway.core.image import TagKind
+LAMP = """from fieldtwin.gateway.core.image.image import TagKind
 from fieldtwin.plc.program import Program, ScanInfo, var_input, var_local
 
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 from procs import free_port
 
-from fieldtwin.report.model import ScenarioResult, Verdict
-from fieldtwin.running.scenario_targets import Target, run_scenario
-from fieldtwin.scenarios.form import load_scenario
+from fieldtwin.results.model import ScenarioResult, Verdict
+from fieldtwin.run.targets.scenario_targets import Target, run_scenario
+from fieldtwin.scenarios.language.form import load_scenario
 
 SCENARIO = """
 scenario: a node is read

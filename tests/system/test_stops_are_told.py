@@ -30,7 +30,7 @@ PROTOTYPE = """prototype_of: shed.yaml
 buses: {lan: {listen: "tcp://127.0.0.1:0"}}
 devices: {tank: {model: profile}}
 """
-PROGRAM = """from fieldtwin.gateway.core.image import TagKind
+PROGRAM = """from fieldtwin.gateway.core.image.image import TagKind
 from fieldtwin.plc.program import Program, ScanInfo, var_input, var_retain
 
 

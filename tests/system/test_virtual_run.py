@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from fieldtwin.running.virtual_run import VirtualOptions, VirtualRun
+from fieldtwin.run.virtual.run import VirtualOptions, VirtualRun
 
 SHORT = ["--prototype", "--virtual", "--for", "20s", "--json"]
 
@@ -70,7 +70,7 @@ def test_many_seeds() -> None:
 def test_what_makes_no_sense_is_refused(words: list[str], told: str) -> None:
     from click.testing import CliRunner
 
-    from fieldtwin.cli.run_command import command
+    from fieldtwin.cli.run.run_command import command
     from fieldtwin.gateway.core.errors import UsageError
 
     result = CliRunner().invoke(command, ["observatory", *words])

@@ -16,7 +16,7 @@ from test_canopen_outputs_system import PROTOTYPE as WINCH_PROTOTYPE
 from test_canopen_outputs_system import SYSTEM as WINCH_SYSTEM
 
 from fieldtwin.gateway.core.errors import FileInvalid
-from fieldtwin.running.virtual_run import VirtualOptions, VirtualRun
+from fieldtwin.run.virtual.run import VirtualOptions, VirtualRun
 from fieldtwin.twin.site.system import load_system
 
 GROUPED = SYSTEM.replace("    safe: {run: 0}\n", "    write_groups: {drive: [speed, run]}\n")

@@ -12,24 +12,24 @@ from typing import Any
 import pytest
 from support import eventually
 
+from fieldtwin.emulators.endpoints.modbus_server import serve_rtu
 from fieldtwin.emulators.endpoints.pty import PtyEnd
 from fieldtwin.emulators.modbus.bank import MapBank, Span
 from fieldtwin.emulators.modbus.rtu import RtuSlave
-from fieldtwin.emulators.modbus.serve import serve_rtu
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.connections.os_connector import OsConnector
 from fieldtwin.gateway.connections.tcp import TcpConnection
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.connection import Direction
 from fieldtwin.gateway.core.endpoint import Endpoint
-from fieldtwin.gateway.core.nursery import Nursery
 from fieldtwin.gateway.devices.config import BusConfig
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient
 from fieldtwin.gateway.protocols.modbus.refusals import GatewayRefusal
 from fieldtwin.gateway.protocols.modbus.server import READ_FUNCTIONS, WRITE_FUNCTIONS
-from fieldtwin.gateway.runtime.audit import AuditLog
-from fieldtwin.gateway.runtime.bridge import Bridge, BridgeConfig
-from fieldtwin.gateway.runtime.bridge_policy import AllowRule, Policy
-from fieldtwin.gateway.runtime.modbus_bus import ModbusBus
+from fieldtwin.gateway.runtime.audit_log import AuditLog
+from fieldtwin.gateway.runtime.bridge.bridge import Bridge, BridgeConfig
+from fieldtwin.gateway.runtime.bridge.policy import AllowRule, Policy
+from fieldtwin.gateway.runtime.buses.modbus_bus import ModbusBus
 from fieldtwin.gateway.runtime.tags import TagTable
 from fieldtwin.gateway.wallclock import WallClock
 

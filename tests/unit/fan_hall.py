@@ -37,7 +37,7 @@ VAR_OUTPUT mode : INT; END_VAR
 END_PROGRAM
 """
 PYTHON = """
-from fieldtwin.gateway.core.image import TagKind
+from fieldtwin.gateway.core.image.image import TagKind
 from fieldtwin.plc.program import Program, var_input, var_output
 
 class Fan(Program):

@@ -7,11 +7,12 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
 
+from fieldtwin.emulators.endpoints.modbus_server import serve_mbap, serve_rtu
 from fieldtwin.emulators.modbus.bank import MapBank
 from fieldtwin.emulators.modbus.mbap import MbapSlave
 from fieldtwin.emulators.modbus.rtu import RtuSlave
-from fieldtwin.emulators.modbus.serve import serve_mbap, serve_rtu
 from fieldtwin.emulators.modbus.unit import ModbusUnit
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.connection import (
     ByteConnection,
     CanConnection,
@@ -21,12 +22,11 @@ from fieldtwin.gateway.core.connection import (
 )
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import ConnectionLost, Unreachable
-from fieldtwin.gateway.core.nursery import Nursery
-from fieldtwin.gateway.core.profile import DeviceProfile, resolve
-from fieldtwin.gateway.core.yaml_file import parse
+from fieldtwin.gateway.core.files.profile import DeviceProfile, resolve
+from fieldtwin.gateway.core.files.yaml_file import parse
 from fieldtwin.gateway.devices.config import BusConfig
 from fieldtwin.gateway.devices.register_device import RegisterDriver
-from fieldtwin.gateway.runtime.modbus_bus import ModbusBus
+from fieldtwin.gateway.runtime.buses.modbus_bus import ModbusBus
 from fieldtwin.gateway.runtime.tags import TagTable
 from fieldtwin.gateway.wallclock import WallClock
 

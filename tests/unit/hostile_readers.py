@@ -18,31 +18,31 @@ from typing import Any
 
 import yaml
 
-from fieldtwin.conformance.waivers import load_waivers
-from fieldtwin.decoding.trace_file import read_events
+from fieldtwin.capture.decoding.trace_file import read_events
+from fieldtwin.capture.formats.can_files import read_can_file
+from fieldtwin.capture.formats.candump import LeftOut, read_log
+from fieldtwin.capture.formats.csv_table import import_csv
+from fieldtwin.capture.formats.packet_file import PacketFile
+from fieldtwin.capture.formats.pcap import read_capture
+from fieldtwin.capture.recordings.importing import kind_of
+from fieldtwin.conformance.core.waivers import load_waivers
 from fieldtwin.emulators.canopen.dictionary import load_eds
 from fieldtwin.emulators.faults.schema import load_faults
 from fieldtwin.emulators.replay.can_log import CanLog
-from fieldtwin.formats.can_files import read_can_file
-from fieldtwin.formats.candump import LeftOut, read_log
-from fieldtwin.formats.csv_table import import_csv
-from fieldtwin.formats.packet_file import PacketFile
-from fieldtwin.formats.pcap import read_capture
 from fieldtwin.gateway.core.errors import FieldtwinError
-from fieldtwin.gateway.core.profile import load_profile
-from fieldtwin.gateway.core.recording import RecordingReader
+from fieldtwin.gateway.core.files.profile import load_profile
+from fieldtwin.gateway.core.files.recording import RecordingReader
 from fieldtwin.gateway.protocols.canopen.dictionary import load_dictionary
 from fieldtwin.plc.st.program import load_file
-from fieldtwin.recording.importing import kind_of
-from fieldtwin.running.twin_rules import load_planner
-from fieldtwin.scenarios.form import load_scenario
+from fieldtwin.run.shadow.rules import load_planner
+from fieldtwin.run.what_if.plan import load_plans
+from fieldtwin.run.what_if.state import read_state
+from fieldtwin.scenarios.language.form import load_scenario
 from fieldtwin.twin.network.network import load_network
 from fieldtwin.twin.prototype.file import load_prototype
 from fieldtwin.twin.site.data_files import network_file
 from fieldtwin.twin.site.system import load_system
 from fieldtwin.twin.template.package import open_package
-from fieldtwin.whatif.plan import load_plans
-from fieldtwin.whatif.state import read_state
 
 MEMORY_BYTES = 192 * 1024 * 1024
 """What reading may take on top of the program itself."""
@@ -70,7 +70,7 @@ def template(path: Path) -> object:
 
 
 def cast(path: Path) -> object:
-    from fieldtwin.formats.cnv import import_cnv
+    from fieldtwin.capture.formats.cnv import import_cnv
 
     return import_cnv(path, path.with_name("cast.out"))
 

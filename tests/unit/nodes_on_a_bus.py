@@ -12,12 +12,12 @@ from canopen_slave_rig import NODE, RICH
 from fieldtwin.emulators.canopen.dictionary import parse_eds
 from fieldtwin.emulators.canopen.node import CanopenNode
 from fieldtwin.emulators.canopen.serve import serve_node
+from fieldtwin.emulators.endpoints.memory_ports import MemoryNet
 from fieldtwin.emulators.virtual.clock import VirtualClock
 from fieldtwin.emulators.virtual.loop import VirtualLoop
-from fieldtwin.emulators.virtual.ports import MemoryNet
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.connection import CanConnection
 from fieldtwin.gateway.core.endpoint import Endpoint
-from fieldtwin.gateway.core.nursery import Nursery
 
 T = TypeVar("T")
 LONG = RICH.replace("DefaultValue=hello", "DefaultValue=twenty bytes of text")

@@ -7,7 +7,7 @@ from functools import cache
 from typing import Any
 
 from fieldtwin.gateway.protocols.modbus.crc import with_crc
-from fieldtwin.scenarios.trace import Event, Kind
+from fieldtwin.results.trace import Event, Kind
 from fieldtwin.twin.site.system import System, load_system
 
 MS = 1_000_000

@@ -10,7 +10,7 @@ import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
-from fieldtwin.running.template_here import Stranger
+from fieldtwin.run.template import Stranger
 from fieldtwin.twin.site.system import load_system
 from fieldtwin.twin.template.pack import Extras, collect, pack
 from fieldtwin.twin.template.package import open_package, unpack
@@ -21,7 +21,7 @@ SHIPPED = CHECKOUT / "profiles"
 BLINKER = """
 import helper
 from fieldtwin.plc.program import Output, Program
-from fieldtwin.gateway.core.image import TagKind
+from fieldtwin.gateway.core.image.image import TagKind
 
 class Blinker(Program):
     def execute(self, scan):

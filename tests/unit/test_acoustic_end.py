@@ -10,8 +10,8 @@ from support import eventually, run
 
 from fieldtwin.emulators.endpoints.acoustic_end import ROOM, AcousticEnd, AcousticServer
 from fieldtwin.emulators.wires.acoustic import AcousticMedium, Water
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.errors import Unreachable
-from fieldtwin.gateway.core.nursery import Nursery
 from fieldtwin.gateway.wallclock import WallClock
 
 PLACES = {"a": (0.0, 0.0), "b": (15.0, 0.0)}

@@ -11,7 +11,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from fieldtwin.emulators.wires.acoustic import AcousticMedium, Water
-from fieldtwin.gateway.core.image import Message
+from fieldtwin.gateway.core.image.image import Message
 from fieldtwin.gateway.core.statemachine import encode_period
 from fieldtwin.gateway.core.values import Quality, Reason, TagValue
 from fieldtwin.plc.binding import load_program

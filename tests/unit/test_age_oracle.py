@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from fieldtwin.running.age_oracle import KEPT_NS, AgeOracle
+from fieldtwin.run.virtual.age_oracle import KEPT_NS, AgeOracle
 
 EMULATED = frozenset({"d"})
 

@@ -10,19 +10,19 @@ import pytest
 from bridge_rig import ANY_PORT, CLOCK, LINE, WRITERS, a_unit, refused, rig, take
 from support import eventually, run
 
+from fieldtwin.emulators.endpoints.modbus_server import serve_mbap
 from fieldtwin.emulators.endpoints.pty import PtyEnd
 from fieldtwin.emulators.endpoints.socket_end import SocketListener
 from fieldtwin.emulators.modbus.mbap import MbapSlave
-from fieldtwin.emulators.modbus.serve import serve_mbap
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.connections.os_connector import OsConnector
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.errors import ReplyTimeout
-from fieldtwin.gateway.core.nursery import Nursery
 from fieldtwin.gateway.devices.config import BusConfig
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient
-from fieldtwin.gateway.runtime.audit import AuditLog
-from fieldtwin.gateway.runtime.bridge import Bridge, BridgeConfig, Route
-from fieldtwin.gateway.runtime.modbus_bus import ModbusBus
+from fieldtwin.gateway.runtime.audit_log import AuditLog
+from fieldtwin.gateway.runtime.bridge.bridge import Bridge, BridgeConfig, Route
+from fieldtwin.gateway.runtime.buses.modbus_bus import ModbusBus
 from fieldtwin.gateway.runtime.tags import TagTable
 
 

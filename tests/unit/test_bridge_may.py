@@ -10,8 +10,8 @@ from bridge_rig import ANY_PORT, WRITERS, read_adu, rig, take
 from support import run
 
 from fieldtwin.gateway.core.errors import ConnectionLost
-from fieldtwin.gateway.runtime.bridge import BridgeConfig
-from fieldtwin.gateway.runtime.bridge_policy import AllowRule, Policy, network
+from fieldtwin.gateway.runtime.bridge.bridge import BridgeConfig
+from fieldtwin.gateway.runtime.bridge.policy import AllowRule, Policy, network
 
 
 def test_an_allow_list_of_units_functions_and_addresses(tmp_path: Path) -> None:

@@ -17,8 +17,8 @@ from fieldtwin.gateway.protocols.modbus.server_forward import Forwarded
 from fieldtwin.gateway.protocols.modbus.server_line import LineRequest, RtuRequests
 from fieldtwin.gateway.protocols.modbus.server_mbap import MbapRequests, TcpRequest
 from fieldtwin.gateway.protocols.modbus.transaction import Transaction
-from fieldtwin.gateway.runtime.bridge_cache import ReplyCache
-from fieldtwin.gateway.runtime.bridge_policy import ALLOWED, AllowRule, Policy, network, within
+from fieldtwin.gateway.runtime.bridge.cache import ReplyCache
+from fieldtwin.gateway.runtime.bridge.policy import ALLOWED, AllowRule, Policy, network, within
 
 PDUS = st.binary(min_size=1, max_size=253)
 

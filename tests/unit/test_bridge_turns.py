@@ -16,8 +16,8 @@ from fieldtwin.gateway.devices.config import DeviceConfig
 from fieldtwin.gateway.devices.register_device import RegisterDriver, SensorDriver
 from fieldtwin.gateway.protocols.modbus.server import examine
 from fieldtwin.gateway.protocols.modbus.server_forward import ForwardedReply
-from fieldtwin.gateway.runtime.bridge_queue import MAX_WAIT_NS, Guest, GuestQueue
-from fieldtwin.gateway.runtime.modbus_bus import Job, ModbusBus
+from fieldtwin.gateway.runtime.buses.bridge_queue import MAX_WAIT_NS, Guest, GuestQueue
+from fieldtwin.gateway.runtime.buses.modbus_bus import Job, ModbusBus
 from fieldtwin.gateway.runtime.tags import TagTable
 
 READ = bytes.fromhex("03 0064 0001")

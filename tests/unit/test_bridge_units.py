@@ -14,7 +14,7 @@ from support import eventually, run
 from fieldtwin.gateway.connections.tcp import TcpConnection
 from fieldtwin.gateway.core.errors import ConnectionLost
 from fieldtwin.gateway.protocols.modbus.refusals import GatewayRefusal
-from fieldtwin.gateway.runtime.bridge import BridgeConfig, Route
+from fieldtwin.gateway.runtime.bridge.bridge import BridgeConfig, Route
 
 
 def test_a_client_reads_units_of_the_line(tmp_path: Path) -> None:

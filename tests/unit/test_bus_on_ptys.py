@@ -10,18 +10,18 @@ from pathlib import Path
 from gateway_rig import profile
 from support import eventually, run
 
+from fieldtwin.emulators.endpoints.modbus_server import serve_rtu
 from fieldtwin.emulators.endpoints.pty import PtyEnd
 from fieldtwin.emulators.modbus.bank import MapBank, Span
 from fieldtwin.emulators.modbus.rtu import RtuSlave
-from fieldtwin.emulators.modbus.serve import serve_rtu
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.connections.os_connector import OsConnector
 from fieldtwin.gateway.connections.serial_line import SerialConnection
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.endpoint import Endpoint
-from fieldtwin.gateway.core.nursery import Nursery
 from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig
 from fieldtwin.gateway.devices.register_device import RegisterDriver, SensorDriver
-from fieldtwin.gateway.runtime.modbus_bus import ModbusBus
+from fieldtwin.gateway.runtime.buses.modbus_bus import ModbusBus
 from fieldtwin.gateway.runtime.tags import TagTable
 from fieldtwin.gateway.wallclock import WallClock
 

@@ -20,8 +20,8 @@ from fieldtwin.gateway.core.values import Reason
 from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig
 from fieldtwin.gateway.devices.register_device import RegisterDriver, SensorDriver
 from fieldtwin.gateway.protocols.modbus.client import UnitPace
-from fieldtwin.gateway.runtime.modbus_bus import Job
-from fieldtwin.gateway.runtime.poll_schedule import PollSchedule, Rate, spread
+from fieldtwin.gateway.runtime.buses.modbus_bus import Job
+from fieldtwin.gateway.runtime.buses.poll_schedule import PollSchedule, Rate, spread
 from fieldtwin.gateway.runtime.tags import TagTable
 
 ONE = profile('tags:\n  level: {at: "holding:0"}\n')

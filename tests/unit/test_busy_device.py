@@ -11,13 +11,13 @@ import pytest
 from gateway_rig import LAN, profile
 from modbus_virtual import VirtualLoop, VirtualWire, run_virtually
 
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.connection import ByteConnection, CanConnection
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import Unreachable
-from fieldtwin.gateway.core.nursery import Nursery
 from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig
 from fieldtwin.gateway.devices.register_device import SensorDriver
-from fieldtwin.gateway.runtime.modbus_bus import ModbusBus
+from fieldtwin.gateway.runtime.buses.modbus_bus import ModbusBus
 from fieldtwin.gateway.runtime.tags import TagTable
 
 GROUPS = ("a", "b", "c", "d")

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from support import eventually, run
 
-from fieldtwin.commissioning.scan_canopen import CanScanner, CanScanOptions
+from fieldtwin.commissioning.scan.canopen import CanScanner, CanScanOptions
 from fieldtwin.emulators.canopen.dictionary import parse_eds
 from fieldtwin.emulators.canopen.node import CanopenNode, NodeContext
 from fieldtwin.emulators.canopen.serve import serve_node
@@ -16,10 +16,10 @@ from fieldtwin.emulators.endpoints.slcan_port import SlcanPort
 from fieldtwin.gateway.connections.can_adapter import AdapterConnection
 from fieldtwin.gateway.connections.os_connector import OsConnector
 from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.connection import CanConnection
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import ConnectionLost, UsageError
-from fieldtwin.gateway.core.nursery import Nursery
 from fieldtwin.gateway.wallclock import WallClock
 
 FRAMES = (

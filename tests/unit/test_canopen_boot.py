@@ -18,10 +18,10 @@ from modbus_virtual import VirtualLoop, run_virtually
 from test_lss_master import Slave
 
 from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import ConnectionLost
-from fieldtwin.gateway.core.nursery import Nursery
-from fieldtwin.gateway.core.profile import load_profile
+from fieldtwin.gateway.core.files.profile import load_profile
 from fieldtwin.gateway.devices.canopen_config import CanopenBusConfig, CanopenNodeConfig
 from fieldtwin.gateway.devices.canopen_device import CanopenDriver
 from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig, Heartbeat
@@ -30,8 +30,8 @@ from fieldtwin.gateway.protocols.canopen.concise_dcf import Setting
 from fieldtwin.gateway.protocols.canopen.configure import PdoConfig
 from fieldtwin.gateway.protocols.canopen.lss import LssAddress
 from fieldtwin.gateway.protocols.canopen.pdo import PdoMapping
-from fieldtwin.gateway.runtime.audit import AuditLog
-from fieldtwin.gateway.runtime.canopen_bus import CanopenBus
+from fieldtwin.gateway.runtime.audit_log import AuditLog
+from fieldtwin.gateway.runtime.buses.canopen_bus import CanopenBus
 from fieldtwin.gateway.runtime.tags import TagTable
 
 PROFILE = load_profile(Path(__file__).parents[2] / "profiles" / "devices" / "inclinometer-cia410.yaml")

@@ -22,21 +22,21 @@ from fieldtwin.emulators.canopen.node import CanopenNode
 from fieldtwin.emulators.canopen.serve import serve_node
 from fieldtwin.emulators.models.emulated_node import emulated_node
 from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.connection import ByteConnection, CanConnection
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import FieldtwinError, NotAllowed, Unreachable
-from fieldtwin.gateway.core.nursery import Nursery
-from fieldtwin.gateway.core.profile import load_profile
+from fieldtwin.gateway.core.files.profile import load_profile
 from fieldtwin.gateway.devices.canopen_config import CanopenBusConfig, CanopenNodeConfig, RpdoConfig
 from fieldtwin.gateway.devices.canopen_device import CanopenDriver
 from fieldtwin.gateway.devices.canopen_rpdo import usable
 from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig, Heartbeat, Tpdo
 from fieldtwin.gateway.protocols.canopen.configure import PdoConfig
 from fieldtwin.gateway.protocols.canopen.pdo import PdoMapping
-from fieldtwin.gateway.runtime.audit import AuditLog
-from fieldtwin.gateway.runtime.canopen_bus import CanopenBus
-from fieldtwin.gateway.runtime.output import Output
-from fieldtwin.gateway.runtime.outputs import OutputWriter
+from fieldtwin.gateway.runtime.audit_log import AuditLog
+from fieldtwin.gateway.runtime.buses.canopen_bus import CanopenBus
+from fieldtwin.gateway.runtime.outputs.output import Output
+from fieldtwin.gateway.runtime.outputs.outputs import OutputWriter
 from fieldtwin.gateway.runtime.tags import TagTable
 
 DEVICES = Path(__file__).parents[2] / "profiles" / "devices"

@@ -22,17 +22,17 @@ from fieldtwin.emulators.journal import HeldJournal
 from fieldtwin.emulators.models.emulated_node import emulated_node
 from fieldtwin.emulators.signals import SignalPlayer, SignalTrack
 from fieldtwin.gateway.connections.os_connector import OsConnector
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
-from fieldtwin.gateway.core.nursery import Nursery
-from fieldtwin.gateway.core.profile import DeviceProfile, load_profile
-from fieldtwin.gateway.core.recording import RecordingReader
+from fieldtwin.gateway.core.files.profile import DeviceProfile, load_profile
+from fieldtwin.gateway.core.files.recording import RecordingReader
 from fieldtwin.gateway.core.values import Quality
 from fieldtwin.gateway.devices.canopen_device import CanopenDriver
 from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig, Heartbeat, Tpdo
 from fieldtwin.gateway.protocols.canopen.dictionary import load_dictionary
-from fieldtwin.gateway.runtime.audit import AuditLog
-from fieldtwin.gateway.runtime.canopen_bus import CanopenBus
+from fieldtwin.gateway.runtime.audit_log import AuditLog
+from fieldtwin.gateway.runtime.buses.canopen_bus import CanopenBus
 from fieldtwin.gateway.runtime.tags import TagTable
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.twin.prototype.file import load_prototype

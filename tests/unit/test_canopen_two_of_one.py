@@ -17,13 +17,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from test_scan_canopen import URL, scan
 
-from fieldtwin.commissioning.can_ear import BusEar
-from fieldtwin.commissioning.identify_canopen import identify_canopen
+from fieldtwin.commissioning.identify.canopen import identify_canopen
+from fieldtwin.commissioning.scan.can_listener import BusEar
 from fieldtwin.emulators.canopen.dictionary import parse_eds
 from fieldtwin.emulators.canopen.node import CanopenNode
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.clock import NS_PER_MS
-from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.devices.canopen_config import CanopenBusConfig, CanopenNodeConfig, cycle_period_ns
 from fieldtwin.gateway.protocols.canopen.boot import Configuration
 from fieldtwin.gateway.protocols.canopen.concise_dcf import Setting

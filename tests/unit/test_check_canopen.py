@@ -13,19 +13,19 @@ from canopen_slave_rig import NODE
 from nodes_on_a_bus import LONG, Serve, local_node, on_bus, ours
 from support import run
 
-from fieldtwin.checking.canopen_session import CanopenOptions, check_canopen
-from fieldtwin.checking.checked import Checked
-from fieldtwin.checking.run import Plan
-from fieldtwin.conformance.case import Danger
+from fieldtwin.conformance.core.case import Danger
+from fieldtwin.conformance.devices.canopen.session import CanopenOptions, check_canopen
+from fieldtwin.conformance.devices.checked import Checked
+from fieldtwin.conformance.devices.run import Plan
 from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
+from fieldtwin.emulators.endpoints.memory_ports import MemoryNet
 from fieldtwin.emulators.virtual.clock import VirtualClock
-from fieldtwin.emulators.virtual.ports import MemoryNet
 from fieldtwin.gateway.connections.soft_bus import SoftBus
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.connection import CanConnection
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import NotAllowed
-from fieldtwin.report.model import Verdict
+from fieldtwin.results.model import Verdict
 
 ALL = Plan(at_most=Danger.DISRUPT, has=frozenset({"object", "eds", "i-know"}))
 MAY_WRITE = ((0x2000, 0), (0x2004, 0), (0x1017, 0))

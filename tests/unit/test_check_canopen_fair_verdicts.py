@@ -8,17 +8,17 @@ from pathlib import Path
 from canopen_slave_rig import NODE
 from nodes_on_a_bus import LONG, on_bus, ours
 
-from fieldtwin.checking.canopen_session import CanopenOptions, check_canopen
-from fieldtwin.checking.run import Plan
-from fieldtwin.conformance.case import Danger
+from fieldtwin.conformance.core.case import Danger
+from fieldtwin.conformance.devices.canopen.session import CanopenOptions, check_canopen
+from fieldtwin.conformance.devices.run import Plan
 from fieldtwin.emulators.canopen.dictionary import parse_eds
 from fieldtwin.emulators.canopen.node import CanopenNode
 from fieldtwin.emulators.canopen.serve import serve_node
+from fieldtwin.emulators.endpoints.memory_ports import MemoryNet
 from fieldtwin.emulators.virtual.clock import VirtualClock
-from fieldtwin.emulators.virtual.ports import MemoryNet
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.connection import CanConnection
-from fieldtwin.report.model import Verdict
+from fieldtwin.results.model import Verdict
 
 SDO, REPLY = 0x600 + NODE, 0x580 + NODE
 ABORT = bytes.fromhex("80 00 10 00 01 00 04 05")

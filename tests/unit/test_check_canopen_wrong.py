@@ -9,17 +9,17 @@ import pytest
 from canopen_slave_rig import NODE
 from nodes_on_a_bus import LONG, on_bus
 
-from fieldtwin.checking.canopen_session import CanopenOptions, check_canopen
-from fieldtwin.checking.run import Plan
-from fieldtwin.conformance.case import Danger
+from fieldtwin.conformance.core.case import Danger
+from fieldtwin.conformance.devices.canopen.session import CanopenOptions, check_canopen
+from fieldtwin.conformance.devices.run import Plan
 from fieldtwin.emulators.canopen.dictionary import parse_eds
 from fieldtwin.emulators.canopen.node import CanopenNode
 from fieldtwin.emulators.canopen.serve import serve_node
+from fieldtwin.emulators.endpoints.memory_ports import MemoryNet
 from fieldtwin.emulators.virtual.clock import VirtualClock
-from fieldtwin.emulators.virtual.ports import MemoryNet
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.connection import CanConnection
-from fieldtwin.report.model import Verdict
+from fieldtwin.results.model import Verdict
 
 Twist = Callable[[CanFrame, list[CanFrame]], list[CanFrame]]
 """What was heard and what a right node sends for it -> what is sent."""

@@ -19,11 +19,11 @@ from rich.table import Table
 from support import eventually, run
 from test_gateway_canopen_bus import rig
 
-from fieldtwin.cli.run_command import command as run_system
-from fieldtwin.cli.talk import data, talk
-from fieldtwin.gateway.core.recording import looks_like_another_file
+from fieldtwin.cli.run.run_command import command as run_system
+from fieldtwin.console import data, talk
+from fieldtwin.gateway.core.files.recording import looks_like_another_file
 from fieldtwin.gateway.devices.config import Heartbeat
-from fieldtwin.running import plc_client
+from fieldtwin.run.processes import plc_client
 
 SILENT = "faults: [{name: silence, device: ctd}]\n"
 VIRTUAL = ["observatory", "--prototype", "--virtual", "--for", "5s"]

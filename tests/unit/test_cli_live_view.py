@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from fieldtwin.cli.live_view import age_text, interference, line, render, troubles, value_text
-from fieldtwin.running.options import RunOptions
-from fieldtwin.running.session import RunSession
+from fieldtwin.cli.run.live_view import age_text, interference, line, render, troubles, value_text
+from fieldtwin.run.live.options import RunOptions
+from fieldtwin.run.live.session import RunSession
 
 NOBODY = "rtu:/dev/ttyS0?baudrate=19200&frame=8E1: cannot open the serial port: No such file or directory"
 SILENT = "tcp://modem:502: unit 1: no reply within 2.0 s; expected unit 1, function 03h"

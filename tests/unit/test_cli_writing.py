@@ -12,7 +12,7 @@ from click.testing import CliRunner
 
 from fieldtwin.cli.main import cli
 from fieldtwin.gateway.core.errors import FileInvalid
-from fieldtwin.scenarios.trace import open_sink
+from fieldtwin.results.trace import open_sink
 
 ROOT = Path(__file__).parents[2]
 

@@ -15,10 +15,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fieldtwin.capture.formats.cnv import import_cnv
 from fieldtwin.emulators.signals import SignalTrack
-from fieldtwin.formats.cnv import import_cnv
 from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid, UsageError
-from fieldtwin.gateway.core.recording import RecordingReader
+from fieldtwin.gateway.core.files.recording import RecordingReader
 
 REAL_CAST = Path(os.environ.get("FIELDTWIN_REAL_CAST", "no-such-cast.cnv.gz"))
 """A whole cast of a real instrument, which does not ship with the project: name one to test with it."""

@@ -14,8 +14,8 @@ from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.core.statemachine import decode_period, encode_period
 from fieldtwin.gateway.core.values import COMMAND
 from fieldtwin.gateway.store.event import Event, Kind
-from fieldtwin.running.twin_rules import load_planner
-from fieldtwin.running.twinning import Twinning
+from fieldtwin.run.shadow.rules import load_planner
+from fieldtwin.run.shadow.twin import Twinning
 from fieldtwin.twin.model.mape.execute import Bounds
 from fieldtwin.twin.model.mape.messages import verdict
 from fieldtwin.twin.model.mape.plan import Plan, RulePlanner

@@ -11,16 +11,16 @@ from canopen_slave_rig import RICH
 from click.testing import CliRunner
 from commissioning_rig import CAN_URL, URL, Wired, bank, can_bus, loop, run_virtually, unit
 
-from fieldtwin.cli.diff_command import command
-from fieldtwin.commissioning.diff import Leave, diff_dictionary, diff_dumps, diff_profile, spans
-from fieldtwin.commissioning.dump import Job
-from fieldtwin.commissioning.dump_file import Dump, load_dump
-from fieldtwin.commissioning.dumping import dump, register_spans
-from fieldtwin.commissioning.reading import Target
+from fieldtwin.cli.device.diff_command import command
+from fieldtwin.commissioning.access.reading import Target
+from fieldtwin.commissioning.dump.diff import Leave, diff_dictionary, diff_dumps, diff_profile, spans
+from fieldtwin.commissioning.dump.dump import Job
+from fieldtwin.commissioning.dump.file import Dump, load_dump
+from fieldtwin.commissioning.dump.session import dump, register_spans
 from fieldtwin.emulators.canopen.dictionary import parse_eds
 from fieldtwin.emulators.canopen.node import CanopenNode, NodeContext
 from fieldtwin.emulators.modbus.bank import MapBank, Span
-from fieldtwin.gateway.core.profile import load_profile
+from fieldtwin.gateway.core.files.profile import load_profile
 from fieldtwin.gateway.protocols.canopen.dictionary import parse_dictionary
 
 ROOT = Path(__file__).parents[2]

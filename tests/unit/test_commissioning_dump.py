@@ -12,19 +12,19 @@ from commissioning_rig import CAN_URL, URL, Wired, bank, can_bus, loop, run_virt
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fieldtwin.commissioning.coverage import NOT_ASKED, READABLE, REFUSED
-from fieldtwin.commissioning.dump import Job
-from fieldtwin.commissioning.dump_file import load_dump
-from fieldtwin.commissioning.dump_objects import ListedObjects
-from fieldtwin.commissioning.dump_sweep import Refused, Silent, Sweep, Taken
-from fieldtwin.commissioning.dumping import dump, estimate, frames, log_path, object_ranges, register_spans
-from fieldtwin.commissioning.latency import Histogram
-from fieldtwin.commissioning.reading import Target
+from fieldtwin.commissioning.access.reading import Target
+from fieldtwin.commissioning.dump.coverage import NOT_ASKED, READABLE, REFUSED
+from fieldtwin.commissioning.dump.dump import Job
+from fieldtwin.commissioning.dump.file import load_dump
+from fieldtwin.commissioning.dump.latency import Histogram
+from fieldtwin.commissioning.dump.objects import ListedObjects
+from fieldtwin.commissioning.dump.session import dump, estimate, frames, log_path, object_ranges, register_spans
+from fieldtwin.commissioning.dump.sweep import Refused, Silent, Sweep, Taken
 from fieldtwin.emulators.canopen.dictionary import parse_eds
 from fieldtwin.emulators.canopen.node import CanopenNode, NodeContext
 from fieldtwin.emulators.modbus.bank import Span
 from fieldtwin.gateway.core.errors import FileInvalid, Unreachable, UsageError
-from fieldtwin.gateway.core.profile import RegisterRange, load_profile
+from fieldtwin.gateway.core.files.profile import RegisterRange, load_profile
 from fieldtwin.gateway.protocols.canopen.dictionary import parse_dictionary
 
 ROOT = Path(__file__).parents[2]

@@ -18,18 +18,18 @@ from commissioning_rig import URL, Wired, bank, loop, run_virtually, unit
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fieldtwin.commissioning.address import tags_of
-from fieldtwin.commissioning.dump import Job
-from fieldtwin.commissioning.dump_file import load_dump
-from fieldtwin.commissioning.dumping import dump, register_spans
-from fieldtwin.commissioning.infer import Series, infer, series_of, without_repetitions
-from fieldtwin.commissioning.infer_costs import NUMBERS, cost, orders_of
-from fieldtwin.commissioning.infer_draft import checked, draft_profile
-from fieldtwin.commissioning.infer_fields import Level, Reading, infer_run, run_of
-from fieldtwin.commissioning.reading import Target, point_at
+from fieldtwin.commissioning.access.address import tags_of
+from fieldtwin.commissioning.access.reading import Target, point_at
+from fieldtwin.commissioning.dump.dump import Job
+from fieldtwin.commissioning.dump.file import load_dump
+from fieldtwin.commissioning.dump.session import dump, register_spans
+from fieldtwin.commissioning.infer.costs import NUMBERS, cost, orders_of
+from fieldtwin.commissioning.infer.draft import checked, draft_profile
+from fieldtwin.commissioning.infer.fields import Level, Reading, infer_run, run_of
+from fieldtwin.commissioning.infer.infer import Series, infer, series_of, without_repetitions
 from fieldtwin.emulators.modbus.bank import Span
 from fieldtwin.gateway.core.errors import FileInvalid
-from fieldtwin.gateway.core.profile import load_profile
+from fieldtwin.gateway.core.files.profile import load_profile
 
 START_S = 1_790_000_000.0
 FORMS = {"int16": "h", "uint16": "H", "int32": "i", "uint32": "I", "float32": "f", "float64": "d"}

@@ -8,14 +8,14 @@ import pytest
 from canopen_slave_rig import RICH
 from commissioning_rig import CAN_URL, URL, Wired, bank, can_bus, loop, run_virtually, unit
 
-from fieldtwin.commissioning.address import RawForm, tags_of, with_care
-from fieldtwin.commissioning.reading import Target, dry_point, point_at, row_of, target_of, text_of
-from fieldtwin.commissioning.writing import before, carry_out, check_broadcast, plan_write, plan_writes, restore
+from fieldtwin.commissioning.access.address import RawForm, tags_of, with_care
+from fieldtwin.commissioning.access.reading import Target, dry_point, point_at, row_of, target_of, text_of
+from fieldtwin.commissioning.access.writing import before, carry_out, check_broadcast, plan_write, plan_writes, restore
 from fieldtwin.emulators.canopen.dictionary import parse_eds
 from fieldtwin.emulators.canopen.node import CanopenNode, NodeContext
 from fieldtwin.emulators.modbus.bank import Span
 from fieldtwin.gateway.core.errors import CheckFailed, NotAllowed, UsageError, VerifyFailed
-from fieldtwin.gateway.core.profile import load_profile
+from fieldtwin.gateway.core.files.profile import load_profile
 
 ROOT = Path(__file__).parents[2]
 SDM = load_profile(ROOT / "profiles/devices/eastron-sdm630.yaml")

@@ -11,13 +11,13 @@ from commissioning_rig import URL, Wired, bank, loop, run_virtually, unit
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fieldtwin.cli import dump_command, read_command, watch_command, write_command
-from fieldtwin.commissioning.address import tags_of
-from fieldtwin.commissioning.plotting import check_plot, plot
-from fieldtwin.commissioning.point import Answer
-from fieldtwin.commissioning.reading import Target, point_at
-from fieldtwin.commissioning.watching import BLOCKS, MOST_SAMPLES, History, samples, sparkline
-from fieldtwin.commissioning.writing import before, plan_write
+from fieldtwin.cli.device import dump_command, read_command, watch_command, write_command
+from fieldtwin.commissioning.access.address import tags_of
+from fieldtwin.commissioning.access.plotting import check_plot, plot
+from fieldtwin.commissioning.access.point import Answer
+from fieldtwin.commissioning.access.reading import Target, point_at
+from fieldtwin.commissioning.access.watching import BLOCKS, MOST_SAMPLES, History, samples, sparkline
+from fieldtwin.commissioning.access.writing import before, plan_write
 from fieldtwin.emulators.modbus.bank import Span
 from fieldtwin.gateway.core.errors import FileInvalid, ModbusExceptionReply, UsageError
 from fieldtwin.gateway.core.values import Quality, Reason, TagValue

@@ -15,7 +15,7 @@ from fieldtwin.emulators.replay.replay import Answer, ExchangeReplay, NeverRecor
 from fieldtwin.emulators.replay.situation import Situations
 from fieldtwin.emulators.replay.unit import ReplayUnit
 from fieldtwin.gateway.core.errors import UsageError
-from fieldtwin.gateway.core.recording import Exchange, RecordingHeader, RecordingWriter
+from fieldtwin.gateway.core.files.recording import Exchange, RecordingHeader, RecordingWriter
 
 
 def read(address: int, count: int = 1, function: int = 4) -> bytes:

@@ -8,8 +8,8 @@ from typing import Any
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from fieldtwin.gateway.core.events import Consumer
-from fieldtwin.gateway.core.image import (
+from fieldtwin.gateway.core.concurrency.events import Consumer
+from fieldtwin.gateway.core.image.image import (
     INPUTS,
     OUTPUTS,
     Image,

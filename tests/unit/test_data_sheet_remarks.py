@@ -16,7 +16,7 @@ import pytest
 from canopen_slave_rig import record, var
 from support import eventually, run
 
-from fieldtwin.commissioning.live import canopen_at
+from fieldtwin.commissioning.access.connection import canopen_at
 from fieldtwin.emulators.canopen.dictionary import parse_eds
 from fieldtwin.emulators.canopen.node import CanopenNode
 from fieldtwin.emulators.canopen.remarks import remarks

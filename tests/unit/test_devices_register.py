@@ -19,10 +19,10 @@ from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.emulators.models.sampled_sensor import SampledSensor
 from fieldtwin.emulators.signals import SignalPlayer, SignalTrack
 from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.concurrency.events import Consumer
 from fieldtwin.gateway.core.errors import FileInvalid, UnknownCommand, VerifyFailed
-from fieldtwin.gateway.core.events import Consumer
-from fieldtwin.gateway.core.profile import load_profile
-from fieldtwin.gateway.core.recording import SignalRow
+from fieldtwin.gateway.core.files.profile import load_profile
+from fieldtwin.gateway.core.files.recording import SignalRow
 from fieldtwin.gateway.core.values import COMMAND, DATA, MEASUREMENT
 from fieldtwin.gateway.devices.codec import decode, decode_little, encode, reorder
 from fieldtwin.gateway.devices.config import DeviceConfig

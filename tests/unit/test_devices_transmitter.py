@@ -19,16 +19,16 @@ from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.emulators.models.mailbox_modem import ModemPair
 from fieldtwin.emulators.models.packet_link import PacketLink, Untamed
 from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.concurrency.events import Consumer
 from fieldtwin.gateway.core.errors import ConnectionLost, FieldtwinError, FileInvalid, NotAllowed
-from fieldtwin.gateway.core.events import Consumer
-from fieldtwin.gateway.core.profile import load_profile
+from fieldtwin.gateway.core.files.profile import load_profile
 from fieldtwin.gateway.core.values import COMMAND, DATA, RESPONSE
 from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig
 from fieldtwin.gateway.devices.transmitter import TransmitterDriver, next_sequence
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient
-from fieldtwin.gateway.runtime.audit import AuditLog
-from fieldtwin.gateway.runtime.mailbox_pump import MailboxPump
-from fieldtwin.gateway.runtime.modbus_bus import Job, ModbusBus
+from fieldtwin.gateway.runtime.audit_log import AuditLog
+from fieldtwin.gateway.runtime.buses.modbus_bus import Job, ModbusBus
+from fieldtwin.gateway.runtime.mailboxes.pump import MailboxPump
 from fieldtwin.gateway.runtime.tags import TagTable
 from fieldtwin.gateway.wallclock import WallClock
 

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from fieldtwin.running.health import _disk, _run_directory, examine
-from fieldtwin.running.health_judging import (
+from fieldtwin.doctor.checks import _disk, _run_directory, examine
+from fieldtwin.doctor.host import cgroup_quota, clock_state, cpu_count, join_advice, kernel_number
+from fieldtwin.doctor.verdicts import (
     ClockState,
     Verdict,
     judged_can,
@@ -18,7 +19,6 @@ from fieldtwin.running.health_judging import (
     judged_watches,
     quota_of,
 )
-from fieldtwin.running.health_os import cgroup_quota, clock_state, cpu_count, join_advice, kernel_number
 
 
 @pytest.mark.parametrize(

@@ -11,10 +11,10 @@ import pytest
 from click.testing import CliRunner
 
 from fieldtwin.cli.main import cli
-from fieldtwin.drawing import water
-from fieldtwin.drawing.svg import ROOM, svg
-from fieldtwin.drawing.tree import tree
-from fieldtwin.drawing.wiring import Wiring, wiring
+from fieldtwin.reports.drawing import network as water
+from fieldtwin.reports.drawing.svg import ROOM, svg
+from fieldtwin.reports.drawing.tree import tree
+from fieldtwin.reports.drawing.wiring import Wiring, wiring
 from fieldtwin.twin.network.network import load_network
 from fieldtwin.twin.prototype.file import load_prototype
 from fieldtwin.twin.site.data_files import network_file

@@ -17,11 +17,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fieldtwin.cli.main import cli
-from fieldtwin.commissioning.coverage import INVALID, NOT_ASKED, READABLE, REFUSED, SILENT, Coverage, describe
-from fieldtwin.commissioning.dump_beyond import beyond_silence, other_lengths
-from fieldtwin.commissioning.dump_file import load_dump
-from fieldtwin.commissioning.dump_sweep import Invalid, Outcome, Refused, Silent, Sweep, Taken
-from fieldtwin.gateway.core.profile import RegisterRange
+from fieldtwin.commissioning.dump.beyond import beyond_silence, other_lengths
+from fieldtwin.commissioning.dump.coverage import INVALID, NOT_ASKED, READABLE, REFUSED, SILENT, Coverage, describe
+from fieldtwin.commissioning.dump.file import load_dump
+from fieldtwin.commissioning.dump.sweep import Invalid, Outcome, Refused, Silent, Sweep, Taken
+from fieldtwin.gateway.core.files.profile import RegisterRange
 
 BLOCKS = (range(20), range(1000, 1032))
 

@@ -24,8 +24,8 @@ from fieldtwin.emulators.modbus.mbap import MbapSlave
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.emulators.stated import parts_of
 from fieldtwin.gateway.core.errors import UsageError
-from fieldtwin.gateway.core.profile import DeviceProfile, resolve
-from fieldtwin.gateway.core.yaml_file import parse
+from fieldtwin.gateway.core.files.profile import DeviceProfile, resolve
+from fieldtwin.gateway.core.files.yaml_file import parse
 
 METER = """
 device: test/meter

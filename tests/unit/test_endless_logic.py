@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from st_bench import program, run, scan
 
-from fieldtwin.gateway.core.image import INPUTS
+from fieldtwin.gateway.core.image.image import INPUTS
 from fieldtwin.plc.binding import image_for
 from fieldtwin.plc.config import PlcConfig, ProgramConfig
 from fieldtwin.plc.program import ProgramFailed, ProgramStuck, ScanTooLong
@@ -22,7 +22,7 @@ from fieldtwin.plc.prove import Proof, prove
 from fieldtwin.plc.runner import Runner
 from fieldtwin.plc.st.resource import MAX_STEPS
 from fieldtwin.plc.task import StopReason
-from fieldtwin.testhost.stepped_program import SteppedProgram
+from fieldtwin.testing.worker.stepped_program import SteppedProgram
 
 ENDLESS = {
     "WHILE": "WHILE go DO\nn := n + 1;\nEND_WHILE",

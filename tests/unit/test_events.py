@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fieldtwin.gateway.core.concurrency.events import Consumer, EventHandler, Producer
 from fieldtwin.gateway.core.errors import Bug
-from fieldtwin.gateway.core.events import Consumer, EventHandler, Producer
 from fieldtwin.gateway.core.values import COMMAND, DATA
 
 

@@ -12,12 +12,12 @@ from pathlib import Path
 
 import pytest
 
-from fieldtwin.commissioning.plotting import check_plot
+from fieldtwin.capture.recordings.exporting import Column, _write_parquet
+from fieldtwin.commissioning.access.plotting import check_plot
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.store.knowledge import open_knowledge
 from fieldtwin.gateway.wallclock import WallClock
-from fieldtwin.recording.exporting import Column, _write_parquet
-from fieldtwin.running import loops
+from fieldtwin.run.processes import event_loop as loops
 from fieldtwin.twin.site.system import load_system
 from fieldtwin.twin.thread.place import twin_carrier
 

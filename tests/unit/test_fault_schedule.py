@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fieldtwin.emulators.faults.schema import parse_fault
-from fieldtwin.gateway.core.yaml_file import parse
-from fieldtwin.running.fault_schedule import CALM_S, MOST, UNSEEN_ON_TCP, random_schedule
-from fieldtwin.running.shrink import as_scenario, smallest
+from fieldtwin.gateway.core.files.yaml_file import parse
+from fieldtwin.run.campaigns.shrink import as_scenario, smallest
+from fieldtwin.run.virtual.fault_schedule import CALM_S, MOST, UNSEEN_ON_TCP, random_schedule
 from fieldtwin.twin.site.system import load_system
 
 SYSTEM = load_system("observatory", [])

@@ -10,9 +10,9 @@ import pytest
 from support import eventually, run
 
 from fieldtwin.gateway.core.control import ControlClient, ControlServer
-from fieldtwin.running.field_contact import FieldContact, connect_control
-from fieldtwin.running.field_return import FieldReturn
-from fieldtwin.running.oracle import Oracle
+from fieldtwin.run.live.oracle import Oracle
+from fieldtwin.run.processes.field_contact import FieldContact, connect_control
+from fieldtwin.run.processes.field_return import FieldReturn
 from fieldtwin.twin.site.system import System, load_system
 
 

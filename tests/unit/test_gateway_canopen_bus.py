@@ -21,15 +21,15 @@ from fieldtwin.emulators.models.played_objects import PlayedObjects
 from fieldtwin.emulators.signals import SignalPlayer, SignalTrack
 from fieldtwin.gateway.connections.os_connector import OsConnector
 from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import ConnectionLost, NotAllowed
-from fieldtwin.gateway.core.nursery import Nursery
-from fieldtwin.gateway.core.profile import load_profile
-from fieldtwin.gateway.core.recording import SignalRow
+from fieldtwin.gateway.core.files.profile import load_profile
+from fieldtwin.gateway.core.files.recording import SignalRow
 from fieldtwin.gateway.devices.canopen_device import CanopenDriver
 from fieldtwin.gateway.devices.config import BusConfig, CanopenBusConfig, DeviceConfig, Heartbeat, Tpdo
-from fieldtwin.gateway.runtime.audit import AuditLog
-from fieldtwin.gateway.runtime.canopen_bus import CanopenBus
+from fieldtwin.gateway.runtime.audit_log import AuditLog
+from fieldtwin.gateway.runtime.buses.canopen_bus import CanopenBus
 from fieldtwin.gateway.runtime.tags import TagTable
 from fieldtwin.gateway.wallclock import WallClock
 

@@ -13,11 +13,11 @@ from support import eventually, run
 
 from fieldtwin.emulators.modbus.bank import DeviceFailure, MapBank, Span, Table
 from fieldtwin.gateway.core.errors import ConnectionLost, EndpointBusy, FieldtwinError, Unreachable
-from fieldtwin.gateway.core.profile import DeviceProfile
+from fieldtwin.gateway.core.files.profile import DeviceProfile
 from fieldtwin.gateway.devices.config import DeviceConfig
 from fieldtwin.gateway.devices.register_device import RegisterDriver, SensorDriver
-from fieldtwin.gateway.runtime.backoff import Backoff
-from fieldtwin.gateway.runtime.modbus_bus import MAX_JOBS, Job
+from fieldtwin.gateway.runtime.buses.backoff import Backoff
+from fieldtwin.gateway.runtime.buses.modbus_bus import MAX_JOBS, Job
 from fieldtwin.gateway.runtime.tags import TagTable
 
 TWO_GROUPS = """

@@ -7,7 +7,7 @@ import asyncio
 import pytest
 from support import run
 
-from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
 
 
 async def until_cancelled(name: str, log: list[str]) -> None:

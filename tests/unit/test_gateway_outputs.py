@@ -16,15 +16,15 @@ from hypothesis import strategies as st
 from support import eventually, run
 
 from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.errors import NotAllowed, Unreachable
-from fieldtwin.gateway.core.nursery import Nursery
 from fieldtwin.gateway.core.values import COMMAND
 from fieldtwin.gateway.devices.codec import decode, encode
 from fieldtwin.gateway.devices.config import DeviceConfig
 from fieldtwin.gateway.devices.register_device import RegisterDriver, SensorDriver
-from fieldtwin.gateway.runtime.audit import AuditLog
-from fieldtwin.gateway.runtime.output import Output
-from fieldtwin.gateway.runtime.outputs import OutputWriter
+from fieldtwin.gateway.runtime.audit_log import AuditLog
+from fieldtwin.gateway.runtime.outputs.output import Output
+from fieldtwin.gateway.runtime.outputs.outputs import OutputWriter
 from fieldtwin.gateway.runtime.tags import TagTable
 from fieldtwin.gateway.wallclock import WallClock
 

@@ -16,17 +16,17 @@ import pytest
 from modbus_virtual import VirtualLoop, VirtualWire, run_virtually
 
 from fieldtwin.gateway.connections.listeners import ClientConnection
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.connection import ByteConnection, CanConnection
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import ConnectionLost, Unreachable
-from fieldtwin.gateway.core.nursery import Nursery
 from fieldtwin.gateway.devices.config import BusConfig
 from fieldtwin.gateway.protocols.modbus.server import READ_FUNCTIONS, WRITE_FUNCTIONS
-from fieldtwin.gateway.runtime.audit import AuditLog
-from fieldtwin.gateway.runtime.bridge import Bridge, BridgeConfig, Route
-from fieldtwin.gateway.runtime.bridge_policy import AllowRule, Policy
-from fieldtwin.gateway.runtime.bridge_tcp import TcpFront
-from fieldtwin.gateway.runtime.modbus_bus import ModbusBus
+from fieldtwin.gateway.runtime.audit_log import AuditLog
+from fieldtwin.gateway.runtime.bridge.bridge import Bridge, BridgeConfig, Route
+from fieldtwin.gateway.runtime.bridge.policy import AllowRule, Policy
+from fieldtwin.gateway.runtime.bridge.tcp import TcpFront
+from fieldtwin.gateway.runtime.buses.modbus_bus import ModbusBus
 from fieldtwin.gateway.runtime.tags import TagTable
 
 ROWS = tomllib.loads((Path(__file__).parents[1] / "vectors" / "modbus_gateway.toml").read_text())["row"]

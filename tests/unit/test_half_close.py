@@ -13,7 +13,7 @@ from bridge_rig import ANY_PORT, WRITERS, read_adu, rig
 from support import eventually, run
 from test_serve_tags import served
 
-from fieldtwin.gateway.runtime.bridge import BridgeConfig
+from fieldtwin.gateway.runtime.bridge.bridge import BridgeConfig
 
 
 async def ask_and_close(port: int, requests: bytes) -> bytes:

@@ -10,9 +10,9 @@ from commissioning_rig import loop, run_virtually
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fieldtwin.commissioning.identify_canopen import CanIdentity, identify_canopen
-from fieldtwin.commissioning.matching import CanClues, Sureness, judge_canopen
-from fieldtwin.gateway.core.profile import load_profile
+from fieldtwin.commissioning.identify.canopen import CanIdentity, identify_canopen
+from fieldtwin.commissioning.identify.matching import CanClues, Sureness, judge_canopen
+from fieldtwin.gateway.core.files.profile import load_profile
 from fieldtwin.gateway.protocols.canopen.configure import Identity
 from fieldtwin.gateway.protocols.canopen.dictionary import load_dictionary
 

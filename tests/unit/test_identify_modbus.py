@@ -9,16 +9,16 @@ from commissioning_rig import Wired, bank, loop, run_virtually, unit
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fieldtwin.cli.identify_command import command
-from fieldtwin.commissioning.identify_modbus import ModbusIdentity, identify_modbus
-from fieldtwin.commissioning.matching import Candidate, ModbusClues, Sureness, judge_modbus, summary
-from fieldtwin.commissioning.sunspec import next_model
+from fieldtwin.cli.device.identify_command import command
+from fieldtwin.commissioning.identify.matching import Candidate, ModbusClues, Sureness, judge_modbus, summary
+from fieldtwin.commissioning.identify.modbus import ModbusIdentity, identify_modbus
+from fieldtwin.commissioning.identify.sunspec import next_model
 from fieldtwin.emulators.modbus.bank import Span
 from fieldtwin.emulators.modbus.identification import Identification
 from fieldtwin.emulators.modbus.unit import ModbusUnit, UnitParts
 from fieldtwin.emulators.recorded_device import load_replay
 from fieldtwin.emulators.replay.unit import ReplayUnit
-from fieldtwin.gateway.core.profile import DeviceProfile, load_profile
+from fieldtwin.gateway.core.files.profile import DeviceProfile, load_profile
 
 URL = "tcp://192.0.2.1:502"
 SHIPPED = [load_profile(path) for path in sorted(Path("profiles/devices").glob("*.yaml"))]

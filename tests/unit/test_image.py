@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fieldtwin.gateway.core.errors import Bug, FileInvalid
-from fieldtwin.gateway.core.image import (
+from fieldtwin.gateway.core.image.image import (
     INPUTS,
     OUTPUTS,
     Image,

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from fieldtwin.gateway.core.image import ImageLayout, RegionLayout, RegionReader, TagKind, TagSpec, message_tag
+from fieldtwin.gateway.core.image.image import ImageLayout, RegionLayout, RegionReader, TagKind, TagSpec, message_tag
 
 TAGS = 334
 """Of each of three kinds: 1,002 mixed tags."""
@@ -25,7 +25,7 @@ DEPTH = 512
 # Every publication is n in all tags and one message n: any mixture of two publications shows.
 WRITER = """
 import json, mmap, sys
-from fieldtwin.gateway.core.image import ImageLayout
+from fieldtwin.gateway.core.image.image import ImageLayout
 from fieldtwin.gateway.core.values import Quality, Reason
 layout = ImageLayout.from_description(json.loads(sys.argv[2]))
 with open(sys.argv[1], "r+b") as f:

@@ -23,12 +23,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from infer_corpus import START_S, corpus, packed
 
-from fieldtwin.commissioning.dump_file import load_dump
-from fieldtwin.commissioning.infer import Inference, Series, infer, series_of
-from fieldtwin.commissioning.infer_calibration import CURVES, calibrated, fitted
-from fieldtwin.commissioning.infer_draft import checked, draft_profile
-from fieldtwin.commissioning.infer_fields import Level, Reading
-from fieldtwin.commissioning.infer_joint import carry_evidence, toggled_bits
+from fieldtwin.commissioning.dump.file import load_dump
+from fieldtwin.commissioning.infer.calibration import CURVES, calibrated, fitted
+from fieldtwin.commissioning.infer.draft import checked, draft_profile
+from fieldtwin.commissioning.infer.fields import Level, Reading
+from fieldtwin.commissioning.infer.infer import Inference, Series, infer, series_of
+from fieldtwin.commissioning.infer.joint import carry_evidence, toggled_bits
 
 ROOT = Path(__file__).parents[2]
 PASSES = 20

@@ -16,8 +16,8 @@ import pytest
 from click.testing import CliRunner
 
 from fieldtwin.cli.main import cli
-from fieldtwin.report.junit import Flavour, render_junit
-from fieldtwin.report.model import CheckResult, Report, ScenarioResult, Struck, Verdict
+from fieldtwin.reports.junit import Flavour, render_junit
+from fieldtwin.results.model import CheckResult, Report, ScenarioResult, Struck, Verdict
 
 _RESULT = ({"type", "message"}, set[str](), set[str](), True)
 _TEXT = (set[str](), set[str](), set[str](), True)

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from fieldtwin.gateway.core.errors import FileInvalid
-from fieldtwin.running.ledger import Ledger
-from fieldtwin.running.many_seeds import SeedResult, fingerprint
+from fieldtwin.run.campaigns.ledger import Ledger
+from fieldtwin.run.campaigns.many_seeds import SeedResult, fingerprint
 
 
 def result(seed: int, ok: bool = True, wrong: int = 0) -> SeedResult:
@@ -56,7 +56,7 @@ def test_a_campaign_that_the_ledger_knows_as_failed_does_not_end_ok(tmp_path: Pa
     """Observed before: with --ledger a seed that had failed was not run again, and the campaign ended with ok."""
     from click.testing import CliRunner
 
-    from fieldtwin.cli.run_command import command
+    from fieldtwin.cli.run.run_command import command
 
     path = tmp_path / "ledger.jsonl"
     words = ["observatory", "--prototype", "--virtual", "--for", "2s", "--seeds", "1..2", "--jobs", "1"]

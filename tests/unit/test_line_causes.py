@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from test_scan_line import exchange, meter
 from uart_line import UartLine
 
-from fieldtwin.commissioning.can_ear import BusHeard
-from fieldtwin.commissioning.causes import Probe, SerialEvidence, can_causes, serial_causes, tcp_causes
-from fieldtwin.commissioning.line import LineLook, LineReport, look_at_line, probe_of
-from fieldtwin.commissioning.traffic import Heard, LineEar
+from fieldtwin.commissioning.scan.can_listener import BusHeard
+from fieldtwin.commissioning.scan.causes import Probe, SerialEvidence, can_causes, serial_causes, tcp_causes
+from fieldtwin.commissioning.scan.line import LineLook, LineReport, look_at_line, probe_of
+from fieldtwin.commissioning.scan.traffic import Heard, LineEar
 from fieldtwin.gateway.connections.can_facts import CanFacts
 from fieldtwin.gateway.connections.line_counters import LineCounters, unpack_counters
 from fieldtwin.gateway.core.endpoint import SerialSettings

@@ -7,10 +7,10 @@ from pathlib import Path
 
 from fieldtwin.emulators.virtual.loop import VirtualLoop
 from fieldtwin.gateway.core.clock import NS_PER_MS
-from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.values import COMMAND
-from fieldtwin.gateway.runtime.mailboxes import Patience
-from fieldtwin.running.shore import Shore
+from fieldtwin.gateway.runtime.mailboxes.mailboxes import Patience
+from fieldtwin.run.processes.topside import Shore
 from fieldtwin.twin.prototype.file import load_prototype
 from fieldtwin.twin.prototype.virtual import VirtualPrototype
 from fieldtwin.twin.site.system import load_system

@@ -7,7 +7,7 @@ import pytest
 from fieldtwin.emulators.modbus.bank import CellHooks, IllegalAddress, MapBank, Span
 from fieldtwin.emulators.virtual.clock import VirtualClock
 from fieldtwin.emulators.virtual.loop import VirtualLoop
-from fieldtwin.emulators.virtual.wire import MemoryWire
+from fieldtwin.emulators.virtual.memory_stream import MemoryWire
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import ReplyTimeout
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient, UnitPace

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
-from fieldtwin.gateway.core.recording import RecordingReader
-from fieldtwin.running.virtual_run import VirtualOptions, VirtualRun
+from fieldtwin.gateway.core.files.recording import RecordingReader
+from fieldtwin.run.virtual.run import VirtualOptions, VirtualRun
 from fieldtwin.twin.prototype.file import load_prototype
 from fieldtwin.twin.site.data_files import data_root, find
 from fieldtwin.twin.site.system import load_system

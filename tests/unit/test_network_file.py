@@ -10,7 +10,7 @@ from click.testing import CliRunner
 
 from fieldtwin.cli.main import cli
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
-from fieldtwin.scenarios.form import load_scenario
+from fieldtwin.scenarios.language.form import load_scenario
 from fieldtwin.twin.network.network import load_network
 from fieldtwin.twin.network.water_faults import WaterFaults
 from fieldtwin.twin.site.data_files import network_file

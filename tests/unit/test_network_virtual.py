@@ -12,13 +12,13 @@ from click.testing import CliRunner
 from fieldtwin.cli.main import cli
 from fieldtwin.emulators.faults.schema import parse_fault
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
-from fieldtwin.report.model import Verdict
-from fieldtwin.running.fault_schedule import CALM_S, random_network_schedule
-from fieldtwin.running.shore import Scripted
-from fieldtwin.running.virtual_network_run import VirtualNetworkOptions, VirtualNetworkRun
-from fieldtwin.running.virtual_scenario import run_virtual
-from fieldtwin.scenarios.form import load_scenario
-from fieldtwin.scenarios.trace import read_trace
+from fieldtwin.results.model import Verdict
+from fieldtwin.results.trace import read_trace
+from fieldtwin.run.processes.topside import Scripted
+from fieldtwin.run.targets.virtual_scenario import run_virtual
+from fieldtwin.run.virtual.fault_schedule import CALM_S, random_network_schedule
+from fieldtwin.run.virtual.network_run import VirtualNetworkOptions, VirtualNetworkRun
+from fieldtwin.scenarios.language.form import load_scenario
 from fieldtwin.twin.network.faults import check_network_fault, placed_all
 from fieldtwin.twin.network.network import WATER, load_network
 

@@ -11,7 +11,7 @@ from click.testing import CliRunner
 from test_service_metrics import seen
 
 from fieldtwin.cli.main import COMMANDS
-from fieldtwin.cli.run_command import command
+from fieldtwin.cli.run.run_command import command
 from fieldtwin.service.metrics import families
 
 ROOT = Path(__file__).parents[2]

@@ -14,11 +14,11 @@ from pathlib import Path
 
 import pytest
 
-from fieldtwin.formats import packed
-from fieldtwin.formats.can_files import read_can_file
-from fieldtwin.formats.candump import LeftOut
-from fieldtwin.formats.cnv import import_cnv
-from fieldtwin.formats.packet_file import PacketFile
+from fieldtwin.capture.formats import packed
+from fieldtwin.capture.formats.can_files import read_can_file
+from fieldtwin.capture.formats.candump import LeftOut
+from fieldtwin.capture.formats.cnv import import_cnv
+from fieldtwin.capture.formats.packet_file import PacketFile
 from fieldtwin.gateway.core.errors import FileInvalid
 
 PIECE = 16 << 20

@@ -19,7 +19,7 @@ from support import eventually, run
 
 from fieldtwin.gateway.core.control import ControlClient, RemoteError
 from fieldtwin.gateway.core.errors import FileInvalid, Unreachable
-from fieldtwin.gateway.core.image import INPUTS, OUTPUTS, RegionReader, TagKind, TagSpec, message_tag, taken_name
+from fieldtwin.gateway.core.image.image import INPUTS, OUTPUTS, RegionReader, TagKind, TagSpec, message_tag, taken_name
 from fieldtwin.gateway.core.statemachine import encode_period
 from fieldtwin.gateway.core.values import Quality, TagValue
 from fieldtwin.plc.binding import InputBinding, image_for
@@ -39,7 +39,7 @@ RELAY = ProgramConfig(
     {"period_s": "ctd.sample_period_s", "response": "modem.outbox"},
 )
 FAULTY = """
-from fieldtwin.gateway.core.image import TagKind
+from fieldtwin.gateway.core.image.image import TagKind
 from fieldtwin.plc.program import Program, var_input, var_output
 
 
@@ -252,7 +252,7 @@ def test_logic_that_raises_stops_with_outputs_safe_and_can_be_asked_why(tmp_path
 
 
 STUCK = """
-from fieldtwin.gateway.core.image import TagKind
+from fieldtwin.gateway.core.image.image import TagKind
 from fieldtwin.plc.program import Program, var_local, var_retain
 
 

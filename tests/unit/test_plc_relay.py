@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fieldtwin.gateway.core.concurrency.events import Consumer
 from fieldtwin.gateway.core.errors import Bug
-from fieldtwin.gateway.core.events import Consumer
-from fieldtwin.gateway.core.image import Message
+from fieldtwin.gateway.core.image.image import Message
 from fieldtwin.gateway.core.statemachine import STATE_CODES, encode_period
 from fieldtwin.gateway.core.values import COMMAND, MEASUREMENT, RESPONSE, STATUS
 from fieldtwin.plc.program import ScanInfo

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fieldtwin.gateway.core.image import TagKind
+from fieldtwin.gateway.core.image.image import TagKind
 from fieldtwin.plc.binding import BoundProgram
 from fieldtwin.plc.program import Program, ScanInfo, var_local, var_retain
 from fieldtwin.plc.retain import Retained, RetainFile, RetainFull

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
-from fieldtwin.gateway.core.image import INPUTS, OUTPUTS, TagKind, TagSpec
+from fieldtwin.gateway.core.image.image import INPUTS, OUTPUTS, TagKind, TagSpec
 from fieldtwin.gateway.core.values import Quality, TagValue
 from fieldtwin.plc.binding import InputBinding, image_for
 from fieldtwin.plc.config import PlcConfig, ProgramConfig, TaskSpec
@@ -18,7 +18,7 @@ from fieldtwin.plc.task import StopReason
 MS = 1_000_000
 PLANT = {"d.go": TagSpec("d.go", TagKind.BOOL), "d.n": TagSpec("d.n", TagKind.INT)}
 MODULE = """
-from fieldtwin.gateway.core.image import TagKind
+from fieldtwin.gateway.core.image.image import TagKind
 from fieldtwin.plc.program import Program, var_input, var_output, var_retain
 
 RAN = []
@@ -230,7 +230,7 @@ def test_tasks_that_make_no_sense_are_refused(tmp_path: Path, tasks: tuple[TaskS
 
 
 CHAIN = """
-from fieldtwin.gateway.core.image import TagKind
+from fieldtwin.gateway.core.image.image import TagKind
 from fieldtwin.plc.program import Program, var_input, var_local
 
 class First(Program):

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import pytest
 
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
-from fieldtwin.gateway.core.image import (
+from fieldtwin.gateway.core.image.image import (
     INPUTS,
     OUTPUTS,
     Image,

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from fieldtwin.gateway.core.image import INPUTS, OUTPUTS, TagKind, TagSpec, message_tag
+from fieldtwin.gateway.core.image.image import INPUTS, OUTPUTS, TagKind, TagSpec, message_tag
 from fieldtwin.gateway.core.values import NEVER, Quality, Reason, Scalar, TagValue
 from fieldtwin.plc.binding import InputBinding, image_for
 from fieldtwin.plc.config import PlcConfig, ProgramConfig, TaskSpec
@@ -35,7 +35,7 @@ VAR since : TON; scans : DINT; first : DINT; done : BOOL; END_VAR
 END_PROGRAM
 """
 PYTHON = """
-from fieldtwin.gateway.core.image import TagKind
+from fieldtwin.gateway.core.image.image import TagKind
 from fieldtwin.plc.program import Program, message_input, var_input, var_local, var_output
 
 class Fan(Program):

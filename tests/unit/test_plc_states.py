@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from fieldtwin.gateway.core.errors import Bug
-from fieldtwin.gateway.core.image import TagKind
+from fieldtwin.gateway.core.image.image import TagKind
 from fieldtwin.gateway.core.statemachine import PERIOD_MAX, PERIOD_MIN, STATES, delta
 from fieldtwin.gateway.core.values import Quality, Reason, TagValue
 from fieldtwin.plc.diagram import svg

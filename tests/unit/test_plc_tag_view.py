@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from fieldtwin.gateway.core.errors import Unreachable, UsageError
-from fieldtwin.gateway.core.image import INPUTS, TagKind, TagSpec
+from fieldtwin.gateway.core.image.image import INPUTS, TagKind, TagSpec
 from fieldtwin.gateway.core.values import Quality, Reason, TagValue
 from fieldtwin.plc.acts import Acts
 from fieldtwin.plc.binding import BoundProgram, InputBinding, image_for
@@ -25,7 +25,7 @@ PLANT = {
     "pump.speed": TagSpec("pump.speed", TagKind.INT, "rpm", limits=(0, 1500)),
 }
 MODULE = """
-from fieldtwin.gateway.core.image import TagKind
+from fieldtwin.gateway.core.image.image import TagKind
 from fieldtwin.plc.program import Program, var_input, var_local, var_output
 
 class Pump(Program):

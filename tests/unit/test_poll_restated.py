@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fieldtwin.gateway.core.clock import NS_PER_MS
-from fieldtwin.gateway.runtime.poll_schedule import SOONER, PollSchedule, Rate, spread
+from fieldtwin.gateway.runtime.buses.poll_schedule import SOONER, PollSchedule, Rate, spread
 
 PERIODS = st.integers(50, 5000)
 

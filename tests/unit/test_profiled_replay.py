@@ -13,8 +13,8 @@ from fieldtwin.emulators.recorded_device import RecordedDevice, load_replay
 from fieldtwin.emulators.replay.profiled import ProfiledReplay
 from fieldtwin.emulators.replay.replay import ExchangeReplay
 from fieldtwin.gateway.core.connection import RS232Connection
-from fieldtwin.gateway.core.profile import load_profile
-from fieldtwin.gateway.core.recording import Exchange
+from fieldtwin.gateway.core.files.profile import load_profile
+from fieldtwin.gateway.core.files.recording import Exchange
 
 ROOT = Path(__file__).resolve().parents[2]
 

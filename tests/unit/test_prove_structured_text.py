@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from st_bench import program
 
 from fieldtwin.gateway.core.errors import UsageError
-from fieldtwin.gateway.core.image import TagKind
+from fieldtwin.gateway.core.image.image import TagKind
 from fieldtwin.gateway.core.values import Quality, Reason, TagValue
 from fieldtwin.plc.blocks import MS, TON
 from fieldtwin.plc.program import Program, ScanInfo, var_input, var_output

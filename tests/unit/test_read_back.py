@@ -14,9 +14,9 @@ import pytest
 from fan_hall import VirtualHall, hall
 
 from fieldtwin.gateway.core.values import Quality, Reason
-from fieldtwin.running.virtual_scenario import run_virtual
-from fieldtwin.scenarios.form import load_scenario
-from fieldtwin.testhost.stepped_program import SteppedProgram
+from fieldtwin.run.targets.virtual_scenario import run_virtual
+from fieldtwin.scenarios.language.form import load_scenario
+from fieldtwin.testing.worker.stepped_program import SteppedProgram
 from fieldtwin.twin.prototype.virtual import VirtualPrototype
 from fieldtwin.twin.site.system import load_system
 

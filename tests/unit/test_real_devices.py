@@ -11,20 +11,20 @@ from pathlib import Path
 import pytest
 from support import eventually, run
 
+from fieldtwin.emulators.endpoints.modbus_server import serve_mbap
 from fieldtwin.emulators.endpoints.socket_end import SocketListener
 from fieldtwin.emulators.modbus.mbap import MbapSlave
-from fieldtwin.emulators.modbus.serve import serve_mbap
 from fieldtwin.emulators.replay.replay import ExchangeReplay
 from fieldtwin.emulators.replay.unit import ReplayUnit
 from fieldtwin.gateway.connections.os_connector import OsConnector
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.endpoint import Endpoint
-from fieldtwin.gateway.core.nursery import Nursery
-from fieldtwin.gateway.core.profile import DeviceProfile, load_profile
-from fieldtwin.gateway.core.recording import RecordingReader
+from fieldtwin.gateway.core.files.profile import DeviceProfile, load_profile
+from fieldtwin.gateway.core.files.recording import RecordingReader
 from fieldtwin.gateway.core.values import Quality
 from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig
 from fieldtwin.gateway.devices.register_device import RegisterDriver
-from fieldtwin.gateway.runtime.modbus_bus import ModbusBus
+from fieldtwin.gateway.runtime.buses.modbus_bus import ModbusBus
 from fieldtwin.gateway.runtime.tags import TagTable
 from fieldtwin.gateway.wallclock import WallClock
 

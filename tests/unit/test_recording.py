@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldtwin.gateway.core.errors import Bug, FileInvalid
-from fieldtwin.gateway.core.recording import (
+from fieldtwin.gateway.core.files.recording import (
     MAX_LINE_BYTES,
     Exchange,
     RecordingHeader,
@@ -243,7 +243,7 @@ def fill(writer: RecordingWriter, start: int, stop: int) -> None:
 WRITE_FOREVER = """
 import sys
 from pathlib import Path
-from fieldtwin.gateway.core.recording import RecordingHeader, RecordingWriter, SignalInfo
+from fieldtwin.gateway.core.files.recording import RecordingHeader, RecordingWriter, SignalInfo
 header = RecordingHeader(version=1, device="d", kind="signals", source="synthetic", signals={"x": SignalInfo()})
 with RecordingWriter(Path(sys.argv[1]), header) as writer:
     while True:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from fieldtwin.emulators.models.seawater import C_35_15_0, T68_PER_T90, conductivity, salinity
 from fieldtwin.emulators.signals import SignalTrack
-from fieldtwin.gateway.core.recording import RecordingReader
+from fieldtwin.gateway.core.files.recording import RecordingReader
 
 ROOT = Path(__file__).resolve().parents[2]
 SHIPPED = ("cast.jsonl", "incl.jsonl")

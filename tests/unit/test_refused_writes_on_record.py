@@ -14,8 +14,8 @@ from support import eventually, run
 from test_serve_writes import rig
 
 from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
-from fieldtwin.gateway.runtime.audit import AuditLog
-from fieldtwin.gateway.runtime.refusals import KEPT, Cause, Refusals
+from fieldtwin.gateway.runtime.audit_log import AuditLog
+from fieldtwin.gateway.runtime.outputs.refusals import KEPT, Cause, Refusals
 from fieldtwin.gateway.wallclock import WallClock
 
 CLOCK = WallClock()

@@ -14,12 +14,12 @@ from hypothesis import strategies as st
 
 from fieldtwin.cli.main import cli
 from fieldtwin.gateway.core.errors import UsageError
-from fieldtwin.regression.as_scenario import Wanted, as_scenario
-from fieldtwin.regression.comparing import Allowed, Verdict, compare
-from fieldtwin.regression.story import Story, story_of
-from fieldtwin.running.virtual_scenario import run_virtual
-from fieldtwin.scenarios.form import load_scenario
-from fieldtwin.scenarios.trace import Event, Kind
+from fieldtwin.results.trace import Event, Kind
+from fieldtwin.run.targets.virtual_scenario import run_virtual
+from fieldtwin.scenarios.language.form import load_scenario
+from fieldtwin.scenarios.regression.as_scenario import Wanted, as_scenario
+from fieldtwin.scenarios.regression.comparing import Allowed, Verdict, compare
+from fieldtwin.scenarios.regression.run_history import Story, story_of
 from fieldtwin.twin.site.system import load_system
 
 SYSTEM = load_system("observatory")

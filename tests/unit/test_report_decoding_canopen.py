@@ -11,14 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from report_rig import MS, can, note, observatory
 
-from fieldtwin.decoding.decoder import Decoder, exchanges
-from fieldtwin.decoding.exchange import Exchange, Span
-from fieldtwin.decoding.sdo_watch import SdoWatch, Transfer
+from fieldtwin.capture.decoding.decoder import Decoder, exchanges
+from fieldtwin.capture.decoding.exchange import Exchange, Span
+from fieldtwin.capture.decoding.sdo import SdoWatch, Transfer
 from fieldtwin.emulators.canopen.sdo_server import SdoServer
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.protocols.canopen.sdo import Done, SdoDownload, SdoTransfer, SdoUpload, Send
 from fieldtwin.gateway.protocols.canopen.sdo_block import SdoBlockDownload, SdoBlockUpload
-from fieldtwin.scenarios.trace import Event, Kind
+from fieldtwin.results.trace import Event, Kind
 
 
 def only(events: list[Event]) -> Exchange:

@@ -10,16 +10,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from report_rig import CTD_VALUES, MS, READ_CTD, adu, answer, ask, chunk, observatory
 
-from fieldtwin.decoding.decoder import Decoder, exchanges
-from fieldtwin.decoding.exchange import Exchange, Span
-from fieldtwin.decoding.modbus_frames import splitter
-from fieldtwin.decoding.modbus_pdu import parse_request
-from fieldtwin.decoding.modbus_wire import ModbusWire, Unit
-from fieldtwin.decoding.tags import TagMap
-from fieldtwin.gateway.core.profile import load_profile
+from fieldtwin.capture.decoding.decoder import Decoder, exchanges
+from fieldtwin.capture.decoding.exchange import Exchange, Span
+from fieldtwin.capture.decoding.modbus_connection import ModbusWire, Unit
+from fieldtwin.capture.decoding.modbus_frames import splitter
+from fieldtwin.capture.decoding.modbus_pdu import parse_request
+from fieldtwin.capture.decoding.tags import TagMap
+from fieldtwin.gateway.core.files.profile import load_profile
 from fieldtwin.gateway.protocols.modbus.ascii import lrc
 from fieldtwin.gateway.protocols.modbus.crc import with_crc
-from fieldtwin.scenarios.trace import Event
+from fieldtwin.results.trace import Event
 
 METER = Path(__file__).parents[2] / "profiles" / "devices" / "eastron-sdm630.yaml"
 

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from report_rig import run_trace
 
-from fieldtwin.scenarios.trace import Trace
+from fieldtwin.results.trace import Trace
 
 PAGE = (Path(__file__).parents[2] / "docs" / "reports.md").read_text(encoding="utf-8")
 
@@ -30,7 +30,7 @@ def test_the_python_of_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 
 
 def test_the_options_of_the_page_are_there() -> None:
-    from fieldtwin.cli.trace_command import command
+    from fieldtwin.cli.recordings.trace_command import command
 
     options = {o for p in command.params for o in p.opts}
     used = {

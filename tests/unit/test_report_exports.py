@@ -14,11 +14,11 @@ from report_rig import MS, note, observatory, run_trace
 from vcd.reader import ScalarChange, TokenKind, VectorChange, tokenize
 
 from fieldtwin.gateway.core.errors import FileInvalid
-from fieldtwin.report.junit import render_junit, write_junit
-from fieldtwin.report.machines import machines_of
-from fieldtwin.report.model import CheckResult, Report, ScenarioResult, Verdict
-from fieldtwin.report.vcd import write_vcd
-from fieldtwin.scenarios.trace import Event, Kind
+from fieldtwin.reports.junit import render_junit, write_junit
+from fieldtwin.reports.run.machines import machines_of
+from fieldtwin.reports.run.vcd import write_vcd
+from fieldtwin.results.model import CheckResult, Report, ScenarioResult, Verdict
+from fieldtwin.results.trace import Event, Kind
 
 FAILED = CheckResult("4", "pressure <good>", Verdict.FAILED, 13_300 * MS, expected="good", got="bad", where="a.yaml:31")
 SKIPPED = CheckResult("5", "set a value", Verdict.SKIPPED, reason="target compose cannot set_value")

@@ -14,16 +14,16 @@ from hypothesis import strategies as st
 from report_rig import MS, adu, answer, ask, can, chunk, note, observatory, run_trace
 
 from fieldtwin.gateway.core.errors import FileInvalid
-from fieldtwin.gateway.core.profile import load_profile
+from fieldtwin.gateway.core.files.profile import load_profile
 from fieldtwin.gateway.devices.config import DeviceConfig
-from fieldtwin.report.coverage import Collector, devices_covered
-from fieldtwin.report.html import BUDGET, render_html, write_html
-from fieldtwin.report.machines import machines_of
-from fieldtwin.report.markup import Markup, el, text
-from fieldtwin.report.model import CheckResult, Counts, Report, ScenarioResult, Verdict
-from fieldtwin.report.requirements import requirement_verdicts
-from fieldtwin.report.window import LONGEST_NS, MOST_EXCHANGES, MOST_FRAMES, MOST_STEPS, Study
-from fieldtwin.scenarios.trace import Event, Kind
+from fieldtwin.reports.markup import Markup, el, text
+from fieldtwin.reports.run.coverage import Collector, devices_covered
+from fieldtwin.reports.run.html import BUDGET, render_html, write_html
+from fieldtwin.reports.run.machines import machines_of
+from fieldtwin.reports.run.requirements import requirement_verdicts
+from fieldtwin.reports.run.window import LONGEST_NS, MOST_EXCHANGES, MOST_FRAMES, MOST_STEPS, Study
+from fieldtwin.results.model import CheckResult, Counts, Report, ScenarioResult, Verdict
+from fieldtwin.results.trace import Event, Kind
 
 EVIL = "<script>alert(1)</script>\" onload='x' & \u202e\x00"
 TRACE = run_trace(20)
@@ -314,7 +314,7 @@ def test_a_wire_of_no_system_is_decoded_as_what_is_spoken_there() -> None:
 def test_results_need_no_protocols() -> None:
     """Who only makes results (a plugin in somebody's own environment) needs neither pymodbus nor canopen."""
     needless = "pymodbus", "canopen", "fieldtwin.twin.site.system"
-    code = f"import sys, fieldtwin.report.model; print([m for m in {needless} if m in sys.modules])"
+    code = f"import sys, fieldtwin.results.model; print([m for m in {needless} if m in sys.modules])"
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=30)
     assert ran.stdout == "[]\n"
 

@@ -10,13 +10,13 @@ import pytest
 from click.testing import CliRunner
 from report_rig import MS, observatory, run_trace
 
-from fieldtwin.cli.trace_command import command
-from fieldtwin.decoding.trace_file import read_events
+from fieldtwin.capture.decoding.trace_file import read_events
+from fieldtwin.cli.recordings.trace_command import command
 from fieldtwin.gateway.connections.tap import TapFile
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.connection import Direction
 from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid
-from fieldtwin.scenarios.trace import Trace
+from fieldtwin.results.trace import Trace
 
 
 @pytest.fixture

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from fieldtwin.capture.recordings.rotating_file import RotatingFile
 from fieldtwin.gateway.core.errors import Unreachable
-from fieldtwin.recording.rotating import RotatingFile
 
 
 @pytest.mark.parametrize("lines", [0, 1])

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from fieldtwin.running.summary import exchange_checks, unanswered_at_stop
+from fieldtwin.run.live.summary import exchange_checks, unanswered_at_stop
 
 
 def counts(

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from fieldtwin.gateway.core.image import message_tag
+from fieldtwin.gateway.core.image.image import message_tag
 from fieldtwin.plc.binding import BoundProgram, InputBinding, image_for
 from fieldtwin.plc.relay import Relay
 from fieldtwin.plc.states import StateMachine, StateTable, Transition
-from fieldtwin.running.states import StateWatch, state_words
+from fieldtwin.run.processes.states import StateWatch, state_words
 from fieldtwin.twin.site.system import load_system
 
 

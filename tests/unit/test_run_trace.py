@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from fieldtwin.scenarios.trace import Event, Kind, Trace, read_trace
+from fieldtwin.results.trace import Event, Kind, Trace, read_trace
 
 
 def some(count: int) -> list[Event]:

@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_canopen_slave_lss import unnamed
 
-from fieldtwin.commissioning.can_ear import BusEar
-from fieldtwin.commissioning.scan_canopen import CanScan, CanScanner, CanScanOptions
+from fieldtwin.commissioning.scan.can_listener import BusEar
+from fieldtwin.commissioning.scan.canopen import CanScan, CanScanner, CanScanOptions
 from fieldtwin.gateway.connections.can_facts import CanFacts
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.connection import CanConnection, Connector

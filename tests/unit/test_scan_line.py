@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from uart_line import UartLine, levels, sampled
 
-from fieldtwin.commissioning.progress import Progress
-from fieldtwin.commissioning.scan_modbus import ModbusScan, ModbusScanner, ScanOptions
-from fieldtwin.commissioning.settings import LIKELY, name_of
-from fieldtwin.commissioning.traffic import LineEar
+from fieldtwin.commissioning.access.progress import Progress
+from fieldtwin.commissioning.scan.modbus import ModbusScan, ModbusScanner, ScanOptions
+from fieldtwin.commissioning.scan.settings import LIKELY, name_of
+from fieldtwin.commissioning.scan.traffic import LineEar
 from fieldtwin.emulators.modbus.bank import Span
 from fieldtwin.emulators.modbus.rtu_receiver import with_crc
 from fieldtwin.emulators.modbus.unit import ModbusUnit

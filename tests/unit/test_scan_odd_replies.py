@@ -12,9 +12,9 @@ import pytest
 from commissioning_rig import loop, run_virtually
 from modbus_virtual import VirtualWire
 
-from fieldtwin.cli.scan_view import modbus_json, show_modbus, unit_ranges
-from fieldtwin.commissioning.odd_replies import OddReply
-from fieldtwin.commissioning.scan_modbus import ModbusScan, ModbusScanner, ScanOptions
+from fieldtwin.cli.device.scan_view import modbus_json, show_modbus, unit_ranges
+from fieldtwin.commissioning.scan.modbus import ModbusScan, ModbusScanner, ScanOptions
+from fieldtwin.commissioning.scan.odd_replies import OddReply
 from fieldtwin.gateway.core.connection import ByteConnection, CanConnection
 from fieldtwin.gateway.core.endpoint import Endpoint, SerialSettings
 

@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from modbus_virtual import VirtualWire
 
-from fieldtwin.commissioning.alike import SPREAD, likeness, spread_over
-from fieldtwin.commissioning.scan_modbus import ModbusScan, ModbusScanner, ScanOptions
-from fieldtwin.commissioning.settings import TCP_UNITS
-from fieldtwin.commissioning.sweep import Send, UnitAnswer, UnitSweep
+from fieldtwin.commissioning.scan.modbus import ModbusScan, ModbusScanner, ScanOptions
+from fieldtwin.commissioning.scan.settings import TCP_UNITS
+from fieldtwin.commissioning.scan.shared_unit_ids import SPREAD, likeness, spread_over
+from fieldtwin.commissioning.scan.sweep import Send, UnitAnswer, UnitSweep
 from fieldtwin.emulators.modbus.bank import Span
 from fieldtwin.emulators.modbus.rtu_receiver import with_crc
 from fieldtwin.gateway.core.connection import ByteConnection, CanConnection

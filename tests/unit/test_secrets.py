@@ -17,7 +17,7 @@ from fieldtwin.gateway.core.errors import FieldtwinError, UsageError
 from fieldtwin.gateway.core.url_secrets import has_password, without_password
 from fieldtwin.gateway.store.knowledge import open_knowledge
 from fieldtwin.gateway.wallclock import WallClock
-from fieldtwin.running.options import RunOptions
+from fieldtwin.run.live.options import RunOptions
 from fieldtwin.twin.site.system import load_system
 from fieldtwin.twin.thread.place import plant_carrier, twin_carrier
 

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from support import eventually, run
 
 from fieldtwin.gateway.connections.tcp import TcpConnection
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import (
     EndpointBusy,
@@ -23,10 +24,9 @@ from fieldtwin.gateway.core.errors import (
     NotAllowed,
     Unreachable,
 )
-from fieldtwin.gateway.core.nursery import Nursery
 from fieldtwin.gateway.core.values import Quality, Reason, Scalar, TagValue
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient
-from fieldtwin.gateway.runtime.bridge_tcp import Caller
+from fieldtwin.gateway.runtime.bridge.tcp import Caller
 from fieldtwin.gateway.runtime.serve import ServeConfig, ServedTag, TagServer
 from fieldtwin.gateway.runtime.serve_codec import FORMATS, pack, unpack
 from fieldtwin.gateway.runtime.tags import TagTable

@@ -14,15 +14,15 @@ from support import eventually, run
 
 from fieldtwin.emulators.modbus.bank import MapBank, Span
 from fieldtwin.gateway.connections.tcp import TcpConnection
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import ModbusExceptionReply
-from fieldtwin.gateway.core.nursery import Nursery
 from fieldtwin.gateway.devices.config import DeviceConfig
 from fieldtwin.gateway.devices.register_device import RegisterDriver, SensorDriver
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient
-from fieldtwin.gateway.runtime.audit import AuditLog
-from fieldtwin.gateway.runtime.output import Output
-from fieldtwin.gateway.runtime.outputs import OutputWriter
+from fieldtwin.gateway.runtime.audit_log import AuditLog
+from fieldtwin.gateway.runtime.outputs.output import Output
+from fieldtwin.gateway.runtime.outputs.outputs import OutputWriter
 from fieldtwin.gateway.runtime.serve import ServeConfig, ServedTag, TagServer
 from fieldtwin.gateway.runtime.tags import TagTable
 from fieldtwin.gateway.wallclock import WallClock

@@ -10,7 +10,7 @@ from support import run
 
 from fieldtwin.gateway.store.event import Event, Kind
 from fieldtwin.gateway.store.sqlite_knowledge import SqliteKnowledge, in_place
-from fieldtwin.running.shadowing import Shadowing
+from fieldtwin.run.shadow.shadow import Shadowing
 from fieldtwin.twin.model.status import encode_status
 from fieldtwin.twin.plant.instance import Instance
 from fieldtwin.twin.site.system import load_system

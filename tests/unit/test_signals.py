@@ -15,7 +15,7 @@ from fieldtwin.emulators.context import UsedUp, WhenUsedUp
 from fieldtwin.emulators.signals import SignalPlayer, SignalTrack
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.errors import Bug, FileInvalid, UsageError
-from fieldtwin.gateway.core.recording import RecordingHeader, RecordingWriter, SignalInfo, SignalRow
+from fieldtwin.gateway.core.files.recording import RecordingHeader, RecordingWriter, SignalInfo, SignalRow
 
 START_NS = 5 * NS_PER_S
 

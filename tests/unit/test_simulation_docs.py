@@ -13,7 +13,7 @@ from fieldtwin.emulators.simulation.python_model import PythonModel
 from fieldtwin.emulators.simulation.simulation import Simulation, by_formulas, by_model
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.errors import FileInvalid
-from fieldtwin.gateway.core.yaml_file import load
+from fieldtwin.gateway.core.files.yaml_file import load
 from fieldtwin.twin.prototype.file import load_prototype
 from fieldtwin.twin.site.schema import SimulationForm
 from fieldtwin.twin.site.system import load_system

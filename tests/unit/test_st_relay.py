@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from fieldtwin.gateway.core.image import Message
+from fieldtwin.gateway.core.image.image import Message
 from fieldtwin.plc.binding import load_program
 from fieldtwin.plc.program import Outbox, ScanInfo
 from fieldtwin.plc.relay import Relay
-from fieldtwin.running.virtual_run import VirtualOptions, VirtualRun
+from fieldtwin.run.virtual.run import VirtualOptions, VirtualRun
 
 SYSTEMS = Path(__file__).parents[2] / "profiles/systems"
 MAILBOXES = ("response", "log")

@@ -11,7 +11,7 @@ from typing import Any
 
 from st_bench import scan
 
-from fieldtwin.gateway.core.image import INPUTS
+from fieldtwin.gateway.core.image.image import INPUTS
 from fieldtwin.plc.binding import image_for, load_program
 from fieldtwin.plc.config import PlcConfig, ProgramConfig, TaskSpec
 from fieldtwin.plc.runner import Runner

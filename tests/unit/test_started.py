@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 from support import run
 
+from fieldtwin.gateway.core.concurrency.async_resource import Started
 from fieldtwin.gateway.core.errors import Unreachable
-from fieldtwin.gateway.core.started import Started
 
 
 class Parts(Started):

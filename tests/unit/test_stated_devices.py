@@ -15,9 +15,9 @@ from fieldtwin.emulators.replay.replay import ExchangeReplay
 from fieldtwin.emulators.stated import parts_of
 from fieldtwin.gateway.core.connection import RS232Connection
 from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid
-from fieldtwin.gateway.core.profile import DeviceProfile, load_profile
-from fieldtwin.gateway.core.recording import Exchange
-from fieldtwin.running.virtual_run import VirtualOptions, VirtualRun
+from fieldtwin.gateway.core.files.profile import DeviceProfile, load_profile
+from fieldtwin.gateway.core.files.recording import Exchange
+from fieldtwin.run.virtual.run import VirtualOptions, VirtualRun
 
 PROFILE = """
 device: mysite/tank

@@ -14,15 +14,15 @@ from support import eventually, run
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.emulators.models.mailbox_modem import ModemPair
 from fieldtwin.gateway.core.errors import Unreachable
-from fieldtwin.gateway.core.profile import load_profile
+from fieldtwin.gateway.core.files.profile import load_profile
 from fieldtwin.gateway.core.values import COMMAND, RESPONSE
 from fieldtwin.gateway.devices.config import DeviceConfig
 from fieldtwin.gateway.devices.transmitter import TransmitterDriver
-from fieldtwin.gateway.runtime.audit import AuditLog
-from fieldtwin.gateway.runtime.mailbox_pump import MailboxPump
-from fieldtwin.gateway.runtime.modbus_bus import Job
+from fieldtwin.gateway.runtime.audit_log import AuditLog
+from fieldtwin.gateway.runtime.buses.modbus_bus import Job
+from fieldtwin.gateway.runtime.mailboxes.acked_commands import TakenFile
+from fieldtwin.gateway.runtime.mailboxes.pump import MailboxPump
 from fieldtwin.gateway.runtime.tags import TagTable
-from fieldtwin.gateway.runtime.taken import TakenFile
 from fieldtwin.gateway.wallclock import WallClock
 
 PROFILE = load_profile(PROFILES / "modem-mailbox.yaml")

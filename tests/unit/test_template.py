@@ -14,7 +14,7 @@ import pytest
 from template_rig import CHECKOUT, SHIPPED, fieldtwin, no, own_system, packed, reworked, unpack_zip
 
 from fieldtwin.gateway.core.errors import FileInvalid, Unreachable, UsageError
-from fieldtwin.running.template_here import system_file
+from fieldtwin.run.template import system_file
 from fieldtwin.twin.template import software
 from fieldtwin.twin.template.check import differences, examine, software_difference
 from fieldtwin.twin.template.pack import Extras

@@ -14,9 +14,9 @@ from template_rig import own_system, packed, with_python
 
 from fieldtwin.cli.main import cli
 from fieldtwin.gateway.core.errors import NotAllowed
-from fieldtwin.running.template_here import Stranger, agree, system_file
-from fieldtwin.running.template_scenarios import agree_to_scenario
-from fieldtwin.testhost.host import Host
+from fieldtwin.run.targets.template_scenarios import agree_to_scenario
+from fieldtwin.run.template import Stranger, agree, system_file
+from fieldtwin.testing.worker.host import Host
 from fieldtwin.twin.site.system import load_system
 from fieldtwin.twin.template.package import open_package, unpack
 

@@ -10,7 +10,7 @@ import pytest
 from template_rig import SHIPPED, fieldtwin, no, own_system, packed, reworked, with_python, yes
 
 from fieldtwin.gateway.core.errors import NotAllowed
-from fieldtwin.running.template_here import Stranger, system_file
+from fieldtwin.run.template import Stranger, system_file
 from fieldtwin.twin.prototype.file import load_prototype
 from fieldtwin.twin.site.system import load_system
 from fieldtwin.twin.template.check import examine

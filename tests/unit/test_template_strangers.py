@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from template_rig import add, own_system, packed, reworked, unpack_zip, yes
 
 from fieldtwin.gateway.core.errors import FileInvalid
-from fieldtwin.running.template_here import system_file
+from fieldtwin.run.template import system_file
 from fieldtwin.twin.prototype.file import load_prototype
 from fieldtwin.twin.site.system import System, load_system
 from fieldtwin.twin.template.check import examine

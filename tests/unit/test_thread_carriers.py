@@ -15,15 +15,15 @@ from support import eventually
 from support import run as run_really
 from thread_rig import SCHEMA, ShakyCarrier, Twin, WatchedCarrier, equal, value
 
+from fieldtwin.emulators.endpoints.memory_ports import MemoryNet
 from fieldtwin.emulators.virtual.clock import VirtualClock
 from fieldtwin.emulators.virtual.loop import VirtualLoop
-from fieldtwin.emulators.virtual.ports import MemoryNet
 from fieldtwin.emulators.virtual.seal import sealed
 from fieldtwin.gateway.connections.listeners import TcpListener
 from fieldtwin.gateway.connections.os_connector import OsConnector
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import Unreachable
-from fieldtwin.gateway.core.nursery import Nursery
 from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig
 from fieldtwin.gateway.store.event import Event, Kind
 from fieldtwin.gateway.wallclock import WallClock

@@ -12,9 +12,9 @@ from typing import Any
 import pytest
 from thread_rig import SCHEMA, Twin, equal, value
 
+from fieldtwin.emulators.endpoints.memory_ports import MemoryNet
 from fieldtwin.emulators.virtual.clock import VirtualClock
 from fieldtwin.emulators.virtual.loop import VirtualLoop
-from fieldtwin.emulators.virtual.ports import MemoryNet
 from fieldtwin.emulators.virtual.seal import sealed
 from fieldtwin.gateway.core.connection import ByteConnection
 from fieldtwin.gateway.core.endpoint import Endpoint

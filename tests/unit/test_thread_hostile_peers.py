@@ -19,9 +19,9 @@ from test_thread_carriers import modems, until_equal, virtually
 from test_thread_mqtt import edge, host
 from thread_rig import SCHEMA, Twin, WatchedCarrier, equal, value
 
+from fieldtwin.emulators.endpoints.memory_ports import MemoryNet
 from fieldtwin.emulators.virtual.clock import VirtualClock
 from fieldtwin.emulators.virtual.loop import VirtualLoop
-from fieldtwin.emulators.virtual.ports import MemoryNet
 from fieldtwin.gateway.connections.listeners import TcpListener
 from fieldtwin.gateway.connections.os_connector import OsConnector
 from fieldtwin.gateway.connections.tcp import TcpConnection

@@ -7,13 +7,13 @@ from pathlib import Path
 import pytest
 
 from fieldtwin.gateway.core.errors import UsageError
-from fieldtwin.gateway.core.image import INPUTS, OUTPUTS
+from fieldtwin.gateway.core.image.image import INPUTS, OUTPUTS
 from fieldtwin.gateway.core.statemachine import STATE_CODES
 from fieldtwin.gateway.core.values import Quality, Reason, TagValue
 from fieldtwin.gateway.store.event import Event, Kind
 from fieldtwin.gateway.wallclock import WallClock
-from fieldtwin.running.options import RunOptions
-from fieldtwin.running.session import RunSession
+from fieldtwin.run.live.options import RunOptions
+from fieldtwin.run.live.session import RunSession
 from fieldtwin.twin.plant.physical import gateway_config, gateway_lost_ms, image_layout
 from fieldtwin.twin.site.system import load_system
 from fieldtwin.twin.thread.place import lent_transmitter, twin_carrier

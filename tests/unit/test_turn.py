@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fieldtwin.emulators.virtual.loop import VirtualLoop
-from fieldtwin.gateway.core.alarm import alarm, ring
-from fieldtwin.gateway.core.turn import Turn
+from fieldtwin.gateway.core.concurrency.fair_lock import Turn
+from fieldtwin.gateway.core.concurrency.timeout import alarm, ring
 
 
 @given(st.lists(st.tuples(st.integers(0, 5), st.integers(0, 4), st.booleans()), max_size=12))

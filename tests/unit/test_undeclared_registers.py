@@ -15,8 +15,8 @@ from fieldtwin.emulators.models.register_device import StatedRegisters
 from fieldtwin.emulators.recorded_device import load_replay
 from fieldtwin.emulators.replay.profiled import ProfiledReplay
 from fieldtwin.gateway.core.errors import FileInvalid
-from fieldtwin.gateway.core.profile import DeviceProfile, load_profile, resolve
-from fieldtwin.gateway.core.yaml_file import parse
+from fieldtwin.gateway.core.files.profile import DeviceProfile, load_profile, resolve
+from fieldtwin.gateway.core.files.yaml_file import parse
 
 ROOT = Path(__file__).resolve().parents[2]
 TEXT = """

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldtwin.gateway.core.errors import FileInvalid
-from fieldtwin.gateway.core.visible import visible
+from fieldtwin.gateway.core.escaping import visible
 
 
 @pytest.mark.parametrize(

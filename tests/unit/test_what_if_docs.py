@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 
 from fieldtwin.gateway.core.statemachine import decode_period
-from fieldtwin.running.twin_rules import PythonPlanner, load_planner, questions_of
+from fieldtwin.run.shadow.rules import PythonPlanner, load_planner, questions_of
+from fieldtwin.run.what_if.plan import load_plans
 from fieldtwin.twin.model.mape.messages import verdict
 from fieldtwin.twin.model.mape.plan import RulePlanner
 from fieldtwin.twin.model.model import DigitalModel
 from fieldtwin.twin.site.system import load_system
-from fieldtwin.whatif.plan import load_plans
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 PAGE = DOCS / "what-if.md"

@@ -15,11 +15,11 @@ from collections.abc import Iterator
 import pytest
 from device_rig import emulated, started_runner
 
-from fieldtwin.decoding.canopen_wire import CanopenWire
-from fieldtwin.decoding.exchange import Exchange as Decoded
+from fieldtwin.capture.decoding.canopen_bus import CanopenWire
+from fieldtwin.capture.decoding.exchange import Exchange as Decoded
 from fieldtwin.gateway.core.canframe import CanFrame
-from fieldtwin.scenarios.expectation import wire_matches
-from fieldtwin.scenarios.form import Expect
+from fieldtwin.scenarios.judging.expectation import wire_matches
+from fieldtwin.scenarios.language.form import Expect
 from fieldtwin.testing.handles import Device
 from fieldtwin.testing.runner import Runner
 from fieldtwin.testing.wire import Exchange

@@ -13,9 +13,9 @@ from collections.abc import Iterator
 
 import pytest
 
-from fieldtwin.decoding.canopen_wire import CanopenWire
-from fieldtwin.decoding.exchange import Exchange
-from fieldtwin.decoding.modbus_wire import ModbusWire
+from fieldtwin.capture.decoding.canopen_bus import CanopenWire
+from fieldtwin.capture.decoding.exchange import Exchange
+from fieldtwin.capture.decoding.modbus_connection import ModbusWire
 from fieldtwin.emulators.modbus.rtu_receiver import with_crc
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.testing.handles import Device

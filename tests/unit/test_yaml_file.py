@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from pydantic import BaseModel, ConfigDict
 
 from fieldtwin.gateway.core.errors import FileInvalid
-from fieldtwin.gateway.core.yaml_file import MAX_BYTES, load, parse, validate
+from fieldtwin.gateway.core.files.yaml_file import MAX_BYTES, load, parse, validate
 
 
 class Inner(BaseModel):

@@ -8,22 +8,22 @@ from pathlib import Path
 import pytest
 from support import eventually, run
 
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.errors import FileInvalid, Unreachable, UsageError
-from fieldtwin.gateway.core.nursery import Nursery
 from fieldtwin.gateway.core.statemachine import encode_period
 from fieldtwin.gateway.core.values import Quality, Reason
 from fieldtwin.gateway.store.event import Event, Kind
 from fieldtwin.gateway.wallclock import WallClock
-from fieldtwin.running.twin_rules import load_planner, questions_of
+from fieldtwin.run.shadow.rules import load_planner, questions_of
+from fieldtwin.run.what_if.asked import objection
+from fieldtwin.run.what_if.asking import Asked, Asking, Subject
+from fieldtwin.run.what_if.last_known import LastKnown
 from fieldtwin.twin.model.mape.execute import Bounds, Execute
 from fieldtwin.twin.model.mape.messages import verdict
 from fieldtwin.twin.model.mape.what_if import PlannedCommand, Question
 from fieldtwin.twin.model.model import DigitalModel
 from fieldtwin.twin.model.status import encode_status
 from fieldtwin.twin.site.system import load_system
-from fieldtwin.whatif.asked import objection
-from fieldtwin.whatif.asking import Asked, Asking, Subject
-from fieldtwin.whatif.last_known import LastKnown
 
 OBSERVATORY = load_system("observatory")
 DEEP = (

@@ -10,23 +10,23 @@ import pytest
 from click.testing import CliRunner
 from support import run
 
-from fieldtwin.cli.what_if_command import command
+from fieldtwin.cli.twin.what_if_command import command
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.gateway.core.values import Quality, Reason
 from fieldtwin.gateway.store.event import Event, Kind
 from fieldtwin.gateway.store.sqlite_knowledge import SqliteKnowledge, in_place
-from fieldtwin.running.shore import Scripted
+from fieldtwin.run.processes.topside import Scripted
+from fieldtwin.run.what_if.fork import Fork, answer
+from fieldtwin.run.what_if.known import known_state
+from fieldtwin.run.what_if.last_known import of_period
+from fieldtwin.run.what_if.many import answers
+from fieldtwin.run.what_if.outcome import VariableOutcome
+from fieldtwin.run.what_if.plan import Plan, load_plans
+from fieldtwin.run.what_if.plan import command as parsed
+from fieldtwin.run.what_if.state import KnownState, read_state
 from fieldtwin.twin.model.status import encode_status
 from fieldtwin.twin.site.system import load_system
-from fieldtwin.whatif.fork import Fork, answer
-from fieldtwin.whatif.known import known_state
-from fieldtwin.whatif.last_known import of_period
-from fieldtwin.whatif.many import answers
-from fieldtwin.whatif.outcome import VariableOutcome
-from fieldtwin.whatif.plan import Plan, load_plans
-from fieldtwin.whatif.plan import command as parsed
-from fieldtwin.whatif.state import KnownState, read_state
 
 ROOT = Path(__file__).resolve().parents[2]
 OBSERVATORY = load_system("observatory")

@@ -6,9 +6,9 @@ from pathlib import Path
 
 from tank_plant import DIVIDES_BY_ZERO, write_plant
 
-from fieldtwin.whatif.fork import Fork, answer
-from fieldtwin.whatif.plan import Plan
-from fieldtwin.whatif.state import KnownState
+from fieldtwin.run.what_if.fork import Fork, answer
+from fieldtwin.run.what_if.plan import Plan
+from fieldtwin.run.what_if.state import KnownState
 
 
 def plan(name: str, *require: str) -> Plan:

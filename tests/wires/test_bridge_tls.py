@@ -16,25 +16,25 @@ from modbus_pki import Pki, make_pki
 from pymodbus.client import AsyncModbusTlsClient
 from support import eventually, run
 
+from fieldtwin.emulators.endpoints.modbus_server import serve_mbap
 from fieldtwin.emulators.endpoints.socket_end import SocketListener
 from fieldtwin.emulators.modbus.bank import MapBank, Span
 from fieldtwin.emulators.modbus.mbap import MbapSlave
-from fieldtwin.emulators.modbus.serve import serve_mbap
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.connections.listeners import TcpListener
 from fieldtwin.gateway.connections.os_connector import OsConnector
 from fieldtwin.gateway.connections.tls import TlsConnection
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import ConnectionLost, ModbusExceptionReply, Unreachable, UsageError
-from fieldtwin.gateway.core.nursery import Nursery
 from fieldtwin.gateway.core.values import Quality, Reason, TagValue
 from fieldtwin.gateway.devices.config import BusConfig
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient
 from fieldtwin.gateway.protocols.modbus.server import READ_FUNCTIONS, WRITE_FUNCTIONS
-from fieldtwin.gateway.runtime.audit import AuditLog
-from fieldtwin.gateway.runtime.bridge import Bridge, BridgeConfig
-from fieldtwin.gateway.runtime.bridge_policy import AllowRule, Policy
-from fieldtwin.gateway.runtime.modbus_bus import ModbusBus
+from fieldtwin.gateway.runtime.audit_log import AuditLog
+from fieldtwin.gateway.runtime.bridge.bridge import Bridge, BridgeConfig
+from fieldtwin.gateway.runtime.bridge.policy import AllowRule, Policy
+from fieldtwin.gateway.runtime.buses.modbus_bus import ModbusBus
 from fieldtwin.gateway.runtime.serve import ServeConfig, ServedTag, TagServer
 from fieldtwin.gateway.runtime.tags import TagTable
 from fieldtwin.gateway.wallclock import WallClock

@@ -31,7 +31,7 @@ from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.wallclock import WallClock
-from fieldtwin.running.bridging import BridgeOptions, run_bridge
+from fieldtwin.run.live.bridge import BridgeOptions, run_bridge
 
 
 async def fieldtwin(*words: str) -> tuple[int, str]:

@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 from support import eventually, run
 
-from fieldtwin.commissioning.live import canopen_at, frame_of, modbus_at
-from fieldtwin.commissioning.wire_log import WireLog
+from fieldtwin.commissioning.access.connection import canopen_at, frame_of, modbus_at
+from fieldtwin.commissioning.access.frame_log import WireLog
+from fieldtwin.emulators.endpoints.modbus_server import serve_mbap
 from fieldtwin.emulators.endpoints.socket_end import SocketListener
 from fieldtwin.emulators.modbus.bank import MapBank, Span
 from fieldtwin.emulators.modbus.mbap import MbapSlave
-from fieldtwin.emulators.modbus.serve import serve_mbap
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.connection import ByteConnection, Direction
 from fieldtwin.gateway.core.endpoint import Endpoint

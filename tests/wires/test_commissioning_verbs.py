@@ -17,24 +17,24 @@ from pymodbus.server import ModbusTcpServer
 from support import eventually, run
 from test_modbus_servers import COUNT, INPUTS, libmodbus, null_modem, sim_device
 
-from fieldtwin.commissioning.address import RawForm, tags_of
-from fieldtwin.commissioning.dump import Job
-from fieldtwin.commissioning.dump_file import load_dump
-from fieldtwin.commissioning.dumping import dump, log_path, object_ranges, register_spans
-from fieldtwin.commissioning.reading import Target, point_at
-from fieldtwin.commissioning.watching import samples
-from fieldtwin.commissioning.writing import before, carry_out, plan_write, restore
+from fieldtwin.commissioning.access.address import RawForm, tags_of
+from fieldtwin.commissioning.access.reading import Target, point_at
+from fieldtwin.commissioning.access.watching import samples
+from fieldtwin.commissioning.access.writing import before, carry_out, plan_write, restore
+from fieldtwin.commissioning.dump.dump import Job
+from fieldtwin.commissioning.dump.file import load_dump
+from fieldtwin.commissioning.dump.session import dump, log_path, object_ranges, register_spans
 from fieldtwin.emulators.canopen.dictionary import parse_eds
 from fieldtwin.emulators.canopen.node import CanopenNode, NodeContext
 from fieldtwin.emulators.canopen.serve import serve_node
 from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
 from fieldtwin.emulators.endpoints.can_end import open_can_end
+from fieldtwin.emulators.endpoints.modbus_server import serve_mbap, serve_rtu
 from fieldtwin.emulators.endpoints.pty import PtyEnd
 from fieldtwin.emulators.endpoints.socket_end import SocketListener
 from fieldtwin.emulators.modbus.bank import MapBank, Span
 from fieldtwin.emulators.modbus.mbap import MbapSlave
 from fieldtwin.emulators.modbus.rtu import RtuSlave
-from fieldtwin.emulators.modbus.serve import serve_mbap, serve_rtu
 from fieldtwin.emulators.modbus.unit import ModbusUnit, UnitLimits
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.wallclock import WallClock

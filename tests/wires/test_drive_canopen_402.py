@@ -15,9 +15,9 @@ from fieldtwin.emulators.canopen.serve import serve_node
 from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
 from fieldtwin.emulators.models.emulated_node import emulated_node
 from fieldtwin.gateway.connections.soft_bus import SoftBus
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.endpoint import Endpoint
-from fieldtwin.gateway.core.nursery import Nursery
-from fieldtwin.gateway.core.profile import load_profile
+from fieldtwin.gateway.core.files.profile import load_profile
 from fieldtwin.gateway.wallclock import WallClock
 
 PROFILE = load_profile(Path(__file__).parents[2] / "profiles" / "devices" / "drive-cia402.yaml")

@@ -22,8 +22,8 @@ from fieldtwin.emulators.endpoints.pty import PtyEnd
 from fieldtwin.emulators.modbus.bank import MapBank, Span
 from fieldtwin.emulators.modbus.rtu import RtuSlave
 from fieldtwin.emulators.modbus.unit import ModbusUnit
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.endpoint import Endpoint
-from fieldtwin.gateway.core.nursery import Nursery
 from fieldtwin.gateway.wallclock import WallClock
 
 DRIVE = Path("profiles/devices/drive-cia402.eds")

@@ -11,6 +11,7 @@ import pytest
 from modbus_pki import make_pki
 from support import run
 
+from fieldtwin.emulators.endpoints.modbus_server import serve_mbap, serve_rtu, serve_udp
 from fieldtwin.emulators.endpoints.pty import PtyEnd
 from fieldtwin.emulators.endpoints.socket_end import SocketListener
 from fieldtwin.emulators.endpoints.udp_end import UdpEnd
@@ -21,12 +22,11 @@ from fieldtwin.emulators.modbus.file_records import FileRecords
 from fieldtwin.emulators.modbus.identification import Identification
 from fieldtwin.emulators.modbus.mbap import MbapSlave
 from fieldtwin.emulators.modbus.rtu import RtuSlave
-from fieldtwin.emulators.modbus.serve import serve_mbap, serve_rtu, serve_udp
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.connections.os_connector import OsConnector
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import ModbusExceptionReply, ReplyTimeout, UsageError
-from fieldtwin.gateway.core.nursery import Nursery
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient
 from fieldtwin.gateway.protocols.modbus.diagnostics import (
     Diagnostics,

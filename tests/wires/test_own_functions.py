@@ -19,8 +19,8 @@ from fieldtwin.emulators.replay.unit import ReplayUnit
 from fieldtwin.gateway.connections.serial_line import SerialConnection
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import FileInvalid, ModbusExceptionReply
-from fieldtwin.gateway.core.profile import DeviceProfile, load_profile
-from fieldtwin.gateway.core.recording import Exchange
+from fieldtwin.gateway.core.files.profile import DeviceProfile, load_profile
+from fieldtwin.gateway.core.files.recording import Exchange
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient
 from fieldtwin.gateway.protocols.modbus.user import FixedShape, UserFunction
 from fieldtwin.gateway.wallclock import WallClock

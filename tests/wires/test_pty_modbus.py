@@ -13,13 +13,13 @@ from pathlib import Path
 import pytest
 from support import eventually, run
 
+from fieldtwin.emulators.endpoints.modbus_server import serve_mbap, serve_rtu
 from fieldtwin.emulators.endpoints.pty import PtyEnd
 from fieldtwin.emulators.endpoints.socket_end import SocketListener
 from fieldtwin.emulators.modbus.bank import MapBank, Span
 from fieldtwin.emulators.modbus.mbap import MbapSlave
 from fieldtwin.emulators.modbus.rtu import RtuSlave
 from fieldtwin.emulators.modbus.rtu_receiver import with_crc
-from fieldtwin.emulators.modbus.serve import serve_mbap, serve_rtu
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.connection import Direction
 from fieldtwin.gateway.core.endpoint import Endpoint, SerialSettings

@@ -20,6 +20,7 @@ import pytest
 from modbus_pki import make_pki
 from support import eventually, run
 
+from fieldtwin.emulators.endpoints.modbus_server import serve_rtu, serve_udp
 from fieldtwin.emulators.endpoints.pty import PtyEnd
 from fieldtwin.emulators.endpoints.udp_end import UdpEnd
 from fieldtwin.emulators.modbus.ascii import AsciiSlave
@@ -28,7 +29,6 @@ from fieldtwin.emulators.modbus.fifo import FifoQueues
 from fieldtwin.emulators.modbus.file_records import FileRecords
 from fieldtwin.emulators.modbus.identification import Identification
 from fieldtwin.emulators.modbus.mbap import MbapSlave
-from fieldtwin.emulators.modbus.serve import serve_rtu, serve_udp
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.connections.os_connector import OsConnector
 from fieldtwin.gateway.core.endpoint import Endpoint

@@ -15,6 +15,7 @@ import pytest
 from modbus_pki import Pki, make_pki
 from support import eventually, run
 
+from fieldtwin.emulators.endpoints.modbus_server import as_recorded, serve_mbap, serve_rtu, serve_udp
 from fieldtwin.emulators.endpoints.pty import PtyEnd
 from fieldtwin.emulators.endpoints.socket_end import SocketEnd, SocketListener
 from fieldtwin.emulators.endpoints.tls_server import client_role
@@ -24,7 +25,6 @@ from fieldtwin.emulators.modbus.bank import MapBank, Span
 from fieldtwin.emulators.modbus.line import Exchange
 from fieldtwin.emulators.modbus.mbap import MbapSlave
 from fieldtwin.emulators.modbus.rtu import RtuSlave
-from fieldtwin.emulators.modbus.serve import as_recorded, serve_mbap, serve_rtu, serve_udp
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.endpoint import Endpoint, SerialSettings
 from fieldtwin.gateway.core.errors import ConnectionLost, EndpointBusy, Unreachable, UsageError

@@ -9,10 +9,10 @@ import struct
 import pytest
 from support import eventually, run
 
+from fieldtwin.emulators.endpoints.modbus_server import serve_mbap
 from fieldtwin.emulators.endpoints.socket_end import SocketEnd, SocketListener
 from fieldtwin.emulators.modbus.bank import MapBank, Span
 from fieldtwin.emulators.modbus.mbap import MbapSlave
-from fieldtwin.emulators.modbus.serve import serve_mbap
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.connection import ByteConnection, Direction
 from fieldtwin.gateway.core.endpoint import Endpoint

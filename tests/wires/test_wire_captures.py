@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fieldtwin.formats.pcap import (
+from fieldtwin.capture.formats.pcap import (
     LINKTYPE_CAN_SOCKETCAN,
     LINKTYPE_ETHERNET,
     LINKTYPE_USER0,

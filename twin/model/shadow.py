@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from fieldtwin.gateway.core.clock import NS_PER_MS, Clock
-from fieldtwin.gateway.core.events import Consumer
+from fieldtwin.gateway.core.concurrency.events import Consumer
 from fieldtwin.gateway.store.event import Event
 from fieldtwin.twin.model.mape.analyze import Analyze
 from fieldtwin.twin.model.mape.messages import Verdict

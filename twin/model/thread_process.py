@@ -11,8 +11,8 @@ from collections import deque
 from typing import ClassVar
 
 from fieldtwin.gateway.core.clock import NS_PER_MS, Clock
+from fieldtwin.gateway.core.concurrency.events import EventHandler
 from fieldtwin.gateway.core.errors import Bug
-from fieldtwin.gateway.core.events import EventHandler
 from fieldtwin.gateway.core.values import DATA, RESPONSE, STATUS, TagValue
 from fieldtwin.gateway.store.event import Event, Kind, of_tag, plain
 

@@ -12,9 +12,9 @@ from pathlib import Path
 
 from fieldtwin.emulators.wires.acoustic import AcousticMedium, Spoils, Water
 from fieldtwin.gateway.core.errors import UsageError
-from fieldtwin.gateway.core.nearest import did_you_mean
-from fieldtwin.gateway.core.profile import DeviceProfile
-from fieldtwin.gateway.core.yaml_file import Key, YamlFile, load, validate
+from fieldtwin.gateway.core.files.nearest import did_you_mean
+from fieldtwin.gateway.core.files.profile import DeviceProfile
+from fieldtwin.gateway.core.files.yaml_file import Key, YamlFile, load, validate
 from fieldtwin.twin.network.schema import NetworkForm, ShipForm
 from fieldtwin.twin.prototype.file import Prototype, load_prototype
 from fieldtwin.twin.site.data_files import find, search_path

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from fieldtwin.emulators.endpoints.modbus_server import serve_mbap
 from fieldtwin.emulators.endpoints.ports import Listening, Ports
 from fieldtwin.emulators.modbus.mbap import MbapSlave
-from fieldtwin.emulators.modbus.serve import serve_mbap
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.emulators.models.acoustic_link import AcousticLink
 from fieldtwin.emulators.models.mailbox_modem import MailboxModem

@@ -9,10 +9,10 @@ from collections.abc import Mapping
 from random import Random
 from typing import Any
 
-from fieldtwin.emulators.faults.drop import Drop
 from fieldtwin.emulators.faults.engine import WireFaults
 from fieldtwin.emulators.faults.fault import Active
 from fieldtwin.emulators.faults.frames import Frame, Framing, Way
+from fieldtwin.emulators.faults.loss.drop import Drop
 from fieldtwin.emulators.faults.schema import FaultSpec, parse_fault
 from fieldtwin.emulators.faults.wrong_aim import WrongAim
 from fieldtwin.gateway.core.clock import NS_PER_S

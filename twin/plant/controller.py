@@ -21,16 +21,16 @@ import msgspec
 
 from fieldtwin.gateway.connections.os_connector import OsConnector
 from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.connection import Connector
 from fieldtwin.gateway.core.control import ControlServer
 from fieldtwin.gateway.core.errors import FieldtwinError, Unreachable, UsageError
-from fieldtwin.gateway.core.nursery import Nursery
 from fieldtwin.gateway.devices.register_device import RegisterDriver
-from fieldtwin.gateway.runtime.audit import AuditLog
-from fieldtwin.gateway.runtime.learnt import LearntFile, describe_learnt
+from fieldtwin.gateway.runtime.audit_log import AuditLog
+from fieldtwin.gateway.runtime.buses.learnt_gaps import LearntFile, describe_learnt
+from fieldtwin.gateway.runtime.mailboxes.acked_commands import TakenFile
 from fieldtwin.gateway.runtime.reconfigure import reconfigure
 from fieldtwin.gateway.runtime.status import describe
-from fieldtwin.gateway.runtime.taken import TakenFile
 from fieldtwin.gateway.store.exchange_log import ExchangeLog
 from fieldtwin.gateway.wallclock import WallClock, run
 from fieldtwin.twin.plant.mapping import MappedConnector, mapping_from_json

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from fieldtwin.gateway.core.image import TagKind
+from fieldtwin.gateway.core.image.image import TagKind
 from fieldtwin.twin.model.variables import Limits, Variable
 from fieldtwin.twin.plant.physical import plant_tags
 from fieldtwin.twin.site.system import System

@@ -18,15 +18,15 @@ from fieldtwin.gateway.connections.listeners import TcpListener
 from fieldtwin.gateway.core.clock import Clock
 from fieldtwin.gateway.core.connection import Connector, Listen
 from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid, Unreachable
-from fieldtwin.gateway.core.image import Image, ImageLayout, TagKind, TagSpec, message_tag
-from fieldtwin.gateway.core.profile import Tag
+from fieldtwin.gateway.core.files.profile import Tag
+from fieldtwin.gateway.core.image.image import Image, ImageLayout, TagKind, TagSpec, message_tag
 from fieldtwin.gateway.devices.canopen_device import CanopenDriver
 from fieldtwin.gateway.devices.config import DeviceConfig
 from fieldtwin.gateway.devices.register_device import RegisterDriver
-from fieldtwin.gateway.runtime.audit import AuditLog
+from fieldtwin.gateway.runtime.audit_log import AuditLog
 from fieldtwin.gateway.runtime.gateway import Gateway, GatewayConfig, make_driver
+from fieldtwin.gateway.runtime.mailboxes.acked_commands import TakenFile
 from fieldtwin.gateway.runtime.tags import TagTable
-from fieldtwin.gateway.runtime.taken import TakenFile
 from fieldtwin.gateway.store.exchange_log import ExchangeLog
 from fieldtwin.plc.binding import BoundProgram, InputBinding, image_for
 from fieldtwin.plc.config import PlcConfig, ProgramConfig, TaskSpec

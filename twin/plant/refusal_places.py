@@ -14,7 +14,7 @@ from typing import Any
 
 from fieldtwin.gateway.core.control import ControlClient
 from fieldtwin.gateway.core.errors import FieldtwinError
-from fieldtwin.gateway.runtime.refusals import Refusal, Refusals
+from fieldtwin.gateway.runtime.outputs.refusals import Refusal, Refusals
 
 ANSWER_S = 1.0
 """Seconds within which the PLC must answer."""

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from fieldtwin.gateway.core.errors import FileInvalid
-from fieldtwin.gateway.core.profile import DeviceProfile
-from fieldtwin.gateway.core.yaml_file import Key, YamlFile, load, validate
+from fieldtwin.gateway.core.files.profile import DeviceProfile
+from fieldtwin.gateway.core.files.yaml_file import Key, YamlFile, load, validate
 from fieldtwin.gateway.devices.config import DeviceConfig
 from fieldtwin.twin.plant.physical import plant_tags
 from fieldtwin.twin.site.schema import SystemForm

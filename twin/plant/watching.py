@@ -12,7 +12,7 @@ from typing import Any
 from fieldtwin.gateway.core.clock import Clock
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.core.values import TagValue
-from fieldtwin.gateway.runtime.refusals import Refusals
+from fieldtwin.gateway.runtime.outputs.refusals import Refusals
 from fieldtwin.gateway.runtime.tags import TagTable
 
 MOST = 50_000

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 from fieldtwin.emulators.faults.fault import Aim, Kind
 from fieldtwin.emulators.faults.schema import FUNCTIONS_OF, FaultSpec, addressed, counted
-from fieldtwin.emulators.faults.value_ranges import check_fault
+from fieldtwin.emulators.faults.values.value_ranges import check_fault
 from fieldtwin.emulators.faults.wrong_aim import WrongAim
-from fieldtwin.gateway.core.nearest import did_you_mean
-from fieldtwin.gateway.core.profile import Tag
+from fieldtwin.gateway.core.files.nearest import did_you_mean
+from fieldtwin.gateway.core.files.profile import Tag
 from fieldtwin.twin.site.system import System
 
 

@@ -14,10 +14,11 @@ from typing import Any
 from fieldtwin.emulators.canopen.node import CanopenNode
 from fieldtwin.emulators.canopen.remarks import Remark
 from fieldtwin.emulators.canopen.serve import serve_node
+from fieldtwin.emulators.client_counts import ClientCounts, Difference
 from fieldtwin.emulators.context import WhenUsedUp
 from fieldtwin.emulators.distorted_registers import DistortedRegisters
 from fieldtwin.emulators.emulator import EmulatedUnit
-from fieldtwin.emulators.endpoints.client_counts import ClientCounts, Difference
+from fieldtwin.emulators.endpoints.modbus_server import Latency, as_recorded, serve_mbap, serve_rtu, serve_udp
 from fieldtwin.emulators.endpoints.ports import CanPort, Listening, OnClient, OsPorts, Ports
 from fieldtwin.emulators.journal import HeldJournal, share_of
 from fieldtwin.emulators.modbus.ascii import AsciiSlave
@@ -25,7 +26,6 @@ from fieldtwin.emulators.modbus.bank import RegisterBank
 from fieldtwin.emulators.modbus.line import LineSlave
 from fieldtwin.emulators.modbus.mbap import MbapSlave
 from fieldtwin.emulators.modbus.rtu import RtuSlave
-from fieldtwin.emulators.modbus.serve import Latency, as_recorded, serve_mbap, serve_rtu, serve_udp
 from fieldtwin.emulators.modbus.unit import ModbusUnit, UnitLimits
 from fieldtwin.emulators.models.emulated_node import NodeOptions, emulated_node
 from fieldtwin.emulators.models.mailbox_modem import MailboxModem, ModemPair
@@ -39,11 +39,11 @@ from fieldtwin.emulators.replay.replay import ExchangeReplay
 from fieldtwin.emulators.signals import SignalPlayer, Signals, SignalTrack
 from fieldtwin.emulators.stated import parts_of
 from fieldtwin.gateway.core.clock import NS_PER_MS, Clock
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.connection import ByteConnection, CanConnection, RS232Connection, TCPConnection
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
-from fieldtwin.gateway.core.nursery import Nursery
-from fieldtwin.gateway.core.profile import DeviceProfile
+from fieldtwin.gateway.core.files.profile import DeviceProfile
 from fieldtwin.gateway.devices.config import DeviceConfig
 from fieldtwin.twin.prototype.field_faults import FieldFaults
 from fieldtwin.twin.prototype.file import EmulatedBus, EmulatedDevice, Prototype

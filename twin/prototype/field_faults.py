@@ -21,8 +21,8 @@ from fieldtwin.emulators.faults.engine import WireFaults
 from fieldtwin.emulators.faults.fault import Active, Aim, ValueFault
 from fieldtwin.emulators.faults.frames import Framing, Way
 from fieldtwin.emulators.faults.schema import FaultSpec, parse_fault
-from fieldtwin.emulators.faults.set_value import Form, SetValue
-from fieldtwin.emulators.faults.value_ranges import check_value
+from fieldtwin.emulators.faults.values.set_value import Form, SetValue
+from fieldtwin.emulators.faults.values.value_ranges import check_value
 from fieldtwin.emulators.wires.can_faults import Rule
 from fieldtwin.gateway.core.clock import NS_PER_S, Clock
 from fieldtwin.gateway.core.connection import ByteConnection, CanConnection

@@ -29,10 +29,10 @@ import msgspec
 
 from fieldtwin.emulators.endpoints.acoustic_end import AcousticEnd
 from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.control import ControlServer
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import FieldtwinError, UsageError
-from fieldtwin.gateway.core.nursery import Nursery
 from fieldtwin.gateway.wallclock import WallClock, run
 from fieldtwin.twin.prototype.field import FieldSide
 from fieldtwin.twin.prototype.field_leases import LEASE_S, FieldLeases

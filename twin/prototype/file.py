@@ -13,9 +13,9 @@ from typing import NamedTuple
 from fieldtwin.emulators.replay.can_log import SUFFIX
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
-from fieldtwin.gateway.core.profile import DeviceProfile, load_profile
-from fieldtwin.gateway.core.recording import shown
-from fieldtwin.gateway.core.yaml_file import Key, YamlFile, load, validate
+from fieldtwin.gateway.core.files.profile import DeviceProfile, load_profile
+from fieldtwin.gateway.core.files.recording import shown
+from fieldtwin.gateway.core.files.yaml_file import Key, YamlFile, load, validate
 from fieldtwin.twin.prototype.simulations import check_plays, check_simulations
 from fieldtwin.twin.site.data_files import find, find_recording
 from fieldtwin.twin.site.schema import EmulatedForm, PrototypeForm

@@ -16,8 +16,8 @@ from fieldtwin.emulators.simulation.signals import SimulatedSignals
 from fieldtwin.emulators.simulation.simulation import Simulation, by_formulas, by_model
 from fieldtwin.gateway.core.clock import NS_PER_MS
 from fieldtwin.gateway.core.errors import UsageError
-from fieldtwin.gateway.core.profile import DeviceProfile, Tag
-from fieldtwin.gateway.core.yaml_file import YamlFile
+from fieldtwin.gateway.core.files.profile import DeviceProfile, Tag
+from fieldtwin.gateway.core.files.yaml_file import YamlFile
 from fieldtwin.twin.site.schema import EmulatedForm, PrototypeForm, SimulationForm
 from fieldtwin.twin.site.system import System
 

@@ -11,20 +11,20 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from fieldtwin.emulators.endpoints.memory_ports import MemoryNet
 from fieldtwin.emulators.models.packet_link import ModemEnd
 from fieldtwin.emulators.virtual.clock import VirtualClock
 from fieldtwin.emulators.virtual.loop import VirtualLoop
-from fieldtwin.emulators.virtual.ports import MemoryNet
 from fieldtwin.gateway.connections.tap import TappedConnector
 from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.concurrency.async_resource import Started
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.connection import Connector, Tap
 from fieldtwin.gateway.core.endpoint import Endpoint
-from fieldtwin.gateway.core.image import Image
-from fieldtwin.gateway.core.nursery import Nursery
-from fieldtwin.gateway.core.started import Started
-from fieldtwin.gateway.runtime.audit import AuditLog
+from fieldtwin.gateway.core.image.image import Image
+from fieldtwin.gateway.runtime.audit_log import AuditLog
 from fieldtwin.gateway.runtime.gateway import Gateway
-from fieldtwin.gateway.runtime.refusals import Refusal
+from fieldtwin.gateway.runtime.outputs.refusals import Refusal
 from fieldtwin.gateway.store.exchange_log import ExchangeLog
 from fieldtwin.plc.publishing import Change
 from fieldtwin.plc.runner import Runner

@@ -9,8 +9,8 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from fieldtwin.gateway.core.errors import UsageError
-from fieldtwin.gateway.core.profile import DeviceProfile
-from fieldtwin.gateway.core.yaml_file import Key, YamlFile
+from fieldtwin.gateway.core.files.profile import DeviceProfile
+from fieldtwin.gateway.core.files.yaml_file import Key, YamlFile
 from fieldtwin.gateway.devices.canopen_config import CanopenBusConfig, CanopenNodeConfig, RpdoConfig
 from fieldtwin.gateway.devices.canopen_rpdo import BITS
 from fieldtwin.gateway.protocols.canopen.boot import Configuration, ExpectedIdentity

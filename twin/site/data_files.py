@@ -13,7 +13,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
-from fieldtwin.gateway.core.input_file import read_input
+from fieldtwin.gateway.core.files.input_file import read_input
 
 MAX_BYTES = 8 * 1024 * 1024
 _HERE = Path(__file__).absolute().parents[3].resolve()  # not resolved at once: in a checkout fieldtwin/twin is a link

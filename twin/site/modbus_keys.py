@@ -8,7 +8,7 @@ from dataclasses import replace
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import UsageError
-from fieldtwin.gateway.core.yaml_file import Key, YamlFile
+from fieldtwin.gateway.core.files.yaml_file import Key, YamlFile
 from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig
 from fieldtwin.gateway.protocols.modbus.framings import framing_of, make_framer
 from fieldtwin.twin.site.schema import BusForm, DeviceForm, SystemForm

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from fieldtwin.gateway.core.profile import Tag
-from fieldtwin.gateway.core.yaml_file import YamlFile
+from fieldtwin.gateway.core.files.profile import Tag
+from fieldtwin.gateway.core.files.yaml_file import YamlFile
 from fieldtwin.gateway.devices.config import DeviceConfig
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from fieldtwin.gateway.core.yaml_file import YamlFile
+from fieldtwin.gateway.core.files.yaml_file import YamlFile
 from fieldtwin.gateway.devices.config import DeviceConfig
 from fieldtwin.twin.site.schema import PlcForm
 

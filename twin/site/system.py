@@ -14,9 +14,9 @@ from pathlib import Path
 
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import UsageError
-from fieldtwin.gateway.core.nearest import did_you_mean
-from fieldtwin.gateway.core.profile import DeviceProfile, Tag, load_profile
-from fieldtwin.gateway.core.yaml_file import Key, YamlFile, load, validate
+from fieldtwin.gateway.core.files.nearest import did_you_mean
+from fieldtwin.gateway.core.files.profile import DeviceProfile, Tag, load_profile
+from fieldtwin.gateway.core.files.yaml_file import Key, YamlFile, load, validate
 from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig, Heartbeat, Tpdo
 from fieldtwin.twin.site.canopen_keys import canopen_bus, canopen_node, check_rpdo1
 from fieldtwin.twin.site.data_files import find

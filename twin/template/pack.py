@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
 from fieldtwin.gateway.core.errors import FileInvalid, Unreachable, UsageError
-from fieldtwin.gateway.core.profile import DeviceProfile
+from fieldtwin.gateway.core.files.profile import DeviceProfile
 from fieldtwin.twin.site.data_files import find
 from fieldtwin.twin.site.system import System
 from fieldtwin.twin.template.software import modules_hash, wheel_hash

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import IO, NamedTuple
 
 from fieldtwin.gateway.core.errors import FileInvalid, Unreachable, UsageError
-from fieldtwin.gateway.core.input_file import open_input
+from fieldtwin.gateway.core.files.input_file import open_input
 from fieldtwin.twin.template.template import (
     MANIFEST,
     MAX_FILE_BYTES,

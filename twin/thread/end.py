@@ -12,8 +12,8 @@ from contextlib import suppress
 from typing import Any
 
 from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S, Clock
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.errors import FieldtwinError, Unreachable
-from fieldtwin.gateway.core.nursery import Nursery
 from fieldtwin.gateway.store.event import Event, KnowledgeStore, without
 from fieldtwin.twin.thread.core import Effect, Incoming, Keep, NoteLost, Open, Outgoing
 from fieldtwin.twin.thread.frames import Ack, Ask, Data, Frame, Hello, Lost, Refused, Schema

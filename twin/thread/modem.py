@@ -10,15 +10,15 @@ import asyncio
 from collections.abc import Sequence
 
 from fieldtwin.gateway.core.clock import NS_PER_MS, Clock
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.connection import Connector
 from fieldtwin.gateway.core.errors import ConnectionLost, FieldtwinError
-from fieldtwin.gateway.core.nursery import Nursery
 from fieldtwin.gateway.core.values import DATA
 from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig
 from fieldtwin.gateway.devices.transmitter import TransmitterDriver
-from fieldtwin.gateway.runtime.bus_turns import DeviceState
-from fieldtwin.gateway.runtime.mailboxes import Inbox, Mailboxes
-from fieldtwin.gateway.runtime.modbus_bus import ModbusBus
+from fieldtwin.gateway.runtime.buses.bus_turns import DeviceState
+from fieldtwin.gateway.runtime.buses.modbus_bus import ModbusBus
+from fieldtwin.gateway.runtime.mailboxes.mailboxes import Inbox, Mailboxes
 from fieldtwin.gateway.runtime.tags import TagTable
 from fieldtwin.twin.thread.frames import Schema
 from fieldtwin.twin.thread.link import Carrier, DatagramLink

@@ -23,15 +23,15 @@ from msgspec.structs import replace
 
 from fieldtwin.gateway.connections.os_connector import OsConnector
 from fieldtwin.gateway.core.clock import NS_PER_MS, Clock
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.connection import Connector
 from fieldtwin.gateway.core.control import ControlClient, ControlServer
 from fieldtwin.gateway.core.errors import FieldtwinError
-from fieldtwin.gateway.core.image import INPUTS, OUTPUTS, ImageLayout, TagKind
-from fieldtwin.gateway.core.image_snapshot import Snapshot
-from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.core.image.image import INPUTS, OUTPUTS, ImageLayout, TagKind
+from fieldtwin.gateway.core.image.snapshot import Snapshot
 from fieldtwin.gateway.core.statemachine import STATE_CODES, STATES
 from fieldtwin.gateway.core.values import COMMAND, RESPONSE, Quality, Reason, TagValue
-from fieldtwin.gateway.runtime.audit import AuditLog
+from fieldtwin.gateway.runtime.audit_log import AuditLog
 from fieldtwin.gateway.store.event import Event, Kind, KnowledgeStore
 from fieldtwin.gateway.store.knowledge import open_knowledge
 from fieldtwin.gateway.wallclock import WallClock, run

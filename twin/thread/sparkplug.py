@@ -20,7 +20,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from fieldtwin.gateway.core.errors import Desync
-from fieldtwin.gateway.core.profile import Tag
+from fieldtwin.gateway.core.files.profile import Tag
 from fieldtwin.gateway.store.event import Event, Value
 from fieldtwin.twin.site.system import System
 from fieldtwin.twin.thread.frames import Ask, Data, Frame, FrameCodec, Hello, Schema

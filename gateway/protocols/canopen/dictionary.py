@@ -18,8 +18,8 @@ from canopen.objectdictionary import ODArray, ODRecord, ODVariable
 from canopen.objectdictionary.eds import import_eds
 
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
-from fieldtwin.gateway.core.input_file import read_input
-from fieldtwin.gateway.core.nearest import did_you_mean
+from fieldtwin.gateway.core.files.input_file import read_input
+from fieldtwin.gateway.core.files.nearest import did_you_mean
 from fieldtwin.gateway.core.values import Scalar
 from fieldtwin.gateway.protocols.canopen.cob_id import check_node
 from fieldtwin.gateway.protocols.canopen.datatypes import DataType

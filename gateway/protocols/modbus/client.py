@@ -12,6 +12,7 @@ from functools import lru_cache
 from typing import Any, NamedTuple, Self, TypeVar
 
 from fieldtwin.gateway.core.clock import NS_PER_S, Clock
+from fieldtwin.gateway.core.concurrency.fair_lock import Turn
 from fieldtwin.gateway.core.connection import ByteConnection, closed_here
 from fieldtwin.gateway.core.endpoint import Endpoint, SerialSettings
 from fieldtwin.gateway.core.errors import (
@@ -25,7 +26,6 @@ from fieldtwin.gateway.core.errors import (
     VerifyFailed,
 )
 from fieldtwin.gateway.core.latency import Latencies
-from fieldtwin.gateway.core.turn import Turn
 from fieldtwin.gateway.protocols.modbus.framings import Framing, framing_of, make_framer
 from fieldtwin.gateway.protocols.modbus.identity import ReadDeviceIdentification
 from fieldtwin.gateway.protocols.modbus.line import TURNAROUND_S, LineSilence

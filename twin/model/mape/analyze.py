@@ -12,8 +12,8 @@ from collections.abc import Iterator
 from typing import Any
 
 from fieldtwin.gateway.core.clock import Clock
+from fieldtwin.gateway.core.concurrency.events import Consumer, Producer
 from fieldtwin.gateway.core.errors import Desync
-from fieldtwin.gateway.core.events import Consumer, Producer
 from fieldtwin.gateway.core.values import DATA, Quality
 from fieldtwin.gateway.store.event import Kind
 from fieldtwin.twin.model.mape.messages import SeenMeasurement, SeenStatus, Verdict, verdict

@@ -10,8 +10,8 @@ from collections import deque
 from dataclasses import dataclass
 
 from fieldtwin.gateway.core.clock import NS_PER_S, Clock
+from fieldtwin.gateway.core.concurrency.events import Consumer, Producer
 from fieldtwin.gateway.core.errors import Desync
-from fieldtwin.gateway.core.events import Consumer, Producer
 from fieldtwin.gateway.core.statemachine import PERIOD_MAX, PERIOD_MIN, decode_period
 from fieldtwin.gateway.core.values import COMMAND
 from fieldtwin.gateway.store.event import Kind

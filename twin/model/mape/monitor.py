@@ -7,8 +7,8 @@ It must never depend on a connection, nor on anything that could send a command.
 from __future__ import annotations
 
 from fieldtwin.gateway.core.clock import Clock
+from fieldtwin.gateway.core.concurrency.events import Consumer, Producer
 from fieldtwin.gateway.core.errors import Desync
-from fieldtwin.gateway.core.events import Consumer, Producer
 from fieldtwin.gateway.core.statemachine import encode_period
 from fieldtwin.gateway.core.values import DATA
 from fieldtwin.gateway.store.event import Event, Kind

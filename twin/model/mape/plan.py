@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from fieldtwin.gateway.core.clock import NS_PER_MS, Clock
+from fieldtwin.gateway.core.concurrency.events import Consumer, Producer
 from fieldtwin.gateway.core.errors import FieldtwinError
-from fieldtwin.gateway.core.events import Consumer, Producer
 from fieldtwin.gateway.core.statemachine import encode_period
 from fieldtwin.gateway.core.values import COMMAND, DATA
 from fieldtwin.gateway.store.event import Kind

@@ -7,7 +7,7 @@ prose, row 5). It must never depend on a connection, nor on anything that could 
 
 from __future__ import annotations
 
-from fieldtwin.gateway.core.events import Consumer
+from fieldtwin.gateway.core.concurrency.events import Consumer
 from fieldtwin.gateway.core.values import DATA
 from fieldtwin.twin.model.mape.messages import SeenMeasurement, Verdict
 from fieldtwin.twin.model.model import DigitalModel

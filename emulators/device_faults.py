@@ -1,0 +1,117 @@
+"""The faults of one emulated device outside of a system: `fieldtwin emulate DEVICE --faults FILE`.
+
+Here an aim may not name buses or devices; it may name a register if the device has a profile. Value faults need a
+device whose registers are created from its profile.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from random import Random
+from typing import Any
+
+from fieldtwin.emulators.distortion import Distortions
+from fieldtwin.emulators.faults.engine import WireFaults
+from fieldtwin.emulators.faults.fault import Active, Aim, Kind, ValueFault
+from fieldtwin.emulators.faults.frames import Framing
+from fieldtwin.emulators.faults.schema import FUNCTIONS_OF, FaultSpec, addressed, counted, parse_fault
+from fieldtwin.emulators.faults.values.value_ranges import check_fault
+from fieldtwin.emulators.faults.wrong_aim import WrongAim
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.files.profile import DeviceProfile, Tag
+
+
+class DeviceFaults:
+    """The faults as given in the file, checked by `check_device`.
+
+    They begin at `start_ns`, the loop's time in nanoseconds.
+    """
+
+    def __init__(
+        self, said: Iterable[Mapping[str, Any]], profile: DeviceProfile | None, seed: int, start_ns: int
+    ) -> None:
+        self.put_in: list[Active] = []
+        """The faults that were put in, once for each wire, with the number of times each has struck."""
+        self._specs = [parse_fault(dict(one), number=number) for number, one in enumerate(said, 1)]
+        self._profile = profile
+        self._seed = seed
+        self._start_ns = start_ns
+
+    def on_wire(self, framing: Framing) -> WireFaults:
+        """Return the faults of one wire of the device."""
+        faults = WireFaults(framing)
+        for spec in self._specs:
+            if spec.kind.kind is Kind.BYTES:
+                faults.put_in(self._active(spec))
+        return faults
+
+    def on_values(self, distortions: Distortions) -> None:
+        """Put the value faults into a device."""
+        for spec in self._specs:
+            if spec.kind.kind is Kind.VALUE:
+                active = self._active(spec)
+                if isinstance(active.fault, ValueFault) and self._profile is not None:
+                    active.fault.learn(self._profile.tags.values())
+                distortions.put_in(active, spec.aim.register_)
+
+    def _active(self, spec: FaultSpec) -> Active:
+        aim = spec.aim
+        addresses, functions = _place(aim, self._profile)
+        until_ns = None if spec.until_s is None else self._start_ns + round(spec.until_s * NS_PER_S)
+        active = Active(
+            spec.id,
+            spec.make(),
+            aim,
+            Random(f"{self._seed} {spec.id}"),
+            self._start_ns + round(spec.from_s * NS_PER_S),
+            until_ns,
+            units=() if aim.unit is None else (aim.unit,),
+            addresses=addresses,
+            functions=functions,
+            counts=counted(aim.registers),
+        )
+        self.put_in.append(active)
+        return active
+
+
+def check_device(spec: FaultSpec, profile: DeviceProfile | None, *, values: bool) -> None:
+    """Raise `WrongAim` for a fault that a single device cannot have. `values`: whether its values can be changed."""
+    aim, kind = spec.aim, spec.kind.kind
+    for key, name in (("device", aim.device), ("bus", aim.bus)):
+        if name:
+            raise WrongAim(
+                key, f"fault {spec.id}: there is only one device, and no name is needed", hint="leave it out"
+            )
+    if kind is Kind.CAN:
+        raise WrongAim("name", f"fault {spec.kind.name} is for {kind.value}", expected="one of a line or socket")
+    tag = _tag(aim, profile)
+    if kind is Kind.VALUE and not values:
+        raise WrongAim(
+            "name",
+            f"fault {spec.kind.name} changes values, and those of this device come from a recording",
+            hint="--values makes its registers from its profile",
+        )
+    if kind is Kind.VALUE and tag is not None and tag.is_text:
+        raise WrongAim("register", f"{tag.name} is no number", expected="a tag that is one")
+    if profile is not None:
+        check_fault(spec.make(), aim.register_, profile.tags.values())
+    _place(aim, profile)
+
+
+def _tag(aim: Aim, profile: DeviceProfile | None) -> Tag | None:
+    if not aim.register_:
+        return None
+    if profile is None:
+        raise WrongAim("register", "a recording has no registers by name", expected="address: holding:0x10")
+    if aim.register_ not in profile.tags:
+        raise WrongAim("register", f"no register {aim.register_!r}", expected=", ".join(profile.tags))
+    return profile.tags[aim.register_]
+
+
+def _place(aim: Aim, profile: DeviceProfile | None) -> tuple[range | None, frozenset[int]]:
+    """Return the addresses that are aimed at, None for all, and the functions of their table."""
+    tag = _tag(aim, profile)
+    if tag is not None:
+        at = tag.registers
+        return range(at.address, at.end), FUNCTIONS_OF[at.table]
+    return (None, frozenset()) if aim.address is None else addressed(aim.address)

@@ -1,0 +1,1 @@
+"""Faults of nodes on a CAN bus."""

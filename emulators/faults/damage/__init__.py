@@ -1,0 +1,1 @@
+"""Faults that damage the bytes of a frame."""

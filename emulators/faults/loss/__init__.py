@@ -1,0 +1,1 @@
+"""Faults that lose or repeat frames, or break the connection."""

@@ -1,0 +1,1 @@
+"""Faults that change a Modbus reply and keep its frame intact."""

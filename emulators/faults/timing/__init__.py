@@ -1,0 +1,1 @@
+"""Faults that deliver frames late, early or in pieces."""

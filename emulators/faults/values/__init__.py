@@ -1,0 +1,1 @@
+"""Faults that change the values of an emulated device."""

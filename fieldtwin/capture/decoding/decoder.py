@@ -1,0 +1,171 @@
+"""The interface of decoding: events of a trace in, words and exchanges out, event by event or all at once.
+
+    decoder = Decoder(system)
+    for event in trace.events:
+        for exchange in decoder.feed(event): ...
+    rest = decoder.finish()
+
+Bounded: one open request per line, 64 per Modbus TCP connection, one transfer per node.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping
+from typing import Any
+
+from fieldtwin.capture.decoding.canopen_bus import CanopenWire
+from fieldtwin.capture.decoding.exchange import Decoded, Exchange
+from fieldtwin.capture.decoding.modbus_connection import ModbusWire, Unit
+from fieldtwin.capture.decoding.tags import TagMap, show_value
+from fieldtwin.gateway.connections.tap import Captured
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.connection import Direction
+from fieldtwin.gateway.core.errors import FieldtwinError
+from fieldtwin.gateway.devices.config import DeviceConfig
+from fieldtwin.gateway.protocols.modbus.framings import framing_of
+from fieldtwin.results.trace import Event, Kind, refusal_text
+from fieldtwin.twin.site.system import System
+
+
+class Decoder:
+    """A decoder of one trace, whose events are fed in order.
+
+    `served` are buses on which the remote client sends requests. `framings` states the protocol on endpoints that are
+    not a bus of `system`: rtu, ascii, mbap, udp or can; nothing there has a name.
+    """
+
+    def __init__(
+        self, system: System | None, served: Collection[str] = (), framings: Mapping[str, str] | None = None
+    ) -> None:
+        self._system = system
+        self._served = served
+        self._framings = framings or {}
+        self._modbus: dict[str, ModbusWire] = {}
+        self._canopen: dict[str, CanopenWire] = {}
+        self._maps: dict[str, TagMap] = {}
+
+    def decode(self, event: Event) -> Decoded:
+        """Describe an event in words.
+
+        Every event of a trace has a description; an unknown bus's bytes are shown unchanged.
+        """
+        if event.kind is not Kind.FRAME:
+            return Decoded(self._words(event), dict(event.data))
+        text, done = self._frame(event)
+        fields: dict[str, Any] = {"bus": event.where, **event.data}
+        if done:
+            fields |= done[-1].describe()
+        return Decoded(text, fields, tuple(done))
+
+    def feed(self, event: Event) -> list[Exchange]:
+        """Return the exchanges that an event ended: by an answer, by the next request, or as a message."""
+        return self._frame(event)[1] if event.kind is Kind.FRAME else []
+
+    def finish(self) -> list[Exchange]:
+        """Conclude the trace: requests that still wait have no answer."""
+        wires: list[ModbusWire | CanopenWire] = [*self._modbus.values(), *self._canopen.values()]
+        return sorted((e for wire in wires for e in wire.finish()), key=lambda e: e.t_ns)
+
+    def pending(self) -> list[Exchange]:
+        """Return the requests whose reply may still come, the oldest first. Changes nothing, so it may be called at any time."""
+        wires: list[ModbusWire | CanopenWire] = [*self._modbus.values(), *self._canopen.values()]
+        return sorted((e for wire in wires for e in wire.pending()), key=lambda e: e.t_ns)
+
+    def _frame(self, event: Event) -> tuple[str, list[Exchange]]:
+        data = event.data
+        try:
+            raw = bytes.fromhex(data.get("bytes", ""))
+            if "id" in data:
+                frame = CanFrame(
+                    data["id"], raw, extended=bool(data.get("ext")), remote=bool(data.get("rtr")),
+                    error=bool(data.get("err")),
+                )  # fmt: skip
+                return self._can(event.where).feed(frame, event.t_ns)
+        except (ValueError, TypeError, FieldtwinError):
+            return f"unreadable: {data}", []
+        wire = self._line(event.where)
+        if wire is None:
+            return raw.hex(" "), []
+        texts, done = wire.feed(data.get("dir") == "sent", raw, event.t_ns)
+        return "; ".join(texts), done
+
+    def _line(self, bus: str) -> ModbusWire | None:
+        if bus not in self._modbus:
+            config = self._system.buses.get(bus) if self._system else None
+            if config is not None and config.endpoint.is_can:
+                return None
+            framing = framing_of(config.endpoint) if config else self._framings.get(bus, "can")
+            if framing == "can":
+                return None
+            units = {d.address: Unit(d.name, TagMap(d.profile)) for d in self._devices(bus)}
+            echo = config.echo if config else False
+            self._modbus[bus] = ModbusWire(bus, framing, units, echo=echo, served=bus in self._served)
+        return self._modbus[bus]
+
+    def _can(self, bus: str) -> CanopenWire:
+        if bus not in self._canopen:
+            self._canopen[bus] = CanopenWire(bus, self._devices(bus))
+        return self._canopen[bus]
+
+    def _devices(self, bus: str) -> list[DeviceConfig]:
+        return self._system.devices_on(bus) if self._system else []
+
+    def _words(self, event: Event) -> str:
+        data, where = event.data, event.where
+        match event.kind:
+            case Kind.TAG:
+                quality = data.get("quality", "")
+                reason = "" if data.get("reason") in (None, "", "none") else f": {data['reason']}"
+                return f"{where} {self._tag_value(where, data.get('value'))}, {quality}{reason}"
+            case Kind.STATE:
+                return f"{where} = {show_value(data.get('value'))}"
+            case Kind.FAULT:
+                state = "on" if data.get("on") else "off"
+                return f"fault {where}: {data.get('name', '')} {state} {data.get('target') or ''}".rstrip()
+            case Kind.REFUSED:
+                return refusal_text(where, data)
+            case Kind.STEP:
+                verdict = f": {data['verdict']}" if data.get("verdict") else ""
+                return f"step {where}: {data.get('text', '')}{verdict}"
+        return f"{where}: {data.get('text', '')}"
+
+    def _tag_value(self, where: str, value: Any) -> str:
+        device, _, name = where.rpartition(".")
+        config = self._system.devices.get(device) if self._system else None
+        if config is None or not isinstance(value, bool | int | float | str | None):
+            return show_value(value)
+        if device not in self._maps:
+            self._maps[device] = TagMap(config.profile)
+        return self._maps[device].show({name: value}).removeprefix(f"{name} ")
+
+
+def exchanges(system: System, events: Iterable[Event], served: Collection[str] = ()) -> list[Exchange]:
+    """Return all exchanges of a trace, in the order of their requests."""
+    decoder = Decoder(system, served)
+    found = [exchange for event in events for exchange in decoder.feed(event)]
+    return sorted(found + decoder.finish(), key=lambda e: (e.t_ns, e.end_ns))
+
+
+def frame_events(captured: Iterable[Captured], system: System, start_ns: int = 0) -> list[Event]:
+    """Return the content of a tap (`fieldtwin run --capture`) as FRAME events.
+
+    `start_ns` is the tap's time of the run's start. Endpoints that do not belong to a bus of the system are omitted.
+    """
+    buses = {str(bus.endpoint): name for name, bus in system.buses.items()}
+    found = []
+    for seen in captured:
+        bus = buses.get(str(seen.endpoint))
+        if bus is None:
+            continue
+        data: dict[str, Any] = {"dir": "sent" if seen.direction is Direction.SENT else "received"}
+        if isinstance(seen.item, CanFrame):
+            data |= {"bytes": seen.item.data.hex(), "id": seen.item.can_id}
+            data |= {k: True for k, on in _flags(seen.item) if on}
+        else:
+            data["bytes"] = seen.item.hex()
+        found.append(Event(seen.t_ns - start_ns, Kind.FRAME, bus, data))
+    return found
+
+
+def _flags(frame: CanFrame) -> list[tuple[str, bool]]:
+    return [("ext", frame.extended), ("rtr", frame.remote), ("err", frame.error)]

@@ -1,0 +1,54 @@
+"""Read recorded traffic: a run's trace (`fieldtwin run --trace`) or a capture of its buses (`--capture`)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from fieldtwin.capture.decoding.decoder import frame_events
+from fieldtwin.capture.formats.pcap import MAX_LINE_BYTES, read_capture
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.files.input_file import open_input
+from fieldtwin.results.trace import Event, Kind, refusal_data
+from fieldtwin.twin.site.system import System
+
+_EXPECTED = "[ns, kind, where, data], as `fieldtwin run --virtual --trace` writes it"
+
+
+def read_events(path: Path, system: System) -> Iterator[Event]:
+    """Yield the events of a trace, or the frames of a capture on the system's buses, in ns since the first.
+
+    A truncated last line is omitted. Raises `FileInvalid` with the line number for any other invalid line.
+    """
+    try:
+        with open_input(path) as file:
+            first = file.read(1)
+    except OSError as e:
+        raise FileInvalid(f"cannot be read: {e.strerror or e}", path=str(path)) from e
+    if first == b"{":
+        refusals: list[dict[str, Any]] = []
+        captured = list(read_capture(path, refusals))
+        start_ns = captured[0].t_ns if captured else 0
+        refused = [Event(r["t_ns"] - start_ns, Kind.REFUSED, r["tag"], refusal_data(r)) for r in refusals]
+        yield from sorted([*frame_events(captured, system, start_ns), *refused], key=lambda event: event.t_ns)
+        return
+    yield from _trace(path)
+
+
+def _trace(path: Path) -> Iterator[Event]:
+    decoder, kinds = msgspec.json.Decoder(tuple[int, str, str, dict[str, object]]), {k.value: k for k in Kind}
+    with open_input(path) as file:
+        number = 0
+        while line := file.readline(MAX_LINE_BYTES):
+            number += 1
+            try:
+                t_ns, kind, where, data = decoder.decode(line)
+                event = Event(t_ns, kinds[kind], where, data)
+            except (msgspec.DecodeError, KeyError) as e:
+                if not line.endswith(b"\n") and not file.read(1):
+                    return
+                raise FileInvalid(f"no event: {e}", path=str(path), line=number, expected=_EXPECTED) from e
+            yield event

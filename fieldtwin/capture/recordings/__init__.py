@@ -1,0 +1,1 @@
+"""Import, export, compare and store recordings of devices, without a device at hand."""

@@ -1,0 +1,98 @@
+"""The options of the verbs that ask one device: where it is, what is known of it, and the log of what is sent."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TypeVar
+
+import click
+
+from fieldtwin.cli.options import Duration, profiles_option
+from fieldtwin.commissioning.access.address import ORDERS, TYPES, RawForm
+from fieldtwin.commissioning.access.frame_log import WireLog
+from fieldtwin.commissioning.access.reading import Target, target_of
+from fieldtwin.gateway.core.connection import Tap
+from fieldtwin.gateway.core.errors import UsageError
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+_DEVICE = (
+    click.option("--unit", type=click.IntRange(0, 255), help="Modbus unit id; default: the profile's, else 1."),
+    click.option("--node", type=click.IntRange(1, 127), help="CANopen node id; default: the profile's, else 1."),
+    click.option("--profile", "profile_name", default="", metavar="NAME", help="A device profile: tags by name."),
+    click.option(
+        "--eds", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="CANopen: its EDS or DCF."
+    ),
+    click.option("--bitrate", type=click.IntRange(10_000, 1_000_000), help="CAN: bit/s; default: the bus's."),
+    click.option("--timeout", "timeout_s", type=Duration(), default="1s", show_default=True, help="For each reply."),
+    click.option("--echo", is_flag=True, help="Serial: what we send comes back first."),
+    click.option(
+        "--log", type=click.Path(dir_okay=False, path_type=Path), help="Keep all that is sent and received here."
+    ),
+    profiles_option,
+)
+_RAW = (
+    click.option("--type", "kind", type=click.Choice(TYPES), help="Of raw addresses; default uint16, bool for bits."),
+    click.option("--order", type=click.Choice(ORDERS, case_sensitive=False), default="ABCD", show_default=True,
+                 help="Byte order of raw values longer than a register."),
+    click.option("--count", type=click.IntRange(1, 2000), default=1, help="How many values from each raw address on."),
+    click.option("--registers", type=click.IntRange(1, 125), default=1, help="Length of a raw string or of bytes."),
+)  # fmt: skip
+
+
+def device_options(command: F) -> F:
+    """ENDPOINT's device: --unit, --node, --profile, --eds, --bitrate, --timeout, --echo, --log, --profiles."""
+    for option in reversed(_DEVICE):
+        command = option(command)
+    return command
+
+
+def raw_options(command: F) -> F:
+    """How raw addresses are read: --type, --order, --count, --registers."""
+    for option in reversed(_RAW):
+        command = option(command)
+    return command
+
+
+def target_from(endpoint: str, options: dict[str, Any]) -> Target:
+    """The device that the options mean. Raises `UsageError`, `FileInvalid`."""
+    unit, node = options["unit"], options["node"]
+    if endpoint.lower().startswith("can:"):
+        if unit is not None:
+            raise UsageError("a CANopen device has a node id", expected="--node", got="--unit")
+    elif node is not None:
+        raise UsageError("a Modbus device has a unit id", expected="--unit", got="--node")
+    return target_of(
+        endpoint,
+        address=node if unit is None else unit,
+        profile_name=options["profile_name"],
+        eds=options["eds"],
+        folders=[Path(p) for p in options["profiles"]],
+        bitrate=options["bitrate"] or 0,
+        timeout_s=options["timeout_s"],
+        echo=options["echo"],
+    )
+
+
+def raw_form(options: dict[str, Any]) -> RawForm:
+    """How raw addresses are read."""
+    return RawForm(options["kind"], options["order"].upper(), options["count"], options["registers"])
+
+
+def words() -> str:
+    """This command line, for a log."""
+    return shlex.join(["fieldtwin", *sys.argv[1:]])
+
+
+@contextmanager
+def logged(path: Path | None) -> Iterator[list[Tap]]:
+    """The taps of a verb: the log at `path`, or none."""
+    if path is None:
+        yield []
+        return
+    with WireLog(path, words()) as log:
+        yield [log]

@@ -1,0 +1,145 @@
+"""`fieldtwin diff`: two dumps, or a dump and a profile, by named field. Parses and prints, no more."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import click
+from rich.table import Table
+from rich.text import Text
+
+from fieldtwin.cli.options import json_option, pairs, profiles_option
+from fieldtwin.commissioning.dump.diff import Differences, Leave, diff_dictionary, diff_dumps, diff_profile
+from fieldtwin.commissioning.dump.file import Dump, load_dump
+from fieldtwin.console import data, talk
+from fieldtwin.gateway.core.errors import FileInvalid, UsageError
+from fieldtwin.gateway.core.files.profile import DeviceProfile, load_profile
+from fieldtwin.gateway.protocols.canopen.dictionary import ObjectDictionary, load_dictionary
+from fieldtwin.reports.site.about import headed
+from fieldtwin.twin.site.data_files import find, search_path
+
+DIFFERENT = 1
+
+
+@click.command("diff")
+@click.argument("left", type=click.Path(dir_okay=False, path_type=Path), metavar="DUMP")
+@click.argument("right", metavar="DUMP|PROFILE|EDS")
+@click.option(
+    "--profile", "profile_name", default="", metavar="NAME", help="Names for two dumps; default: the dump's own."
+)
+@click.option("--ignore", multiple=True, metavar="PATTERN", help="Tags or addresses to leave out, e.g. 'energy_*'.")
+@click.option("--tolerance", multiple=True, metavar="NAME=NUMBER", help="Nearer is the same; NAME * for all others.")
+@click.option("--settings", is_flag=True, help="Two dumps: only what can be written.")
+@profiles_option
+@json_option
+def command(
+    left: Path,
+    right: str,
+    profile_name: str,
+    ignore: tuple[str, ...],
+    tolerance: tuple[str, ...],
+    settings: bool,
+    profiles: tuple[str, ...],
+    as_json: bool,
+) -> int:
+    """Show what differs between a DUMP and another, or between a DUMP and a PROFILE or EDS. Exit code 1 if something does.
+
+    \b
+    fieldtwin diff before.jsonl after.jsonl --settings
+    fieldtwin diff meter.jsonl eastron-sdm630
+    fieldtwin diff drive.jsonl drive.eds
+    """
+    folders = [Path(p) for p in profiles]
+    one = _dump(left)
+    leave = Leave(ignore, _tolerances(tolerance), settings)
+    if _is_dump(Path(right)):
+        other = _dump(Path(right))
+        if one.protocol != other.protocol:
+            raise FileInvalid("dumps of two protocols", path=right, expected=one.protocol, got=other.protocol)
+        profile = _named(one, profile_name, folders)
+        found = diff_dumps(one, other, profile, _sheet(one, profile), leave)
+    else:
+        found = _against(one, right, folders, leave)
+    if as_json:
+        h = one.header
+        endpoint, when = str(h.get("endpoint", "")), str(h.get("started", ""))
+        head = headed("diff", one.protocol, endpoint, int(h["address"]), Path(right).name, device=left.name, when=when)
+        click.echo(json.dumps(head | asdict(found)))
+    else:
+        _show(found, left.name, Path(right).name)
+    return DIFFERENT if found.found or not found.compared else 0  # of nothing compared, nothing is known
+
+
+def _against(one: Dump, right: str, folders: list[Path], leave: Leave) -> Differences:
+    if Path(right).suffix.lower() in (".eds", ".dcf"):
+        if one.protocol != "canopen":
+            raise UsageError("an EDS is for the dump of a CANopen node", got=one.path)
+        return diff_dictionary(one, load_dictionary(Path(right), int(one.header["address"])))
+    profile = load_profile(find("devices", right, extra=folders))
+    if profile.protocol != one.protocol:
+        raise UsageError(f"{profile.name} is a {profile.protocol} device", expected=f"a profile of {one.protocol}")
+    sheet = _sheet(one, profile)
+    return diff_dictionary(one, sheet) if sheet is not None else diff_profile(one, profile, leave)
+
+
+def _dump(path: Path) -> Dump:
+    dump = load_dump(path)
+    if not dump.passes:
+        raise FileInvalid("a dump without values", path=str(path))
+    if not dump.ended:
+        talk.print(f"{path.name} was interrupted: what it lacks is not compared", soft_wrap=True)
+    return dump
+
+
+def _is_dump(path: Path) -> bool:
+    try:
+        with path.open("rb") as file:
+            return b"fieldtwin_dump" in file.read(64)
+    except OSError:
+        return False
+
+
+def _named(dump: Dump, name: str, folders: list[Path]) -> DeviceProfile | None:
+    """The profile that is asked for, else the one that the dump was made with, if it is here."""
+    if name:
+        return load_profile(find("devices", name, extra=folders))
+    known = dump.header.get("profile")
+    if not known:
+        return None
+    for folder in search_path(folders):
+        for path in sorted((folder / "devices").glob("*.yaml")):
+            if f"device: {known}" in path.read_text(encoding="utf-8", errors="replace"):
+                return load_profile(path)
+    talk.print(f"no profile {known} here: addresses instead of names (--profile)", soft_wrap=True)
+    return None
+
+
+def _sheet(dump: Dump, profile: DeviceProfile | None) -> ObjectDictionary | None:
+    path = profile.eds_path if profile is not None else None
+    named = dump.header.get("eds")
+    if path is None and dump.protocol == "canopen" and named and Path(str(named)).is_file():
+        path = Path(str(named))
+    return load_dictionary(path, int(dump.header["address"])) if path is not None else None
+
+
+def _tolerances(texts: tuple[str, ...]) -> dict[str, float]:
+    try:
+        return {name: abs(float(number)) for name, number in pairs(texts, "--tolerance").items()}
+    except ValueError as e:
+        raise UsageError(f"--tolerance: {e}", expected="NAME=NUMBER") from e
+
+
+def _show(found: Differences, left: str, right: str) -> None:
+    if found.found:
+        table = Table(box=None, pad_edge=False, header_style="bold")
+        for name in ("name", "at", "what", left, right):
+            table.add_column(name, overflow="fold")
+        for d in found.found:
+            table.add_row(Text(d.name), d.at if d.at != d.name else "", d.kind, Text(d.left), Text(d.right))
+        data.print(table)
+    for note in found.notes:
+        talk.print(Text(note), soft_wrap=True)
+    nothing = "" if found.compared else ": nothing in these two can be compared"
+    talk.print(f"{found.compared} compared, {len(found.found)} different{nothing}")

@@ -1,0 +1,165 @@
+"""`fieldtwin dump`: what a device holds, where its holes are, how much it takes at once. Parses and prints, no more."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+from fieldtwin.cli.device.device_options import device_options, target_from, words
+from fieldtwin.cli.device.dump_view import estimate_text, notes, profile_gaps, summary, unknown_text
+from fieldtwin.cli.options import Duration, json_option
+from fieldtwin.commissioning.dump.dump import DEFAULT_BUDGET_S, Job
+from fieldtwin.commissioning.dump.dump import Progress as Told
+from fieldtwin.commissioning.dump.file import Dump, load_dump
+from fieldtwin.commissioning.dump.profile import dumped_tags
+from fieldtwin.commissioning.dump.session import dump, estimate, frames, log_path, object_ranges, register_spans
+from fieldtwin.console import data, talk
+from fieldtwin.gateway.core.errors import Unreachable, UsageError
+from fieldtwin.gateway.wallclock import run as run_precise
+
+
+@click.command("dump")
+@click.argument("endpoint")
+@click.argument("ranges", nargs=-1, metavar="[RANGE]...")
+@device_options
+@click.option(
+    "-o", "--out", type=click.Path(dir_okay=False, path_type=Path), help="The dump; default dump-ADDRESS.jsonl."
+)
+@click.option("--resume", is_flag=True, help="Go on with the file that is there.")
+@click.option(
+    "--passes", type=click.IntRange(1, 100_000), default=1, show_default=True, help="Times through, for `infer`."
+)
+@click.option("--every", "every_s", type=Duration(), default="10s", show_default=True, help="From pass to pass.")
+@click.option(
+    "--rate", type=click.FloatRange(0, 1000), default=50, show_default=True, help="Requests a second; 0: any."
+)
+@click.option("--thorough", is_flag=True, help="Ask every address; else in a void every eighth, and round numbers.")
+@click.option(
+    "--budget", "budget_s", type=Duration(), default=f"{DEFAULT_BUDGET_S / 60:g}m", show_default=True,
+    help="Time for each table to look where nothing was read: beyond silence, and with other read lengths.",
+)  # fmt: skip
+@click.option("--longest", type=click.IntRange(1, 2000), help="Values in a read; default: as many as the device takes.")
+@click.option("--pairs", is_flag=True, help="The device knows pairs of registers only.")
+@click.option("--retries", type=click.IntRange(0, 10), default=2, show_default=True, help="After no good reply.")
+@click.option("--no-functions", is_flag=True, help="Do not ask for functions 07h, 08h, 0Bh, 0Ch, 11h, 2Bh.")
+@click.option("--dry-run", is_flag=True, help="Print the frames of a device that refuses nothing, and send nothing.")
+@json_option
+def command(
+    endpoint: str,
+    ranges: tuple[str, ...],
+    out: Path | None,
+    resume: bool,
+    passes: int,
+    every_s: float,
+    rate: float,
+    thorough: bool,
+    budget_s: float,
+    longest: int | None,
+    pairs: bool,
+    retries: int,
+    no_functions: bool,
+    dry_run: bool,
+    as_json: bool,
+    log: Path | None,
+    **options: Any,
+) -> int:
+    """Dump the device at ENDPOINT: values, holes, longest read, latency, functions. It only reads.
+
+    RANGEs are holding, holding:0..999 or 40001..40100, and 6000..6FFF on a CAN bus; without any, what the profile or EDS names,
+    else everything. All that is sent is logged in a file next to the dump. Exit code 4 if most of the ranges is still unknown at
+    the end: no reply, no valid reply, or not asked.
+
+    \b
+    fieldtwin dump tcp://192.168.0.7 -o meter.jsonl
+    fieldtwin dump 'rtu:/dev/ttyUSB0?baudrate=9600&frame=8N1' holding:0..999 --passes 20 --every 15s
+    fieldtwin dump can:socketcan/can0 --node 5 --eds drive.eds
+    """
+    target = target_from(endpoint, options)
+    if log is not None:
+        raise UsageError("a dump always writes its log next to itself", got="--log")
+    modbus = target.protocol == "modbus"
+    spacing_s = 1 / rate if rate else 0.0
+    job = Job(
+        target,
+        spans=register_spans(ranges) if modbus else (),
+        objects=() if modbus else object_ranges(ranges),
+        stride=1 if thorough else 8,
+        most=longest,
+        pairs=pairs or (target.profile is not None and target.profile.form.limits.even_only),
+        passes=passes,
+        every_s=every_s,
+        functions=not no_functions,
+        budget_s=budget_s,
+        spacing_s=spacing_s,
+    )
+    if dry_run:
+        for frame in frames(job):
+            click.echo(frame)
+        return 0
+    out = out or Path(f"dump-{target.address}.jsonl")
+    talk.print(estimate_text(estimate(job, spacing_s), passes, rate), soft_wrap=True)
+    _tell_what_is_left_out(job)
+    try:
+        with _bar(out.name) as progress:
+            run_precise(
+                dump(job, out, words=words(), resume=resume, retries=retries, spacing_s=spacing_s, progress=progress)
+            )
+    except KeyboardInterrupt:
+        talk.print(f"stopped; what was answered is in {out}, and --resume goes on", soft_wrap=True)
+        raise
+    found = load_dump(out)
+    if as_json:
+        click.echo(json.dumps(_described(found, out)))
+    else:
+        for part in summary(found):
+            data.print(part)
+        talk.print(f"{out}, and what was sent in {log_path(out)}", soft_wrap=True)
+    if found.is_mostly_unknown:
+        talk.print(unknown_text(found), soft_wrap=True)
+        return Unreachable.exit_code
+    return 0
+
+
+def _tell_what_is_left_out(job: Job) -> None:
+    if job.target.profile is not None and not job.spans and job.target.protocol == "modbus":
+        left = [t.name for t in dumped_tags(job.target.profile)[1]]
+        if left:
+            talk.print(f"left out, secret or changed by reading: {', '.join(left)}", soft_wrap=True)
+
+
+def _described(found: Dump, out: Path) -> dict[str, Any]:
+    return {
+        "out": str(out),
+        "log": str(log_path(out)),
+        "passes": len(found.passes),
+        "values": len(found.passes[-1].cells),
+        "maps": list(found.maps.values()),
+        "unknown": dict(zip(("addresses", "of"), found.unknown, strict=True)),
+        "mostly_unknown": found.is_mostly_unknown,
+        "functions": list(found.functions.values()),
+        "latency": found.latency,
+        "gaps": profile_gaps(found),
+        "notes": notes(found),
+    }
+
+
+@contextmanager
+def _bar(name: str) -> Iterator[Told]:
+    """A progress bar on a terminal, nothing elsewhere."""
+    with Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.completed} of {task.total}, {task.fields[requests]} requests"),
+        TimeRemainingColumn(),
+        console=talk,
+        transient=True,
+        disable=not talk.is_terminal,
+    ) as bar:
+        task = bar.add_task(name, total=None, requests=0)
+        yield lambda done, total, requests: bar.update(task, completed=done, total=total, requests=requests)

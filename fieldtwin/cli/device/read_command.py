@@ -1,0 +1,64 @@
+"""`fieldtwin read`: values of one device, once. Parses and prints, no more."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+
+from fieldtwin.cli.device.device_options import device_options, logged, raw_form, raw_options, target_from
+from fieldtwin.cli.device.value_table import exit_code, value_table
+from fieldtwin.cli.options import json_option
+from fieldtwin.commissioning.access.address import tags_of
+from fieldtwin.commissioning.access.point import Answer
+from fieldtwin.commissioning.access.reading import Target, dry_point, read_all, row_of
+from fieldtwin.console import data
+from fieldtwin.gateway.core.errors import NotAllowed
+from fieldtwin.gateway.core.files.profile import Tag
+from fieldtwin.gateway.wallclock import run as run_precise
+
+
+@click.command("read")
+@click.argument("endpoint")
+@click.argument("items", nargs=-1, metavar="[ITEM]...")
+@device_options
+@raw_options
+@click.option("--dry-run", is_flag=True, help="Print the frames that would be sent, and send nothing.")
+@json_option
+def command(
+    endpoint: str, items: tuple[str, ...], log: Path | None, dry_run: bool, as_json: bool, **options: Any
+) -> int:
+    """Read ITEMs of the device at ENDPOINT: tags of a profile, or addresses; without any, the whole profile.
+
+    An item that cannot be read has its reason in its place; the others are read all the same. Exit code: 0 if every value
+    came, 4 if the wire lost one, else 5 if the device refused one.
+
+    \b
+    fieldtwin read tcp://192.168.0.7 holding:100 --count 4
+    fieldtwin read 'rtu:/dev/ttyUSB0?baudrate=9600&frame=8N1' 40101 --type float32 --order CDAB
+    fieldtwin read rtu:/dev/ttyUSB0 --profile eastron-sdm630 'voltage_*' frequency
+    fieldtwin read can:socketcan/can0 --node 5 6041h:00 1018h:01 --count 4
+    """
+    target = target_from(endpoint, options)
+    tags = tags_of(items, target.protocol, raw_form(options), target.profile, target.dictionary)
+    readable = [t for t in tags if t.readable]
+    if not readable:
+        raise NotAllowed(f"cannot be read: {', '.join(t.name for t in tags)}", hint="the profile says `access: wo`")
+    if dry_run:
+        for frame in dry_point(target).read_frames(readable):
+            click.echo(frame)
+        return 0
+    answers = run_precise(_read(target, tags, log))
+    if as_json:
+        rows = [row_of(t, answers[t.name]) for t in tags]
+        click.echo(json.dumps({"endpoint": target.url, "address": target.address, "values": rows}))
+    else:
+        data.print(value_table(tags, answers))
+    return exit_code(answers.values())
+
+
+async def _read(target: Target, tags: list[Tag], log: Path | None) -> dict[str, Answer]:
+    with logged(log) as taps:
+        return await read_all(target, tags, taps=taps)

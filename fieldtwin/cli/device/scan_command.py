@@ -1,0 +1,185 @@
+"""`fieldtwin scan`: who is on a wire. Parses and prints, no more."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import click
+
+from fieldtwin.cli.device.device_options import logged
+from fieldtwin.cli.device.scan_progress import ScanProgress, duration
+from fieldtwin.cli.device.scan_view import can_json, modbus_json, show_can, show_modbus
+from fieldtwin.cli.options import Duration, json_option
+from fieldtwin.cli.stop_key import StopKey
+from fieldtwin.commissioning.access.connection import frame_of
+from fieldtwin.commissioning.scan.canopen import ALL_NODES, CanScan, CanScanner, CanScanOptions
+from fieldtwin.commissioning.scan.modbus import ModbusScan, ModbusScanner, ScanOptions
+from fieldtwin.commissioning.scan.settings import name_of, seconds_of, with_settings
+from fieldtwin.commissioning.scan.sweep import PROBE
+from fieldtwin.console import talk
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.wallclock import run as run_precise
+
+INTERRUPTED = 130
+_PART = re.compile(r"^([0-9]{1,3})(?:-([0-9]{1,3}))?$")
+
+
+@click.command("scan")
+@click.argument("endpoint")
+@click.option("--units", metavar="LIST", help="Modbus units, such as 1-20,247; default 1 to 247, on TCP 0 and 255 too.")
+@click.option("--nodes", metavar="LIST", help="CANopen nodes; default 1 to 127.")
+@click.option("--listen", "listen_only", is_flag=True, help="Only listen: send nothing.")
+@click.option("--listen-for", type=Duration(), help="How long to listen first; default 3s, on CAN 5s.")
+@click.option("--share-bus", is_flag=True, help="Ask although somebody talks on the wire: between its exchanges.")
+@click.option("--timeout", "timeout_s", type=Duration(), help="For each reply; default 600ms, TCP 1s, CAN 100ms.")
+@click.option(
+    "--rate", "per_s", type=click.FloatRange(0.1, 1000), help="Questions a second, at most; default 20, CAN 10."
+)
+@click.option("--quick", is_flag=True, help="Modbus: only the likely settings and units (30 s).")
+@click.option("--all", "every_setting", is_flag=True, help="Modbus: go on over all settings though units were found.")
+@click.option("--bitrate", type=click.IntRange(10_000, 1_000_000), help="CAN: bit/s that the bus should have.")
+@click.option("--no-lss", is_flag=True, help="CAN: do not look for nodes without a node id.")
+@click.option("--log", type=click.Path(dir_okay=False, path_type=Path), help="Keep all that is sent and received here.")
+@click.option("--dry-run", is_flag=True, help="Print what would be asked, with its time, and open nothing.")
+@json_option
+def command(endpoint: str, log: Path | None, dry_run: bool, as_json: bool, **options: Any) -> int:
+    """Find the units or nodes at ENDPOINT: listen first, then ask, paced.
+
+    \b
+    fieldtwin scan rtu:/dev/ttyUSB0                      likely settings, then all
+    fieldtwin scan 'rtu:COM5?baudrate=9600&frame=8N1'    every unit at these
+    fieldtwin scan tcp://192.168.0.7                     every unit id of a host
+    fieldtwin scan can:socketcan/can0                    heartbeats, 1000h, LSS
+
+    q or Ctrl-C stops and keeps what was found. Exit code 1: nobody was found.
+    """
+    can = Endpoint.parse(endpoint).is_can
+    _refuse_foreign(can, options)
+    if dry_run:
+        for line in _plan_of_can(options) if can else _plan_of_modbus(endpoint, options):
+            click.echo(line)
+        return 0
+    return _can(endpoint, log, as_json, options) if can else _modbus(endpoint, log, as_json, options)
+
+
+def _modbus(endpoint: str, log: Path | None, as_json: bool, options: dict[str, Any]) -> int:
+    result = run_precise(_scan_modbus(endpoint, log, options))
+    if as_json:
+        click.echo(json.dumps(modbus_json(result)))
+    else:
+        show_modbus(result)
+    found = bool(result.units or (result.heard is not None and result.heard.live))
+    return _end(found, result.stopped, result.took_s)
+
+
+def _can(endpoint: str, log: Path | None, as_json: bool, options: dict[str, Any]) -> int:
+    result = run_precise(_scan_can(endpoint, log, options))
+    if as_json:
+        click.echo(json.dumps(can_json(result)))
+    else:
+        show_can(result)
+    found = bool(result.nodes or result.unconfigured or result.heard.nodes)
+    return _end(found, result.stopped, result.took_s)
+
+
+def _end(found: bool, stopped: bool, took_s: float) -> int:
+    if stopped:
+        talk.print(f"stopped after {duration(took_s)}: the list is not complete")
+        return INTERRUPTED
+    return 0 if found else 1
+
+
+def _plan_of_modbus(endpoint: str, options: dict[str, Any]) -> Iterator[str]:
+    """Phases, settings, frames: for `--dry-run`."""
+    made = _modbus_options(options)
+    if Endpoint.parse(endpoint).is_serial:
+        yield f"listen for {duration(made.listen_s)}; with traffic heard nothing is sent" + (
+            ", but between its exchanges" if made.share_bus else " without --share-bus"
+        )
+    for phase, steps in ModbusScanner(endpoint, made).planned() if not made.listen_only else ():
+        yield f"{phase}: up to {duration(seconds_of(steps))}"
+        for step in steps:
+            url = str(with_settings(Endpoint.parse(endpoint), step.settings)) if step.settings else endpoint
+            first, last = (frame_of(url, step.units[i], PROBE).hex(" ") for i in (0, -1)) if step.units else ("", "")
+            where = f"{name_of(step.settings)}, " if step.settings else ""
+            yield f"  {where}{len(step.units)} units: {first} ... {last}"
+
+
+def _plan_of_can(options: dict[str, Any]) -> Iterator[str]:
+    made = _can_options(options)
+    yield f"listen for {duration(made.listen_s)}; with traffic heard nothing is sent" + (
+        "" if made.share_bus else " without --share-bus"
+    )
+    if not made.listen_only:
+        each_s = max(made.timeout_s + 0.01, 1 / made.per_s)
+        yield f"1000h of {len(made.nodes)} nodes: up to {duration(len(made.nodes) * each_s)}"
+        yield f"  {0x600 + made.nodes[0]:03X}#4000100000000000 ... {0x600 + made.nodes[-1]:03X}#4000100000000000"
+        if made.lss:
+            yield "nodes without an id: 7E5#4C00000000000000, then LSS fastscan, 14 s for each that is there"
+
+
+async def _scan_modbus(endpoint: str, log: Path | None, options: dict[str, Any]) -> ModbusScan:
+    made = _modbus_options(options)
+    with logged(log) as taps, StopKey() as stop, ScanProgress(stop.listens) as show:
+        return await ModbusScanner(endpoint, made, on_progress=show, stop=stop.pressed, taps=taps).run()
+
+
+async def _scan_can(endpoint: str, log: Path | None, options: dict[str, Any]) -> CanScan:
+    made = _can_options(options)
+    with logged(log) as taps, StopKey() as stop, ScanProgress(stop.listens) as show:
+        return await CanScanner(endpoint, made, on_progress=show, stop=stop.pressed, taps=taps).run()
+
+
+def _modbus_options(options: dict[str, Any]) -> ScanOptions:
+    return ScanOptions(
+        units=numbers(options["units"], 0, 255, "--units"),
+        timeout_s=options["timeout_s"],
+        per_s=options["per_s"] or 20.0,
+        listen_s=3.0 if options["listen_for"] is None else options["listen_for"],
+        quick_only=options["quick"],
+        listen_only=options["listen_only"],
+        every_setting=options["every_setting"],
+        share_bus=options["share_bus"],
+    )
+
+
+def _can_options(options: dict[str, Any]) -> CanScanOptions:
+    return CanScanOptions(
+        bitrate=options["bitrate"] or 0,
+        nodes=numbers(options["nodes"], 1, 127, "--nodes") or ALL_NODES,
+        listen_s=5.0 if options["listen_for"] is None else options["listen_for"],
+        timeout_s=options["timeout_s"] or 0.1,
+        per_s=options["per_s"] or 10.0,
+        lss=not options["no_lss"],
+        listen_only=options["listen_only"],
+        share_bus=options["share_bus"],
+    )
+
+
+def numbers(text: str | None, low: int, high: int, name: str) -> tuple[int, ...] | None:
+    """``1-20,247`` as numbers, each once, in order. Raises `UsageError`."""
+    if text is None:
+        return None
+    found: list[int] = []
+    for part in text.split(","):
+        match = _PART.match(part.strip())
+        first = int(match[1]) if match else -1
+        last = int(match[2] or match[1]) if match else -1
+        if not low <= first <= last <= high:
+            raise UsageError(f"cannot read {name}", expected=f"{low} to {high}, such as 1-20,47", got=repr(text))
+        found += range(first, last + 1)
+    return tuple(dict.fromkeys(found))
+
+
+def _refuse_foreign(can: bool, options: dict[str, Any]) -> None:
+    """What belongs to the other protocol."""
+    foreign = ("units", "quick", "every_setting") if can else ("nodes", "bitrate", "no_lss")
+    names = {"every_setting": "--all"}
+    given = [names.get(n, "--" + n.replace("_", "-")) for n in foreign if options[n]]
+    if given:
+        raise UsageError(f"{', '.join(given)}: not {'on a CAN bus' if can else 'of Modbus'}")

@@ -1,0 +1,227 @@
+"""`fieldtwin write`: set values of one device, with care. Parses, asks and prints, no more."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.text import Text
+
+from fieldtwin.cli.device.device_options import device_options, logged, raw_form, raw_options, target_from
+from fieldtwin.cli.options import Duration, json_option
+from fieldtwin.commissioning.access import writing
+from fieldtwin.commissioning.access.address import of_behaviour, tags_of, with_care
+from fieldtwin.commissioning.access.connection import frame_of, modbus_at
+from fieldtwin.commissioning.access.point import Answer, Point, decoded
+from fieldtwin.commissioning.access.reading import Target, dry_point, point_at, text_of
+from fieldtwin.commissioning.access.writing import Write, Written
+from fieldtwin.console import data, talk
+from fieldtwin.gateway.core.errors import FieldtwinError, NotAllowed, ReplyTimeout, UsageError
+from fieldtwin.gateway.core.files.profile import Tag
+from fieldtwin.gateway.protocols.modbus.diagnostics import Diagnostics
+from fieldtwin.gateway.wallclock import run as run_precise
+
+RESTART_COMMUNICATIONS = 1
+
+
+@click.command("write")
+@click.argument("endpoint")
+@click.argument("items", nargs=-1, metavar="ITEM=VALUE...")
+@device_options
+@raw_options
+@click.option(
+    "--behaviour", "behaviours", multiple=True, metavar="NAME", help="The writes that the profile has under a name."
+)
+@click.option("--yes", is_flag=True, help="Do not ask.")
+@click.option("--restore", is_flag=True, help="Put the old values back afterwards.")
+@click.option("--hold", "hold_s", type=Duration(), default="0s", help="With --restore: how long the new values stay.")
+@click.option("--blind", is_flag=True, help="Write even where the old value cannot be read.")
+@click.option(
+    "--i-know", is_flag=True, help="Leave for what hits more than this value: unit 0, `danger` tags, restarts."
+)
+@click.option("--restart-communications", "restart", is_flag=True, help="Modbus: function 08h/01h instead of a value.")
+@click.option("--dry-run", is_flag=True, help="Print the frames that would be sent, and send nothing.")
+@json_option
+def command(
+    endpoint: str,
+    items: tuple[str, ...],
+    behaviours: tuple[str, ...],
+    log: Path | None,
+    yes: bool,
+    restore: bool,
+    hold_s: float,
+    blind: bool,
+    i_know: bool,
+    restart: bool,
+    dry_run: bool,
+    as_json: bool,
+    **options: Any,
+) -> int:
+    """Write ITEMs of the device at ENDPOINT: read, ask, write once, read back, compare.
+
+    VALUE is a number, the name that the profile has for one, on/off, or hex:BYTES. Ctrl-C during --hold restores.
+
+    \b
+    fieldtwin write tcp://192.168.0.7 holding:100=42
+    fieldtwin write rtu:/dev/ttyUSB0 --profile eastron-sdm630 demand_period=15 --yes
+    fieldtwin write can:socketcan/can0 --node 5 6060h:00=1 --type int8 --restore --hold 10s
+    fieldtwin write can:socketcan/can0 --node 5 --profile drive-cia402 --behaviour quick_stop
+    """
+    target = target_from(endpoint, options)
+    items = (*(item for name in behaviours for item in of_behaviour(name, target.profile)), *items)
+    if restart:
+        return _restart(target, items, log, i_know=i_know, yes=yes, dry_run=dry_run)
+    writes = writing.plan_writes(_pairs(items, target, options), i_know=i_know, restore=restore)
+    dry = dry_point(target)
+    writing.check_broadcast(dry, i_know=i_know)
+    if dry_run:
+        for write in writes:
+            for frame in dry.write_frames(write.tag, write.data):
+                click.echo(frame)
+        return 0
+    if not yes and not sys.stdin.isatty():
+        raise NotAllowed("nobody to ask whether to write", expected="--yes")
+    done = run_precise(_write(target, writes, log, yes=yes, hold_s=hold_s if restore else None, blind=blind))
+    if as_json:
+        click.echo(json.dumps([_row(w) for w in done]))
+    else:
+        for written in done:
+            data.print(_told(written))
+    return 0
+
+
+def _pairs(items: tuple[str, ...], target: Target, options: dict[str, Any]) -> list[tuple[Tag, str]]:
+    if not items:
+        raise UsageError("nothing to write", expected="ITEM=VALUE, such as holding:100=42")
+    pairs: list[tuple[Tag, str]] = []
+    for item in items:
+        name, equals, value = item.partition("=")
+        if not equals or not value:
+            raise UsageError(f"cannot read {item!r}", expected="ITEM=VALUE, such as holding:100=42")
+        tags = tags_of([name], target.protocol, raw_form(options), target.profile, target.dictionary)
+        if len(tags) != 1:
+            raise UsageError(f"{name!r} means {len(tags)} values", expected="one, each with a value of its own")
+        pairs.append((with_care(tags[0], target.profile), value))
+    return pairs
+
+
+async def _write(
+    target: Target, writes: Sequence[Write], log: Path | None, *, yes: bool, hold_s: float | None, blind: bool
+) -> list[Written]:
+    with logged(log) as taps:
+        async with point_at(target, taps=taps) as point:
+            old = [None if blind else await writing.before(point, w) for w in writes]
+            if hold_s is not None and None in old:
+                raise NotAllowed("what cannot be read cannot be put back", expected="no --restore")
+            _show(writes, old)
+            if not yes and not click.confirm("Write?", default=False, err=True):
+                raise click.Abort
+            return await _carry_out(point, writes, old, hold_s)
+
+
+async def _carry_out(
+    point: Point, writes: Sequence[Write], old: Sequence[Answer | None], hold_s: float | None
+) -> list[Written]:
+    """All writes, in order. With `hold_s` what was written is put back, also where one of them failed or somebody stopped it."""
+    done: list[Written] = []
+    try:
+        for write, before in zip(writes, old, strict=True):
+            # Until it is known what came of it, it was written.
+            done.append(Written(write, before.value.raw if before is not None else None, None))
+            done[-1] = await writing.carry_out(point, write, before)
+        if hold_s is not None:
+            talk.print(f"written; the old values come back in {hold_s:g} s")
+            await asyncio.sleep(hold_s)
+    except BaseException:
+        told = done[:-1] if hold_s is None else await _put_back(point, done)
+        for written in told:
+            talk.print(Text("" if hold_s is not None else "before that: ") + _told(written), soft_wrap=True)
+        raise
+    return done if hold_s is None else await _put_back(point, done)
+
+
+async def _put_back(point: Point, done: list[Written]) -> list[Written]:
+    """The last one first, and each of them, whatever comes of the others."""
+    back: list[Written] = []
+    failed: FieldtwinError | None = None
+    for written in reversed(done):
+        try:
+            back.insert(0, await writing.restore(point, written))
+        except FieldtwinError as e:
+            talk.print(Text(f"{written.write.tag.name} was not put back: {e}", "red"), soft_wrap=True)
+            failed = failed or e
+    if failed is not None:
+        raise failed
+    return back
+
+
+def _show(writes: Sequence[Write], old: Sequence[Answer | None]) -> None:
+    for write, before in zip(writes, old, strict=True):
+        was = text_of(write.tag, before) if before is not None else "(not read)"
+        line = Text.assemble((write.tag.name, "bold"), f": {was} → {_new(write)} {write.tag.unit}".rstrip())
+        talk.print(line, soft_wrap=True)
+        for warning in write.warnings:
+            talk.print(Text(f"  {warning}", "yellow"), soft_wrap=True)
+
+
+def _new(write: Write) -> str:
+    return text_of(write.tag, Answer(decoded(write.tag, write.data, 1)))
+
+
+def _held(tag: Tag, raw: bytes | None) -> str:
+    return "(not read)" if raw is None else text_of(tag, Answer(decoded(tag, raw, 1)))
+
+
+def _told(written: Written) -> Text:
+    tag = written.write.tag
+    if written.restored:
+        return Text(f"{tag.name}: {_held(tag, written.after)} again")
+    if written.same:
+        return Text(f"{tag.name}: {_held(tag, written.after)} already, nothing was written")
+    if written.after is None:
+        return Text(f"{tag.name}: written, and cannot be read back")
+    return Text(f"{tag.name}: {_held(tag, written.before)} → {_held(tag, written.after)}, read back")
+
+
+def _row(written: Written) -> dict[str, Any]:
+    tag, secret = written.write.tag, written.write.tag.secret
+    return {
+        "name": tag.name,
+        "before": None if written.before is None or secret else written.before.hex(),
+        "after": None if written.after is None or secret else written.after.hex(),
+        "verified": written.after is not None,
+        "written": not written.same,
+        "restored": written.restored,
+    }
+
+
+def _restart(target: Target, items: Sequence[str], log: Path | None, *, i_know: bool, yes: bool, dry_run: bool) -> int:
+    """Function 08h, sub-function 01h: the unit's port starts anew, its counters are cleared (AP 6.8.1)."""
+    if items or target.protocol != "modbus":
+        raise UsageError("--restart-communications stands alone, for a Modbus unit")
+    request = Diagnostics(RESTART_COMMUNICATIONS)
+    if dry_run:
+        click.echo(frame_of(target.url, target.address, request).hex(" "))
+        return 0
+    if not i_know:
+        raise NotAllowed("a restart clears counters and may lose contact", expected="--i-know")
+    if not yes and not (sys.stdin.isatty() and click.confirm("Restart its communications?", default=False, err=True)):
+        raise NotAllowed("not restarted", expected="--yes")
+
+    async def send() -> bool:
+        with logged(log) as taps:
+            async with modbus_at(target.url, timeout_s=target.timeout_s, echo=target.echo, taps=taps) as client:
+                try:
+                    await client.execute(target.address, request)
+                except ReplyTimeout:
+                    return False  # a unit in listen-only mode restarts without a word (AP 6.8.1)
+                return True
+
+    answered = run_precise(send())
+    data.print("restarted" if answered else "sent; no reply, as from a unit that was in listen-only mode")
+    return 0

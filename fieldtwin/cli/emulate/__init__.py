@@ -1,0 +1,1 @@
+"""Commands that emulate devices, buses and links, and list the faults."""

@@ -1,0 +1,117 @@
+"""`fieldtwin bridge`: Modbus TCP clients to units on a serial line, or the other way round, in one command."""
+
+from __future__ import annotations
+
+import json
+import sys
+
+import click
+
+from fieldtwin.cli.options import Duration, json_option, pairs
+from fieldtwin.console import talk
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.runtime.bridge.policy import LOOPBACK, network
+from fieldtwin.gateway.wallclock import run
+from fieldtwin.run.live.bridge import BridgeOptions, run_bridge
+
+ANYWHERE = ("127.0.0.1", "::1", "localhost", "")
+
+
+@click.command("bridge")
+@click.argument("listen")
+@click.argument("target")
+@click.option(
+    "--allow", "networks", multiple=True, metavar="NETWORK", help="Who may connect; default: this host. Repeatable."
+)
+@click.option("--allow-writes", is_flag=True, help="Pass on every function; without it, those that only read.")
+@click.option(
+    "--unit", "units", multiple=True, metavar="UNIT=UNIT", help="A client's unit id = the target's. Repeatable."
+)
+@click.option(
+    "--timeout", "timeout_s", type=Duration(), default="1s", show_default=True, help="How long a unit may take."
+)
+@click.option(
+    "--retries", type=click.IntRange(0, 10), default=1, show_default=True, help="Of reads that nobody answered."
+)
+@click.option("--cache", "cache_s", type=Duration(), default="0", help="Answer reads from replies at most this old.")
+@click.option("--clients", type=click.IntRange(1, 1000), default=16, show_default=True, help="Connections at a time.")
+@click.option("--queue", type=click.IntRange(1, 64), default=32, show_default=True, help="Requests that may wait.")
+@click.option("--broadcast", is_flag=True, help="Pass unit 0 on to the line; nobody answers.")
+@click.option("--answer-broadcast", is_flag=True, help="The same, and tell the client that it went out.")
+@click.option("--pause", "pause_s", type=Duration(), default="0", help="Between one exchange and the next on TARGET.")
+@click.option("--echo", is_flag=True, help="Serial TARGET: the adapter returns what is sent (RS-485).")
+@click.option("--idle", "idle_s", type=Duration(), default="0", help="Close clients that were silent for so long.")
+@click.option(
+    "--role", "roles", multiple=True, metavar="ROLE", help="tls: only clients whose certificate says so. Repeatable."
+)
+@click.option("--instance", default="", help="Name of the run directory, where the audit log is.")
+@json_option
+def command(
+    listen: str,
+    target: str,
+    networks: tuple[str, ...],
+    allow_writes: bool,
+    units: tuple[str, ...],
+    timeout_s: float,
+    retries: int,
+    cache_s: float,
+    clients: int,
+    queue: int,
+    broadcast: bool,
+    answer_broadcast: bool,
+    pause_s: float,
+    echo: bool,
+    idle_s: float,
+    roles: tuple[str, ...],
+    instance: str,
+    as_json: bool,
+) -> int:
+    """Let the clients of LISTEN reach the units behind TARGET.
+
+    \b
+    fieldtwin bridge tcp://0.0.0.0:502 "rtu:/dev/ttyUSB0?baudrate=9600&frame=8N1" --allow 10.0.0.0/24
+    fieldtwin bridge "tls://0.0.0.0:802?cert=us.pem&key=us.key&ca=clients.pem" rtu:/dev/ttyUSB0 --allow 0.0.0.0/0
+    fieldtwin bridge "rtu:/dev/ttyS1?baudrate=19200" tcp://plc:502 --unit 1=255     a master on a line asks a TCP device
+
+    Read-only and for this host, unless told otherwise. Unknown units are refused with exception 0A, silent ones with 0B, and
+    those are then left alone for a while.
+    """
+    here = Endpoint.parse(listen)
+    if roles and here.scheme != "tls":
+        raise UsageError("roles are in clients' certificates", expected="tls://HOST:PORT", got=listen)
+    options = BridgeOptions(
+        listen=here,
+        target=Endpoint.parse(target),
+        networks=tuple(network(text) for text in networks) or LOOPBACK,
+        allow_writes=allow_writes,
+        units=tuple((_unit(a), _unit(b)) for a, b in pairs(units, "--unit").items()),
+        timeout_s=timeout_s,
+        retries=retries,
+        cache_ms=round(1000 * cache_s),
+        clients=clients,
+        queue=queue,
+        broadcast=broadcast,
+        answer_broadcast=answer_broadcast,
+        pause_s=pause_s,
+        echo=echo,
+        idle_s=idle_s,
+        roles=frozenset(roles) or None,
+        instance=instance,
+    )
+    if not networks and options.listen.host not in ANYWHERE:
+        talk.print("only clients of this host may ask; --allow NETWORK lets others in")
+    result = run(run_bridge(options, lambda text: talk.print(text, soft_wrap=True, markup=False)))
+    if as_json:
+        json.dump(result, sys.stdout, indent=2)
+        sys.stdout.write("\n")
+    else:
+        counted = ", ".join(f"{k} {v}" for k, v in result["target"].items() if v)
+        talk.print(f"{result['requests']} requests" + (f": {counted}" if counted else ""))
+    return 0
+
+
+def _unit(text: str) -> int:
+    if not text.isascii() or not text.isdigit() or int(text) > 255:
+        raise UsageError("a unit id", expected="0 to 255", got=repr(text))
+    return int(text)

@@ -1,0 +1,83 @@
+"""`fieldtwin faults`: which faults there are, where they can be put, and what they can be told."""
+
+from __future__ import annotations
+
+import json
+import sys
+from typing import Any
+
+import click
+from rich.table import Table
+
+from fieldtwin.cli.options import json_option
+from fieldtwin.console import data
+from fieldtwin.emulators.faults.fault import Fault
+
+
+@click.command("faults")
+@click.argument("names", nargs=-1)
+@json_option
+def command(names: tuple[str, ...], as_json: bool) -> int:
+    """List the faults, or say all of NAMES: of `exception` and `sdo-abort` the codes that the standards know as well.
+
+    A fault file is `faults: [{name: silence, device: ctd, from: 5s, until: 12s}]`, for `fieldtwin run --prototype --faults
+    FILE`, `fieldtwin emulate DEVICE --faults FILE` and `fieldtwin link --faults FILE`. What every fault takes: id, bus or
+    device, unit, function, address or register, registers, cob_id, direction (request, reply, both), nth, every,
+    from, until, probability.
+    """
+    from fieldtwin.emulators.faults.registry import FAULTS, fault_class
+
+    chosen = [fault_class(name) for name in names] or list(FAULTS.values())
+    described = [_described(kind) for kind in chosen]
+    if as_json:
+        json.dump(described, sys.stdout, indent=2)
+        sys.stdout.write("\n")
+        return 0
+    for on in dict.fromkeys(d["on"] for d in described):
+        table = Table(title=on, title_justify="left", title_style="bold", box=None, show_header=False, pad_edge=False)
+        table.add_column(no_wrap=True)
+        table.add_column()
+        for d in described:
+            if d["on"] == on:
+                table.add_row(d["name"], _told(d, codes=bool(names)))
+        data.print(table)
+        data.print()
+    return 0
+
+
+def _described(kind: type[Fault]) -> dict[str, Any]:
+    """A fault as JSON; its parameters as JSON schema has them."""
+    from fieldtwin.emulators.faults.schema import aims_of
+
+    own = kind.form.model_json_schema().get("properties", {})
+    for parameter in own.values():
+        parameter.pop("title", None)
+    ways = sorted(way.value for way in kind.ways)
+    return {
+        "name": kind.name,
+        "on": kind.kind.value,
+        "summary": kind.summary,
+        "direction": ways,
+        "aims": aims_of(kind),
+        "parameters": own,
+        **({"codes": {_code(code): text for code, text in kind.codes.items()}} if kind.codes else {}),
+    }
+
+
+def _told(described: dict[str, Any], *, codes: bool) -> str:
+    own = ", ".join(f"{name}: {_number(p['default'])}" for name, p in described["parameters"].items())
+    known = "".join(f"\n{code}  {text}" for code, text in described.get("codes", {}).items()) if codes else ""
+    return f"{described['summary']}" + (f" [dim]({own})[/dim]" if own else "") + known
+
+
+def _code(code: int) -> str:
+    return f"0x{code:08X}" if code > 0xFF else str(code)
+
+
+def _number(value: float | str | None) -> str:
+    """Codes, which are large, as everybody writes them."""
+    if value is None:
+        return "by the tag's type"
+    if isinstance(value, str | bool):
+        return json.dumps(value)
+    return f"0x{value:X}" if isinstance(value, int) and value >= 0x1000 else f"{value:g}"

@@ -1,0 +1,141 @@
+"""`fieldtwin link`: the emulated connection on its own, socat-compatible."""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+from collections.abc import Callable
+from contextlib import AsyncExitStack
+from pathlib import Path
+from typing import Any
+
+import click
+
+from fieldtwin.console import talk
+from fieldtwin.emulators.can_link import CanLink
+from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
+from fieldtwin.emulators.endpoints.can_end import open_can_end
+from fieldtwin.emulators.faults.engine import WireFaults
+from fieldtwin.emulators.faults.frames import Framing, Way
+from fieldtwin.emulators.faults.on_link import check_can_link, check_link, wire_faults
+from fieldtwin.emulators.faults.schema import FaultSpec, load_faults
+from fieldtwin.emulators.link import run_link
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.connection import CanConnection
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.run.emulate.fault_counts import struck
+
+BITRATE = 125_000
+"""Of a bus that the link runs itself, where its endpoint does not say ``bitrate=``."""
+
+
+@click.command("link")
+@click.argument("near")
+@click.argument("far")
+@click.option(
+    "--faults",
+    "faults_file",
+    type=click.Path(exists=True, dir_okay=False),
+    help="Put these faults on it (fieldtwin faults).",
+)
+@click.option(
+    "--framing",
+    type=click.Choice([framing.value for framing in Framing]),
+    default="rtu",
+    help="With --faults: how frames look on it; default: rtu.",
+)
+@click.option("--seed", type=int, default=1, help="With --faults: of what is left to chance; default: 1.")
+def command(near: str, far: str, faults_file: str | None, framing: str, seed: int) -> int:
+    """Carry a serial line over TCP, byte for byte: a port at NEAR, its line at FAR. With --faults, what goes wrong between
+    any two: sockets, serial lines, CAN buses.
+
+    NEAR and FAR are endpoints; a plain path is a virtual serial port that is made there. Interoperates with
+    `socat pty,raw,echo=0,link=PATH tcp:HOST:PORT` on either side.
+
+    \b
+    fieldtwin link /tmp/line1 tcp://field:4001            a port here, the device's line there
+    fieldtwin link rtu:/dev/ttyUSB0 "tcp://0.0.0.0:4001?listen=1"    a real port, offered to others
+    fieldtwin link --faults noisy.yaml /tmp/line1 tcp://plc:4001     the same, with what goes wrong on lines
+    fieldtwin link --faults noisy.yaml /tmp/master /tmp/device       between two programs with serial ports
+    fieldtwin link --faults lost.yaml "can:fieldtwin/127.0.0.1:29540?listen=1" can:socketcan/can0    masters here, nodes there
+    fieldtwin link --faults bad.yaml --framing mqtt "tcp://127.0.0.1:1884?listen=1" tcp://broker:1883      a bad way to a broker
+    """
+    ends = _endpoint(near), _endpoint(far)
+    on_can = any(end.is_can for end in ends)
+    if on_can and not (all(end.is_can for end in ends) and faults_file):
+        raise UsageError(f"{near} and {far}: a link of CAN buses has two of them, and faults", expected="--faults FILE")
+    check = check_can_link if on_can else check_link
+    said = load_faults(Path(faults_file), check) if faults_file else ()
+    return asyncio.run(_run(*ends, said, Framing.RAW if on_can else Framing(framing), seed, check))
+
+
+def _endpoint(text: str) -> Endpoint:
+    if "/" in text and ":" not in text:
+        if Path(text).is_char_device() and not Path(text).is_symlink():
+            raise UsageError(f"{text} is a real port", expected=f"rtu:{text}")
+        return Endpoint("pty", path=text)
+    return Endpoint.parse(text)
+
+
+async def _run(
+    near: Endpoint,
+    far: Endpoint,
+    said: tuple[dict[str, Any], ...],
+    framing: Framing,
+    seed: int,
+    check: Callable[[FaultSpec], None],
+) -> int:
+    loop = asyncio.get_running_loop()
+    faults = wire_faults(said, framing, seed, round(loop.time() * NS_PER_S), check) if said else None
+    put_in = tuple(faults.active.values()) if faults is not None else ()
+    stop = asyncio.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, stop.set)
+    linking = asyncio.create_task(_can(near, far, faults) if near.is_can and faults else _bytes(near, far, faults))
+    stopping = asyncio.create_task(stop.wait())
+    try:
+        await asyncio.wait([linking, stopping], return_when=asyncio.FIRST_COMPLETED)
+        if linking.done():
+            linking.result()
+    finally:
+        for task in (linking, stopping):
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
+        for active in put_in:
+            talk.print(struck(active), soft_wrap=True, markup=False)
+    return 0
+
+
+async def _bytes(near: Endpoint, far: Endpoint, faults: WireFaults | None) -> None:
+    await run_link(
+        near,
+        far,
+        on_event=lambda text: talk.print(text, soft_wrap=True, markup=False),
+        on_ready=lambda link: talk.print(f"{near}  ⇄  {far}", soft_wrap=True, markup=False),
+        faults=faults,
+    )
+
+
+async def _can(near: Endpoint, far: Endpoint, faults: WireFaults) -> None:
+    async with AsyncExitStack() as closing:
+        link = CanLink(await _can_end(near, closing), await _can_end(far, closing), faults)
+        closing.push_async_callback(link.aclose)
+        link.start()
+        talk.print(f"{near}  ⇄  {far}", soft_wrap=True, markup=False)
+        try:
+            raise await asyncio.shield(link.ended)
+        finally:
+            to, back = link.passed[Way.REQUEST], link.passed[Way.REPLY]
+            talk.print(f"{to} frames to {far}, {back} back, {link.lost} lost", soft_wrap=True, markup=False)
+
+
+async def _can_end(endpoint: Endpoint, closing: AsyncExitStack) -> CanConnection:
+    """Join a bus; with ``?listen=1`` run one, where others join."""
+    if endpoint.param("listen") not in ("1", "true"):
+        end = await open_can_end(endpoint, 0)
+        closing.push_async_callback(end.aclose)
+        return end
+    bus = await SoftBusServer.open(endpoint, int(endpoint.param("bitrate") or BITRATE), paced=True)
+    closing.push_async_callback(bus.aclose)
+    return bus.attach("link")

@@ -1,0 +1,363 @@
+"""`fieldtwin compare`: does a device do what a recording says? Parses and prints, no more."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import signal
+import sys
+from collections.abc import Callable, Coroutine
+from contextlib import suppress
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.table import Table
+
+from fieldtwin.capture.formats.candump import read_log
+from fieldtwin.capture.recordings.comparing import Comparer, Comparison, Rules, Tolerance, pairs_of, request_of
+from fieldtwin.capture.recordings.comparing_can import Frames, compare_logs
+from fieldtwin.capture.recordings.rotating_file import exchanges_of, header_of, parts_of
+from fieldtwin.cli.device.device_options import device_options, logged, target_from
+from fieldtwin.cli.options import Duration, json_option, pairs
+from fieldtwin.commissioning.record.asking import asker_at, changes, frame_for
+from fieldtwin.commissioning.record.comparing import compare_device, compare_node, uploads_of
+from fieldtwin.console import data, talk
+from fieldtwin.gateway.core.endpoint import SCHEMES
+from fieldtwin.gateway.core.errors import FileInvalid, NotAllowed, UsageError
+from fieldtwin.gateway.core.files.profile import DeviceProfile, load_profile
+from fieldtwin.gateway.core.files.recording import shown
+from fieldtwin.gateway.protocols.canopen.sdo import SdoUpload
+from fieldtwin.gateway.wallclock import run as run_precise
+from fieldtwin.reports.site.about import headed
+from fieldtwin.twin.site.data_files import find
+
+SHOWN = 20
+INCONCLUSIVE = 4
+"""Nothing that could be compared differs, but not everything could be compared."""
+
+
+@click.command("compare")
+@click.argument("recording", type=click.Path(dir_okay=False, path_type=Path))
+@click.argument("other")
+@click.option(
+    "--tolerance",
+    "tolerances",
+    multiple=True,
+    metavar="[TAG=]AMOUNT",
+    help="What values may differ by, e.g. 2 or 1% or frequency=0.05; repeatable. Default: not at all.",
+)
+@click.option(
+    "--latency",
+    default="20ms/50%",
+    show_default=True,
+    metavar="AMOUNT",
+    help="What median and 90 % of the latencies may differ by, whichever of the two is more; `any`: not judged.",
+)
+@click.option(
+    "--least",
+    type=click.FloatRange(0, 100),
+    default=100.0,
+    show_default=True,
+    metavar="PERCENT",
+    help="How many of the exchanges have to be alike.",
+)
+@click.option(
+    "--most", type=click.IntRange(1), default=None, help="A live device: ask only the first so many requests."
+)
+@click.option(
+    "--listen", "listen_s", type=Duration(), default="0s", help="A live bus: listen so long, compare messages too."
+)
+@click.option(
+    "--spacing", "spacing_s", type=Duration(), default="0s", help="A live device: pause behind every exchange."
+)
+@click.option("--writes", is_flag=True, help="A live device: make the recorded writes again, too. Asks first.")
+@click.option("--yes", is_flag=True, help="With --writes: do not ask.")
+@click.option("--i-know", is_flag=True, help="With --writes: broadcasts and restarts (FC08) too.")
+@click.option("--dry-run", is_flag=True, help="A live device: print the frames that would be sent, and send nothing.")
+@click.option("--all", "everything", is_flag=True, help=f"Show all differences, not only the first {SHOWN}.")
+@device_options
+@json_option
+def command(recording: Path, other: str, as_json: bool, everything: bool, **options: Any) -> int:
+    """Hold OTHER, a device at an endpoint or another recording, against RECORDING: the same requests, the same outcomes?
+
+    \b
+    fieldtwin compare meter.jsonl rtu:/dev/ttyUSB0 --profile eastron-sdm630 --tolerance 2%
+    fieldtwin compare meter.jsonl emulated.jsonl
+    fieldtwin compare drive.log can:socketcan/can0 --node 5 --listen 10s
+
+    Prints fidelity: the share of exchanges that are alike (values), and how near the latencies are (timing). Exit code 1
+    when it is not met, 4 when too much could not be compared. A device is only read, unless --writes.
+    """
+    rules = Rules(*_tolerances(options["tolerances"]), _latency(options["latency"]), options["least"] / 100)
+    live = other.partition(":")[0].lower() in SCHEMES and not Path(other).is_file()
+    if not live and (options["writes"] or options["dry_run"]):
+        raise UsageError("--writes and --dry-run are for a live device")
+    if options["dry_run"]:
+        return _dry(recording, other, options)
+    if recording.suffix == ".log":
+        result = _live_can(recording, other, rules, options) if live else _logs(recording, Path(other), rules, options)
+    else:
+        result = _live(recording, other, rules, options) if live else _files(recording, Path(other), rules, options)
+    if as_json:
+        json.dump(
+            _headed(recording, other, live, options)
+            | asdict(result)
+            | {
+                "values": result.values if result.compared else None,
+                "met": result.met,
+                "inconclusive": result.inconclusive,
+            },
+            sys.stdout,
+        )
+        sys.stdout.write("\n")
+    else:
+        _show(result, recording, other, everything)
+    return 0 if result.met else INCONCLUSIVE if result.inconclusive else 1
+
+
+def _headed(recording: Path, other: str, live: bool, options: dict[str, Any]) -> dict[str, Any]:
+    """Which device was compared with what: `fieldtwin report` reads it."""
+    can = recording.suffix == ".log"
+    address = options["node"] if can else options["unit"]
+    if address is None and not can:
+        address = next((exchange.unit for exchange in exchanges_of(recording)), 0)
+    endpoint, device = (other, "") if live else ("", Path(other).name)
+    return headed("compare", "canopen" if can else "modbus", endpoint, address or 0, recording.name, device=device)
+
+
+def _dry(recording: Path, url: str, options: dict[str, Any]) -> int:
+    """The frames of what would be asked, as often as it would be."""
+    target = target_from(url, options)
+    asked = 0
+    if recording.suffix == ".log":
+        for exchange in uploads_of(_frames(recording), options["node"]):
+            if not options["most"] or asked < options["most"]:
+                asked += 1
+                span = exchange.spans[0]
+                click.echo(str(SdoUpload(exchange.unit, span.address, span.subindex, 0).start(0)))
+        return 0
+    for e in exchanges_of(recording):
+        if (changes(e.request) and not options["writes"]) or (options["most"] and asked >= options["most"]):
+            continue
+        frame = frame_for(target.url, e.unit if options["unit"] is None else options["unit"], e.request)
+        if frame is not None:
+            asked += 1
+            click.echo(frame.hex(" "))
+    return 0
+
+
+# -- what may differ ----------------------------------------------------------------------------------------------------
+
+
+def _tolerances(texts: tuple[str, ...]) -> tuple[Tolerance, dict[str, Tolerance]]:
+    plain = [t for t in texts if "=" not in t]
+    named = pairs(tuple(t for t in texts if "=" in t), "--tolerance")
+    if len(plain) > 1:
+        raise UsageError("one tolerance for all, others by tag", got=", ".join(plain))
+    return (_tolerance(plain[0]) if plain else Tolerance()), {tag: _tolerance(text) for tag, text in named.items()}
+
+
+def _tolerance(text: str) -> Tolerance:
+    try:
+        if text.endswith("%"):
+            return Tolerance(share=_positive(text[:-1]) / 100)
+        return Tolerance(_positive(text))
+    except ValueError:
+        raise UsageError("cannot read a tolerance", expected="a number such as 2, or 1%", got=text) from None
+
+
+def _positive(text: str) -> float:
+    value = float(text)
+    if not 0 <= value < 1e300:
+        raise ValueError
+    return value
+
+
+def _latency(text: str) -> Tolerance | None:
+    if text == "any":
+        return None
+    absolute = share = 0.0
+    for part in text.split("/"):
+        if part.endswith("%"):
+            share = _tolerance(part).share
+        else:
+            absolute = float(Duration().convert(part, None, None))
+    return Tolerance(absolute, share)
+
+
+# -- the four cases -----------------------------------------------------------------------------------------------------
+
+
+def _profile(options: dict[str, Any]) -> DeviceProfile | None:
+    name = options["profile_name"]
+    return load_profile(find("devices", name, extra=[Path(p) for p in options["profiles"]])) if name else None
+
+
+def _files(recording: Path, other: Path, rules: Rules, options: dict[str, Any]) -> Comparison:
+    for path in (recording, other):
+        _expect_exchanges(path)
+    comparer, unit = Comparer(rules, _profile(options)), options["unit"]
+    mine, theirs = ((e for e in exchanges_of(p) if unit in (None, e.unit)) for p in (recording, other))
+    for one, two in pairs_of(mine, theirs, request_of):
+        comparer.add(one, two)
+    return comparer.result()
+
+
+def _live(recording: Path, url: str, rules: Rules, options: dict[str, Any]) -> Comparison:
+    _expect_exchanges(recording)
+    target = target_from(url, options)
+    if target.protocol != "modbus":
+        raise UsageError(f"{recording.name} is of a Modbus device", got=url)
+    if options["writes"]:
+        _allow_writes(recording, url, options)
+    comparer = Comparer(rules, target.profile)
+
+    async def work(stop: asyncio.Event, progress: Callable[[int], None]) -> None:
+        with logged(options["log"]) as taps:
+            async with asker_at(
+                target.url,
+                timeout_s=target.timeout_s,
+                spacing_s=options["spacing_s"],
+                echo=target.echo,
+                taps=tuple(taps),
+            ) as asker:
+                await compare_device(
+                    exchanges_of(recording), asker, comparer, unit=options["unit"], writes=options["writes"],
+                    wearing=_wearing(target.profile),
+                    most=options["most"] or 0, stop=stop, progress=progress,
+                )  # fmt: skip
+
+    _run(work)
+    return comparer.result()
+
+
+def _logs(recording: Path, other: Path, rules: Rules, options: dict[str, Any]) -> Comparison:
+    nodes = () if options["node"] is None else (options["node"],)
+    return compare_logs(_frames(recording), _frames(other), rules, profile=_profile(options), nodes=nodes)
+
+
+def _live_can(recording: Path, url: str, rules: Rules, options: dict[str, Any]) -> Comparison:
+    target = target_from(url, options)
+    if target.protocol != "canopen":
+        raise UsageError(f"{recording.name} is of a CAN bus", got=url)
+    if options["writes"]:
+        raise UsageError("--writes is for Modbus")
+    found: list[Comparison] = []
+
+    async def work(stop: asyncio.Event, progress: Callable[[int], None]) -> None:
+        with logged(options["log"]) as taps:
+            result = await compare_node(
+                lambda: _frames(recording), target, rules, node=options["node"], most=options["most"] or 0,
+                listen_s=options["listen_s"], taps=taps, stop=stop, progress=progress,
+            )  # fmt: skip
+        found.append(result)
+
+    _run(work)
+    return found[0]
+
+
+def _frames(path: Path) -> Frames:
+    for part in parts_of(path):
+        yield from ((t_ns, frame) for t_ns, _, frame in read_log(part))
+
+
+def _expect_exchanges(path: Path) -> None:
+    if header_of(path).kind != "exchanges":
+        raise FileInvalid("a recording of signals holds no requests", path=str(path), expected="one of exchanges")
+
+
+def _allow_writes(recording: Path, url: str, options: dict[str, Any]) -> None:
+    """A write to a plant is asked for once, with what it would be."""
+    writes = [e for e in exchanges_of(recording) if changes(e.request)]
+    dangerous = [e for e in writes if e.unit == 0 or e.request[0] == 8]
+    if dangerous and not options["i_know"]:
+        raise NotAllowed(f"{len(dangerous)} of the recorded writes are broadcasts or diagnostics", hint="--i-know")
+    if not writes or options["yes"]:
+        return
+    for exchange in writes[:SHOWN]:
+        talk.print(f"  unit {exchange.unit}: {exchange.request.hex(' ')}", soft_wrap=True, markup=False)
+    if not sys.stdin.isatty() or not click.confirm(f"make these {len(writes)} writes at {url}?", err=True):
+        raise NotAllowed("the writes were not allowed", hint="--yes")
+
+
+def _wearing(profile: DeviceProfile | None) -> set[tuple[str, int]]:
+    """What is written once and never in loops."""
+    tags = profile.tags.values() if profile is not None else ()
+    return {(t.at.table, a) for t in tags if t.nonvolatile and t.at for a in range(t.at.address, t.at.end)}
+
+
+def _run(work: Callable[[asyncio.Event, Callable[[int], None]], Coroutine[Any, Any, None]]) -> None:
+    """Until it is done, or a signal ends it: then what was compared so far counts."""
+
+    async def main() -> None:
+        stop = asyncio.Event()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            with suppress(NotImplementedError):  # Windows
+                asyncio.get_running_loop().add_signal_handler(number, stop.set)
+        if not talk.is_terminal:
+            await work(stop, lambda done: None)
+            return
+        with talk.status("comparing") as status:
+            await work(stop, lambda done: status.update(f"comparing: {done} exchanges"))
+
+    run_precise(main())
+
+
+# -- what is shown --------------------------------------------------------------------------------------------------------
+
+
+def _show(result: Comparison, recording: Path, other: str, everything: bool) -> None:
+    name = recording.name if recording.suffix == ".log" else shown(parts_of(recording)[0])
+    data.print(f"{other} against {name}", soft_wrap=True, markup=False)
+    if result.differences:
+        table = Table("at s", "unit", "what", "asked", "where", "recorded", "there", box=None, pad_edge=False)
+        for d in result.differences if everything else result.differences[:SHOWN]:
+            table.add_row(f"{d.t_s:.3f}", str(d.unit), d.what, d.request, d.where, d.recorded, d.other)
+        data.print(table)
+        left = sum(result.by_kind.values()) - min(len(result.differences), SHOWN)
+        if left > 0 and not everything:
+            talk.print("  and more: --all", soft_wrap=True)
+    if result.latency:
+        table = Table(
+            "latency, ms", "n", "recorded p50", "p90", "p99", "there p50", "p90", "p99", box=None, pad_edge=False
+        )
+        for row in result.latency:
+            times = [f"{1000 * t:.1f}" for t in (*row.recorded_s, *row.other_s)]
+            table.add_row(row.service, str(row.count), *times, "" if row.alike else "beyond tolerance")
+        data.print(table)
+    kinds = ", ".join(f"{n} {kind}" for kind, n in sorted(result.by_kind.items()))
+    data.print(
+        f"{result.compared} compared, {result.alike} alike" + (f"; otherwise: {kinds}" if kinds else ""), soft_wrap=True
+    )
+    if result.extra:
+        data.print(f"{result.extra} more there, of which the recording says nothing", soft_wrap=True)
+    if result.left_out:
+        data.print(f"{result.left_out} left out: they may change the device, or cannot be asked", soft_wrap=True)
+    if result.left_out_writes and result.by_kind:
+        data.print(
+            f"{result.after_left_out} of the differences are in what {result.left_out_writes} left-out writes had set; "
+            "others may follow from these writes: --writes makes them again", soft_wrap=True,
+        )  # fmt: skip
+    _show_shifts(result)
+    timing = "not known" if result.timing is None else f"{100 * result.timing:.1f} %"
+    verdict = "met" if result.met else "INCONCLUSIVE" if result.inconclusive else "NOT met"
+    alike = f"{100 * result.values:.1f} %" if result.compared else "not known"
+    data.print(f"fidelity: values {alike}, timing {timing}: {verdict}", soft_wrap=True)
+
+
+def _show_shifts(result: Comparison) -> None:
+    """Where the dialogue continued the recorded one, and what the recording has nothing about."""
+    for shift in result.shifts[:SHOWN]:
+        data.print(
+            f"unit {shift.unit}, {shift.where}: was read before, continues at value {shift.at + 1} of {shift.recorded} recorded",
+            soft_wrap=True, markup=False,
+        )  # fmt: skip
+    if len(result.shifts) > SHOWN:
+        data.print(f"and {len(result.shifts) - SHOWN} more registers or bits", soft_wrap=True)
+    if result.not_compared:
+        data.print(
+            f"{result.not_compared} not compared: the recording has no values after that position. "
+            "Restart the emulator to compare everything", soft_wrap=True,
+        )  # fmt: skip

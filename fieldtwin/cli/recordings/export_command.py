@@ -1,0 +1,53 @@
+"""`fieldtwin export`: recordings for other programs. Parses and prints, no more."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import click
+
+from fieldtwin.cli.options import json_option, profiles_option
+from fieldtwin.console import data
+from fieldtwin.gateway.core.files.profile import load_profile
+from fieldtwin.twin.site.data_files import find
+
+
+@click.command("export")
+@click.argument("recording", type=click.Path(path_type=Path))
+@click.argument("out", type=click.Path(dir_okay=False, path_type=Path))
+@click.option(
+    "--profile", "profile_name", default="", metavar="NAME", help="A table of exchanges: its tags as columns."
+)
+@click.option(
+    "--framing",
+    type=click.Choice(["mbap", "rtu"]),
+    default="mbap",
+    show_default=True,
+    help="pcap of exchanges: as Modbus TCP, or as RTU frames (link type USER0).",
+)
+@click.option("--endpoint", default="", metavar="URL", help="A capture with several wires: this one.")
+@profiles_option
+@json_option
+def command(
+    recording: Path, out: Path, profile_name: str, framing: str, endpoint: str, profiles: tuple[str, ...], as_json: bool
+) -> int:
+    """Write RECORDING as OUT, whose name says as what: .csv, .parquet, .log (candump) or .pcap.
+
+    \b
+    meter.jsonl    to .csv or .parquet (with --profile: in the tags' units), to .pcap for Wireshark
+    bus.log        to .csv, .parquet, .pcap
+    cast.jsonl     signals: to .csv or .parquet
+    a capture      (run --capture, record --tap, a verb's --log) to .pcap; of a CAN bus to .log
+    """
+    from fieldtwin.capture.recordings.exporting import export
+
+    profile = load_profile(find("devices", profile_name, extra=[Path(p) for p in profiles])) if profile_name else None
+    count = export(recording, out, profile=profile, framing=framing, url=endpoint)
+    if as_json:
+        json.dump({"out": str(out), "records": count}, sys.stdout)
+        sys.stdout.write("\n")
+    else:
+        data.print(f"{out}: {count} {'packets' if out.suffix == '.pcap' else 'records'}", soft_wrap=True, markup=False)
+    return 0

@@ -1,0 +1,380 @@
+"""`fieldtwin record`: what a device says, what passes on a line, or a CAN bus, into a file. Parses and prints, no more."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import signal
+import sys
+from collections.abc import Callable, Coroutine, Iterable, Iterator
+from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.status import Status
+
+from fieldtwin.capture.recordings.importing import TextSummary, import_capture
+from fieldtwin.capture.recordings.rotating_file import MB, RotatingFile, exchanges_of, header_of
+from fieldtwin.capture.recordings.sinks import CanLogSink, ExchangeSink, LineSink
+from fieldtwin.cli.device.device_options import device_options, logged, target_from, words
+from fieldtwin.cli.options import Duration, json_option
+from fieldtwin.commissioning.access.address import tags_of
+from fieldtwin.commissioning.access.reading import Target, dry_point
+from fieldtwin.commissioning.record.asking import frame_for
+from fieldtwin.commissioning.record.polling import (
+    PollCounters,
+    ProfileRound,
+    Round,
+    SameRequests,
+    follow_bus,
+    record_node,
+    record_polls,
+)
+from fieldtwin.commissioning.record.sniffing import LineSniffer
+from fieldtwin.commissioning.record.tapping import LineTap
+from fieldtwin.console import data, talk
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.connection import Direction
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.files.recording import RecordingHeader, encode_header
+from fieldtwin.gateway.wallclock import WallClock
+from fieldtwin.gateway.wallclock import run as run_precise
+
+REFRESH_S = 0.5
+
+
+@click.command("record")
+@click.argument("endpoint", required=False)
+@click.option(
+    "-o",
+    "--out",
+    type=click.Path(dir_okay=False, path_type=Path),
+    required=True,
+    help="The recording: NAME.jsonl, of a CAN bus NAME.log. A file that is there is never touched.",
+)
+@click.option(
+    "--tap", "taps", nargs=2, metavar="A B", help="Between a master (A) and its devices (B): pass all on, keep all."
+)
+@click.option(
+    "--sniff", metavar="PORT", help="Listen with one adapter to a serial line between other devices; nothing is sent."
+)
+@click.option(
+    "--like",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    help="Ask what this recording asked (reads only), instead of the tags of a profile.",
+)
+@click.option("--group", "groups", multiple=True, help="Of a Modbus profile: only this poll group.")
+@click.option("--every", "every_s", type=Duration(), default="1s", show_default=True, help="How often a round begins.")
+@click.option("--rounds", type=click.IntRange(1), default=None, help="Stop after so many rounds.")
+@click.option("--for", "for_s", type=Duration(), default=None, help="Stop after so long; default: at Ctrl-C.")
+@click.option("--spacing", "spacing_s", type=Duration(), default="0s", help="Pause behind every exchange.")
+@click.option(
+    "--part-size", "part_mb", type=click.IntRange(1), default=256, show_default=True, help="MB of a part of the file."
+)
+@click.option("--part-time", "part_s", type=Duration(), default=None, help="Begin a new part after so long, e.g. 1h.")
+@click.option("--keep", type=click.IntRange(1), default=None, help="Keep so many parts; the oldest are removed.")
+@click.option(
+    "--as-scenario",
+    default="",
+    metavar="SYSTEM",
+    help="ENDPOINT is a run of SYSTEM (--trace, --capture): make a scenario of it, with tolerances.",
+)
+@click.option("--emulated", is_flag=True, help="Say in the recording that the device is an emulator.")
+@click.option("--dry-run", is_flag=True, help="Print the frames that a round would send, and send nothing.")
+@device_options
+@json_option
+def command(
+    endpoint: str | None,
+    out: Path,
+    taps: tuple[str, str] | None,
+    sniff: str | None,
+    like: Path | None,
+    for_s: float | None,
+    as_scenario: str,
+    as_json: bool,
+    **options: Any,
+) -> int:
+    """Record a device at ENDPOINT by polling it (nothing is written), a line between two ports, or a CAN bus.
+
+    \b
+    fieldtwin record rtu:/dev/ttyUSB0 --profile eastron-sdm630 -o meter.jsonl
+    fieldtwin record tcp://192.168.0.7 --like old.jsonl --rounds 20 -o new.jsonl
+    fieldtwin record --tap rtu:/dev/ttyUSB0 rtu:/dev/ttyUSB1 -o line.jsonl
+    fieldtwin record --sniff 'rtu:/dev/ttyUSB0?baudrate=9600' -o line.jsonl
+    fieldtwin record --tap tcp://127.0.0.1:1502 tcp://192.168.0.7 -o line.jsonl
+    fieldtwin record can:socketcan/can0 -o bus.log                 (listens only)
+    fieldtwin record can:socketcan/can0 --profile drive-cia402 -o drive.log
+    fieldtwin record run.jsonl --as-scenario observatory -o run.scenario.yaml
+
+    Play it with `fieldtwin emulate`, hold a device against it with `fieldtwin compare`.
+    """
+    if as_scenario:
+        return _scenario_of(endpoint, as_scenario, out, options["profiles"])
+    job = _Job(out, for_s, as_json, options)
+    if taps is not None:
+        if endpoint or like or options["profile_name"]:
+            raise UsageError("--tap takes two endpoints and nothing else to ask")
+        return job.tap(*(_end(text) for text in taps))
+    if sniff is not None:
+        if endpoint or like or options["profile_name"]:
+            raise UsageError("--sniff takes one port and asks nothing")
+        return job.sniff(_end(sniff))
+    if endpoint is None:
+        raise UsageError("what is to be recorded?", expected="ENDPOINT, --tap A B, or --sniff PORT")
+    target = target_from(endpoint, options)
+    if target.protocol == "canopen":
+        if like is not None:
+            raise UsageError("--like is for Modbus")
+        return job.bus(target)
+    if like is not None:
+        unit = options["unit"]
+        same = SameRequests(exchanges_of(like), unit)
+        if not same.requests:
+            raise UsageError(f"{like.name} asks nothing that may be asked again", hint="only reads are")
+        if same.left_out:
+            talk.print(
+                f"{same.left_out} requests of {like.name} that may change the device are left out", soft_wrap=True
+            )
+        return job.polls(target, same, header_of(like).device)
+    if target.profile is None:
+        raise UsageError(
+            "what is to be asked?", expected="--profile NAME or --like RECORDING", hint="or --tap A B to ask nothing"
+        )
+    if target.profile.form.trigger is not None:
+        talk.print(
+            f"{target.profile.name} measures when it is told to, and is not told: nothing is written", soft_wrap=True
+        )
+    return job.polls(target, ProfileRound(target.profile, target.address, options["groups"]), target.profile.name)
+
+
+def _scenario_of(run: str | None, system: str, out: Path, profiles: tuple[str, ...]) -> int:
+    """A recorded run as a scenario, with the tolerances that `fieldtwin trace --as-scenario` has by itself."""
+    from fieldtwin.cli.recordings.regression_view import write_scenario
+    from fieldtwin.scenarios.regression.comparing import Allowed
+    from fieldtwin.twin.site.system import load_system
+
+    if run is None:
+        raise UsageError("which run?", expected="the file of run --virtual --trace, or of run --capture")
+    plant = load_system(system, [Path(p) for p in profiles])
+    return write_scenario(plant, Path(run), out, system, allowed=Allowed(), seed=None, values=False)
+
+
+def _end(text: str) -> Endpoint:
+    """One side of a tap; a plain path is a port."""
+    return Endpoint.parse(text if ":" in text else f"rtu:{text}")
+
+
+class _Job:
+    """One recording: its file, its end, and what is shown of it."""
+
+    def __init__(self, out: Path, for_s: float | None, as_json: bool, options: dict[str, Any]) -> None:
+        self._out, self._for_s, self._json, self._options = out, for_s, as_json, options
+        self._clock = WallClock()
+        self._parts: dict[str, Any] = {
+            "max_bytes": options["part_mb"] * MB, "max_s": options["part_s"] or 0.0, "keep": options["keep"] or 0
+        }  # fmt: skip
+
+    # -- kinds --------------------------------------------------------------------------------------------------------
+
+    def polls(self, target: Target, one_round: Round, device: str) -> int:
+        if self._options["dry_run"]:
+            return self._dry(frame_for(target.url, unit, pdu) for unit, pdu in one_round.asks)
+        counters = PollCounters()
+        header = RecordingHeader(
+            version=1, device=device, kind="exchanges", source="measured", endpoint=target.url, made_by=words(),
+            profile_hash=target.profile.hash if target.profile else "", start_utc=self._now(),
+            prototype=self._options["emulated"],
+        )  # fmt: skip
+        log: Path | None = self._options["log"]
+        with logged(log) as taps, RotatingFile(self._out, encode_header(header), **self._parts) as file:
+
+            async def work(stop: asyncio.Event) -> None:
+                await record_polls(
+                    target, one_round, ExchangeSink(file), every_s=self._options["every_s"], counters=counters, stop=stop,
+                    rounds=self._options["rounds"] or 0, spacing_s=self._options["spacing_s"], taps=taps, clock=self._clock,
+                )  # fmt: skip
+
+            self._run(work, lambda: f"{counters.rounds} rounds, {counters.exchanges} exchanges")
+        return self._summary(file, counters, {"exchanges": file.lines})
+
+    def _dry(self, frames: Iterable[bytes | str | None]) -> int:
+        for frame in frames:
+            if frame is not None:
+                click.echo(frame if isinstance(frame, str) else frame.hex(" "))
+        return 0
+
+    def bus(self, target: Target) -> int:
+        polled = target.profile is not None or target.dictionary is not None
+        if not polled and self._options["node"] is not None:
+            raise UsageError(
+                "nothing to read from the node",
+                expected="--profile NAME or --eds FILE",
+                hint="without --node: only listen",
+            )
+        if self._options["dry_run"]:
+            tags = tags_of((), "canopen", None, target.profile, target.dictionary) if polled else []
+            return self._dry(dry_point(target).read_frames(tags))
+        counters, lost = PollCounters(), 0
+        if self._options["log"]:
+            raise UsageError("--log: what is recorded of a bus is all of it already")
+        with RotatingFile(self._out, **self._parts) as file:
+            sink = CanLogSink(file, self._clock, Endpoint.parse(target.url).path.rpartition("/")[2].replace(":", "_"))
+
+            async def work(stop: asyncio.Event) -> None:
+                nonlocal lost
+                if not polled:
+                    lost = await follow_bus(target, sink, stop=stop, clock=self._clock)
+                    return
+                await record_node(
+                    target, sink, every_s=self._options["every_s"], counters=counters, stop=stop,
+                    rounds=self._options["rounds"] or 0, clock=self._clock,
+                )  # fmt: skip
+
+            self._run(work, lambda: f"{file.lines} frames")
+        return self._summary(file, counters if polled else None, {"frames": file.lines, "lost_here": lost})
+
+    def tap(self, near: Endpoint, far: Endpoint) -> int:
+        """Record a line that passes through here."""
+
+        def tapped(sink: LineSink) -> Callable[[asyncio.Event], Coroutine[Any, Any, None]]:
+            return LineTap(near, far, sink, say=self._say, clock=self._clock).run
+
+        return self._line(far, tapped, "tapped", "bytes to the device", "back")
+
+    def sniff(self, port: Endpoint) -> int:
+        """Record a line between other devices that one adapter listens to."""
+        return self._line(
+            port,
+            lambda sink: LineSniffer(port, sink, say=self._say, clock=self._clock).run,
+            "sniffed",
+            "bytes of requests",
+            "of replies",
+        )
+
+    @staticmethod
+    def _say(text: str) -> None:
+        talk.print(text, soft_wrap=True, markup=False)
+
+    def _line(
+        self,
+        far: Endpoint,
+        listening: Callable[[LineSink], Callable[[asyncio.Event], Coroutine[Any, Any, None]]],
+        how: str,
+        there: str,
+        back: str,
+    ) -> int:
+        """Write the bytes first, as they come, then make a recording of what they say."""
+        if self._out.exists():
+            raise UsageError(f"{self._out} exists already", expected="another name")
+        started = self._now()
+        raw = self._out.with_suffix(f".tap{self._out.suffix or '.jsonl'}")
+        with RotatingFile(raw, **self._parts) as file:
+            sink = LineSink(file, far, self._clock, words())
+            self._run(
+                listening(sink),
+                lambda: f"{sink.bytes[Direction.SENT]} {there}, {sink.bytes[Direction.RECEIVED]} {back}",
+            )
+        said = {
+            "bytes_sent": sink.bytes[Direction.SENT], "bytes_received": sink.bytes[Direction.RECEIVED], "raw": str(raw)
+        }  # fmt: skip
+        if not any(sink.bytes.values()):
+            talk.print("nothing passed")
+            return self._summary(file, None, said)
+        header = RecordingHeader(
+            version=1, device=f"{how}/{self._out.stem}", kind="exchanges", source="measured", endpoint=str(far),
+            made_by=words(), start_utc=started, prototype=self._options["emulated"],
+        )  # fmt: skip
+        found: TextSummary = import_capture(raw, self._out, url=str(far), header=header)
+        said |= {
+            "exchanges": found.records, "unanswered": found.pairs.unanswered, "strays": found.pairs.strays,
+            "malformed": found.pairs.malformed, "recording": str(self._out), "profiles": list(map(str, found.profiles)),
+        }  # fmt: skip
+        return self._summary(file, None, said)
+
+    # -- around them --------------------------------------------------------------------------------------------------
+
+    def _now(self) -> str:
+        return datetime.fromtimestamp(self._clock.utc_ns() / NS_PER_S, UTC).isoformat(timespec="milliseconds")
+
+    def _run(self, work: Callable[[asyncio.Event], Coroutine[Any, Any, None]], status: Callable[[], str]) -> None:
+        """Until it ends, a signal, or --for."""
+
+        async def main() -> None:
+            stop = asyncio.Event()
+            loop = asyncio.get_running_loop()
+            for number in (signal.SIGINT, signal.SIGTERM):
+                with suppress(NotImplementedError):  # Windows
+                    loop.add_signal_handler(number, stop.set)
+            timer = loop.call_later(self._for_s, stop.set) if self._for_s is not None else None
+            showing = asyncio.ensure_future(_shown(shown, status)) if shown is not None else None
+            try:
+                await work(stop)
+            finally:
+                if timer is not None:
+                    timer.cancel()
+                if showing is not None:
+                    showing.cancel()
+                    await asyncio.gather(showing, return_exceptions=True)
+
+        with _status() as shown:
+            run_precise(main())
+
+    def _summary(self, file: RotatingFile, counters: PollCounters | None, said: dict[str, Any]) -> int:
+        """0; 4 where nobody ever answered."""
+        polled = counters is not None and counters.exchanges > 0
+        silent = counters is not None and polled and counters.unanswered == counters.exchanges
+        if self._json:
+            parts: dict[str, Any] = {
+                "out": str(self._out),
+                "parts": list(map(str, file.parts)),
+                "removed": file.removed,
+            }
+            if counters is not None:
+                parts |= {
+                    "rounds": counters.rounds, "missed_rounds": counters.missed, "unanswered": counters.unanswered,
+                    "refused": counters.refused, "connections_lost": counters.lost,
+                }  # fmt: skip
+            json.dump(parts | said, sys.stdout)
+            sys.stdout.write("\n")
+            return 4 if silent else 0
+        names = {"bytes_sent": "bytes to the device", "bytes_received": "bytes back", "lost_here": "frames lost here"}
+        text = ", ".join(
+            f"{v} {names.get(k, k)}"
+            for k, v in said.items()
+            if isinstance(v, int) and (v or k in ("exchanges", "frames"))
+        )
+        data.print(f"{said.get('recording', self._out)}: {text or 'nothing'}", soft_wrap=True, markup=False)
+        for profile in said.get("profiles", ()):
+            data.print(f"  draft profile: {profile}", soft_wrap=True, markup=False)
+        if "raw" in said:
+            data.print(f"  the bytes as they were: {said['raw']}", soft_wrap=True, markup=False)
+        if len(file.parts) > 1:
+            gone = f", {file.removed} older ones removed" if file.removed else ""
+            talk.print(f"in {len(file.parts)} parts{gone}", soft_wrap=True)
+        if counters is not None:
+            notes = [
+                (counters.rounds, "rounds"), (counters.missed, "rounds that could not begin in time"),
+                (counters.unanswered, "without an answer"), (counters.refused, "refused"),
+                (counters.lost, "times the connection was lost"),
+            ]  # fmt: skip
+            talk.print(", ".join(f"{n} {what}" for n, what in notes if n), soft_wrap=True)
+        return 4 if silent else 0
+
+
+@contextmanager
+def _status() -> Iterator[Status | None]:
+    """A line that says how far it is, where somebody looks."""
+    if not talk.is_terminal:
+        yield None
+        return
+    with talk.status("recording") as status:
+        yield status
+
+
+async def _shown(status: Status, text: Callable[[], str]) -> None:
+    while True:
+        status.update(f"recording: {text()}  (Ctrl-C ends it)")
+        await asyncio.sleep(REFRESH_S)

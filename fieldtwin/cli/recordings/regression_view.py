@@ -1,0 +1,119 @@
+"""Runs held against each other, as people and programs read it: `fieldtwin trace --against`, `fieldtwin run --compare`."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from pathlib import Path
+
+import click
+from rich.markup import escape
+
+from fieldtwin.capture.decoding.trace_file import read_events
+from fieldtwin.console import data, talk
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.scenarios.regression.as_scenario import Wanted, as_scenario
+from fieldtwin.scenarios.regression.comparing import Allowed, Verdict, compare
+from fieldtwin.scenarios.regression.run_history import story_of
+from fieldtwin.twin.site.system import System
+
+SHOWN = 30
+LENGTHS_S = 1.0
+"""Runs whose lengths differ by more are said to."""
+SUFFIX = ".scenario.yaml"
+
+
+def allowed_of(tolerances: tuple[str, ...], window_s: float, ignored: tuple[str, ...]) -> Allowed:
+    """``2%`` for all, ``ctd.pressure=0.5`` for one. Raises `UsageError`."""
+    share, amounts = Allowed().share, {}
+    for text in tolerances:
+        name, equals, amount = text.rpartition("=")
+        try:
+            number = float(amount.removesuffix("%"))
+        except ValueError:
+            number = -1.0
+        if number < 0 or bool(equals) == amount.endswith("%"):
+            raise UsageError(f"cannot read --tolerance {text!r}", expected="2%, or DEVICE.TAG=0.5")
+        if equals:
+            amounts[name] = number
+        else:
+            share = number / 100
+    return Allowed(window_s, share, amounts, ignored=frozenset(ignored))
+
+
+def judged(system: System, old: Path, new: Path, allowed: Allowed) -> Verdict:
+    """The run in `new` by the one in `old`. Raises `FileInvalid`."""
+    return compare(story_of(system, read_events(old, system)), story_of(system, read_events(new, system)), allowed)
+
+
+def show(verdict: Verdict, old: Path, *, as_json: bool) -> int:
+    """Print it; the exit code."""
+    if as_json:
+        json.dump(
+            {
+                "against": str(old),
+                "same": verdict.same,
+                "compared": verdict.compared,
+                "compared_s": verdict.common_s,
+                "old_s": verdict.old_s,
+                "new_s": verdict.new_s,
+                "differences": [{k: getattr(d, k) for k in d.__slots__} for d in verdict.differences],
+            },
+            sys.stdout,
+            indent=2,
+        )
+        click.echo()
+        return 0 if verdict.same else 1
+    for difference in verdict.differences[:SHOWN]:
+        data.print(f"[red]{difference.what:<8}[/red] {escape(str(difference))}", soft_wrap=True, highlight=False)
+    more = len(verdict.differences) - SHOWN
+    if more > 0:
+        data.print(f"... and {more} more (--json has all)")
+    if verdict.same:
+        said = f"[green]the same[/green] as {escape(old.name)}"
+    elif not verdict.compared:
+        said = "[red]nothing in these runs can be compared[/red]"
+    else:
+        said = f"[red]{len(verdict.differences)} differences[/red] from {escape(old.name)}"
+    data.print(
+        f"{said}: {verdict.compared} fields and services compared over {verdict.common_s:.1f} s",
+        highlight=False,
+        soft_wrap=True,
+    )
+    if abs(verdict.old_s - verdict.new_s) > LENGTHS_S:
+        data.print(
+            f"  not compared: what one run has after that (lengths {verdict.old_s:.1f} s and {verdict.new_s:.1f} s)",
+            highlight=False,
+            soft_wrap=True,
+        )
+    return 0 if verdict.same else 1
+
+
+def write_scenario(
+    system: System, run: Path, out: Path, named: str, *, allowed: Allowed, seed: int | None, values: bool
+) -> int:
+    """Make a scenario of the run in `run`; `named` is how the system was. Raises `UsageError` for a file that is there."""
+    if not out.name.endswith(SUFFIX):
+        raise UsageError("a scenario's name", expected=f"NAME{SUFFIX}", got=out.name)
+    beside = Path(named).is_file()
+    wanted = Wanted(
+        f"{system.name}, as in {run.name}",
+        os.path.relpath(system.path.resolve(), out.resolve().parent) if beside else f"{system.name}.yaml",
+        allowed.share,
+        allowed.window_s,
+        seed,
+        values,
+        run.name,
+    )
+    text = as_scenario(system, story_of(system, read_events(run, system)), wanted)
+    try:
+        with out.open("x", encoding="utf-8") as file:
+            file.write(text)
+    except FileExistsError:
+        raise UsageError("the file is there already", got=str(out), hint="another name, or remove it") from None
+    except OSError as e:
+        raise UsageError(f"cannot write: {e.strerror or e}", got=str(out)) from e
+    steps = text.count("\n  - ")
+    talk.print(f"{steps} steps  →  {escape(str(out))}; run it: fieldtwin test {escape(str(out))}", soft_wrap=True)
+    return 0

@@ -1,0 +1,162 @@
+"""`fieldtwin trace`: what happened in a run, in words, as JSON, or as waveforms. Parses and prints, no more."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import click
+
+from fieldtwin.capture.decoding.decoder import Decoder
+from fieldtwin.capture.decoding.exchange import Decoded, Exchange
+from fieldtwin.capture.decoding.trace_file import read_events
+from fieldtwin.cli.options import Duration, json_option, profiles_option
+from fieldtwin.cli.recordings.regression_options import tolerance_options
+from fieldtwin.cli.template_question import consent, trust_option
+from fieldtwin.console import talk
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.results.trace import Event, Kind
+
+
+@click.command("trace")
+@click.argument("file", type=click.Path(path_type=Path))
+@click.argument("system")
+@profiles_option
+@click.option("--only", multiple=True, help="A bus, device, tag, program or fault; all its events. Repeatable.")
+@click.option("--from", "start_s", type=Duration(), default="0s", help="Leave out what was before.")
+@click.option("--to", "end_s", type=Duration(), help="Leave out what was later.")
+@click.option("--problems", is_flag=True, help="Only requests without a good answer, and refused outputs.")
+@click.option(
+    "--against",
+    type=click.Path(path_type=Path),
+    help="An older run: what is otherwise, or slower? Exit code 1 if anything.",
+)
+@click.option("--as-scenario", type=click.Path(path_type=Path), help="Make a scenario of the run, with tolerances.")
+@click.option("--seed", type=int, help="With --as-scenario: the seed that the run had.")
+@click.option(
+    "--set-values",
+    is_flag=True,
+    help="With --as-scenario: set what devices said, for another prototype than the run's.",
+)
+@tolerance_options
+@click.option("--vcd", type=click.Path(path_type=Path), help="Write waveforms (IEEE 1364) for GTKWave instead.")
+@trust_option
+@json_option
+def command(
+    file: Path,
+    system: str,
+    profiles: tuple[str, ...],
+    only: tuple[str, ...],
+    start_s: float,
+    end_s: float | None,
+    problems: bool,
+    vcd: Path | None,
+    trust: bool,
+    against: Path | None,
+    as_scenario: Path | None,
+    seed: int | None,
+    set_values: bool,
+    tolerances: tuple[str, ...],
+    window_s: float,
+    ignored: tuple[str, ...],
+    as_json: bool,
+) -> int:
+    """Show FILE, a trace (run --virtual --trace) or a capture (run --capture) of SYSTEM, frames decoded.
+
+    With --json, each request with its answer, and each message, is a line.
+
+    
+    fieldtwin trace new.jsonl observatory --against old.jsonl --tolerance 1%
+    fieldtwin trace run.jsonl observatory --as-scenario run.scenario.yaml
+
+    Another run is compared by what it means: states and their order, values, qualities, latencies; never byte by byte.
+    """
+    from fieldtwin.run.template import system_file
+    from fieldtwin.twin.site.system import load_system
+
+    folders = [Path(p) for p in profiles]
+    agreed = consent(
+        trust=trust or vcd is None
+    )  # waveforms alone look at what programs are: they are imported for that
+    plant = load_system(system_file(system, agreed, plant=True, profiles=folders), folders)
+    if against is not None or as_scenario is not None:
+        from fieldtwin.cli.recordings import regression_view
+
+        if vcd is not None or only or problems or (against is not None and as_scenario is not None):
+            raise UsageError("--against and --as-scenario take the whole run, and nothing beside it")
+        allowed = regression_view.allowed_of(tolerances, window_s, ignored)
+        if against is not None:
+            return regression_view.show(regression_view.judged(plant, against, file, allowed), against, as_json=as_json)
+        assert as_scenario is not None
+        return regression_view.write_scenario(
+            plant, file, as_scenario, system, allowed=allowed, seed=seed, values=set_values
+        )
+    events = read_events(file, plant)
+    start_ns, end_ns = round(start_s * NS_PER_S), None if end_s is None else round(end_s * NS_PER_S)
+    if vcd is not None:
+        if only or problems or as_json:
+            raise UsageError("--vcd takes the whole trace", expected="no --only, --problems or --json beside it")
+        from fieldtwin.reports.run.machines import machines_of
+        from fieldtwin.reports.run.vcd import write_vcd
+
+        inside = [e for e in events if e.t_ns >= start_ns and (end_ns is None or e.t_ns <= end_ns)]
+        write_vcd(vcd, inside, plant, machines_of(plant), f"{plant.name}, {file.name}")
+        talk.print(f"{len(inside)} events  →  {vcd}", soft_wrap=True)
+        return 0
+    decoder = Decoder(plant)
+    for event, decoded in _decoded(decoder, events, end_ns):
+        if event.t_ns < start_ns:
+            continue
+        if as_json or problems:
+            _show_refusal(event, decoded, only, as_json=as_json)
+            _show_exchanges(decoded.exchanges, only, problems=problems, as_json=as_json)
+        elif _wanted(only, event, decoded):
+            click.echo(_line(event, decoded))
+    if as_json or problems:
+        _show_exchanges(decoder.finish(), only, problems=problems, as_json=as_json)
+    return 0
+
+
+def _decoded(decoder: Decoder, events: Iterator[Event], end_ns: int | None) -> Iterator[tuple[Event, Decoded]]:
+    for event in events:
+        if end_ns is not None and event.t_ns > end_ns:
+            return
+        yield event, decoder.decode(event)
+
+
+def _wanted(only: tuple[str, ...], event: Event, decoded: Decoded) -> bool:
+    names = {event.where, event.where.partition(".")[0], *(e.device for e in decoded.exchanges)}
+    told = decoded.text.partition(":")[0]  # a request names its device too
+    return not only or not names.isdisjoint(only) or (event.kind is Kind.FRAME and told in only)
+
+
+def _line(event: Event, decoded: Decoded) -> str:
+    if event.kind is Kind.FRAME:
+        head = f"{event.where} {'→' if event.data.get('dir') == 'sent' else '←'}"
+    else:
+        head = event.kind.value
+    return f"{event.t_ns / NS_PER_S:12.6f}  {head:<10}  {decoded.text}"
+
+
+def _show_refusal(event: Event, decoded: Decoded, only: tuple[str, ...], *, as_json: bool) -> None:
+    """A write that did not reach its device is a problem that no exchange shows: nothing was sent."""
+    if event.kind is not Kind.REFUSED or not _wanted(only, event, decoded):
+        return
+    if as_json:
+        click.echo(json.dumps({"t_s": event.t_ns / NS_PER_S, "refused": event.where, **event.data}))
+    else:
+        click.echo(_line(event, decoded))
+
+
+def _show_exchanges(
+    exchanges: list[Exchange] | tuple[Exchange, ...], only: tuple[str, ...], *, problems: bool, as_json: bool
+) -> None:
+    for exchange in exchanges:
+        if (problems and exchange.ok) or (only and not {exchange.bus, exchange.device}.intersection(only)):
+            continue
+        if as_json:
+            click.echo(json.dumps({"t_s": exchange.t_ns / NS_PER_S, "bus": exchange.bus, **exchange.describe()}))
+        else:
+            click.echo(f"{exchange.t_ns / NS_PER_S:12.6f}  {exchange.bus:<10}  {exchange.text}: {exchange.reply_text}")

@@ -1,0 +1,457 @@
+"""What a person sees of a run: a live table on a terminal, one line a second elsewhere, and the summary at the end.
+
+Everything shown comes from the session's statuses; nothing is computed here but text.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from types import TracebackType
+from typing import Any
+
+from rich.console import Group, RenderableType
+from rich.live import Live
+from rich.markup import escape
+from rich.table import Table
+from rich.text import Text
+
+from fieldtwin.cli.run.plc_views import acts_text, waiting_texts, without_texts
+from fieldtwin.console import data, talk
+from fieldtwin.results.trace import refusal_text
+from fieldtwin.run.live.session import RunSession
+
+COLOUR = {"good": "green", "uncertain": "yellow", "bad": "red", "substituted": "magenta", "simulated": "cyan"}
+REFRESH_S = 0.25
+LINE_S = 1.0
+MAX_TAGS = 40
+MAX_TROUBLES = 5
+MAX_FORCES = 6
+MAX_REFUSED = 5
+READ_ONLY = "read-only"
+"""The cause of a refusal that is by design: the plant runs without leave to write."""
+MOST_FAULTS = 20
+
+
+def print_mapping(session: RunSession) -> None:
+    """Say once where each plant endpoint is really opened."""
+    if not session.options.prototype:
+        leave = "writes allowed" if session.options.allow_writes else "read-only"
+        talk.print(f"[bold]plant[/bold] {session.system.name}: {leave}; instance {session.instance.name}")
+        _print_thread(session)
+        return
+    talk.print(
+        f"[bold]prototype[/bold] of {session.system.name}; instance {session.instance.name} in {session.instance.dir}",
+        soft_wrap=True,
+    )
+    for plant, target in session.mapping.items():
+        talk.print(f"  {plant}  →  {target}" if plant != target else f"  {plant}  (the plant's own)", soft_wrap=True)
+    for bridge, cable in session.cables.items():
+        talk.print(f"  masters of bridge {bridge}  →  {cable.master}", soft_wrap=True)
+    for device, endpoint in session.far.items():
+        talk.print(f"  far end of {device}  →  {endpoint}", soft_wrap=True)
+    _print_thread(session)
+
+
+def print_metrics(url: str) -> None:
+    """Say once where the metrics are."""
+    if url:
+        talk.print(f"  metrics  ←  {url}", soft_wrap=True)
+
+
+def _print_thread(session: RunSession) -> None:
+    if session.thread_place:
+        talk.print(f"  digital thread  ←  {session.thread_place}", soft_wrap=True)
+
+
+class LiveView:
+    """``async with LiveView(session)``: shows the run while the body runs. On a terminal a table, otherwise lines."""
+
+    def __init__(self, session: RunSession, quiet: bool) -> None:
+        self._session = session
+        self._task: asyncio.Task[None] | None = None
+        self._table = talk.is_terminal and not quiet
+        self._quiet = quiet
+
+    async def __aenter__(self) -> LiveView:
+        if not self._quiet:
+            self._task = asyncio.get_running_loop().create_task(
+                self._show_table() if self._table else self._show_lines()
+            )
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None
+    ) -> None:
+        if self._task is not None:
+            self._task.cancel()
+            try:
+                await self._task
+            except asyncio.CancelledError:
+                pass  # that is what was asked for
+
+    async def _show_table(self) -> None:
+        open_ports: set[str] = set()
+        with Live(render(self._session), console=talk, auto_refresh=False, transient=True) as live:
+            while True:
+                open_ports = self._tell_once(open_ports)
+                live.update(render(self._session), refresh=True)
+                await asyncio.sleep(REFRESH_S)
+
+    async def _show_lines(self) -> None:
+        told: set[str] = set()
+        open_ports: set[str] = set()
+        while True:
+            await asyncio.sleep(LINE_S)
+            open_ports = self._tell_once(open_ports)
+            now = [*troubles(self._session), *_waiting_once(self._session)]
+            for trouble in now:
+                if trouble not in told:  # once, and again only when it had gone
+                    talk.print(f"! {trouble}", soft_wrap=True, markup=False)
+            told = set(now)
+            talk.print(line(self._session), soft_wrap=True, markup=False)
+
+    def _tell_once(self, told: set[str]) -> set[str]:
+        """Say once where the gateway listens: a prototype takes free ports. And that a lost field side is back."""
+        now = set(ports(self._session))
+        if (back := self._session.field_return) is not None and back.news:
+            now.add(back.news)
+        for text in sorted(now - told):
+            talk.print(f"  {text}", soft_wrap=True, markup=False)
+        return now
+
+
+def ports(session: RunSession) -> list[str]:
+    """Where the gateway serves tags and lets clients reach units."""
+    gateway = session.gateway_status or {}
+    return [
+        f"{kind} {name}  ←  {front['listening']}"
+        for kind in ("serve", "bridge")
+        for name, front in gateway.get(kind, {}).items()
+        if front["listening"]
+    ]
+
+
+THREAD_TROUBLES = (("thread", "trouble"), ("store of the thread", "store_trouble"))
+
+
+def troubles(session: RunSession) -> list[str]:
+    """What is wrong now, each with its reason: errors of the run, buses that cannot be opened, devices that do not answer, and
+    what stopped the PLC, the digital thread's carrier and store."""
+    gateway = session.gateway_status or {}
+    found = list(session.errors)
+    if session.field_return is not None and (trouble := session.field_return.trouble):
+        found.append(trouble)
+    closed = {name: bus["error"] for name, bus in gateway.get("buses", {}).items() if bus["error"]}
+    found += [f"{name}: {error}" for name, error in closed.items()]
+    for kind in ("serve", "bridge"):
+        found += [f"{kind} {name}: {front['error']}" for name, front in gateway.get(kind, {}).items() if front["error"]]
+    for name, device in gateway.get("devices", {}).items():
+        if device["error"] and device["error"] != closed.get(device["bus"]):
+            found.append(f"{name}: {device['error']}")
+    if error := (session.plc_status or {}).get("error"):
+        found.append(f"PLC: {error}")
+    found += refused(gateway)
+    thread = session.thread_status or {}
+    found += [f"{what}: {text}" for what, key in THREAD_TROUBLES if (text := thread.get(key))]
+    return found
+
+
+def refused(gateway: dict[str, Any]) -> list[str]:
+    """The outputs that are refused now, each with its value, the reason and the program's line. In a read-only plant one line
+    for all that are not written by design."""
+    entries = [e for e in gateway.get("refusals", {}).get("entries", []) if e["standing"]]
+    by_design = {e["tag"] for e in entries if e["cause"] == READ_ONLY}
+    found = [refusal_text(e["tag"], e) for e in entries if e["cause"] != READ_ONLY]
+    if by_design:
+        found.append(f"read-only plant: {', '.join(sorted(by_design))} not written (--allow-writes)")
+    return found
+
+
+def interference(session: RunSession) -> list[str]:
+    """Why the PLC does not do what its programs say: it is paused, a program waits for its start, or something is forced."""
+    plc = session.plc_status or {}
+    found = ["PAUSED: the PLC executes nothing, its outputs stay as they are"] if plc.get("state") == "paused" else []
+    found += waiting_texts(plc)
+    if forces := plc.get("forces"):
+        found.append(f"FORCED: {forces_text(forces)}")
+    return found
+
+
+def _waiting_once(session: RunSession) -> list[str]:
+    """For the lines of a log: each program that waits, without the seconds, so that it is told once."""
+    waiting = (session.plc_status or {}).get("waiting", {})
+    return [f"program {program} has not started; missing {start['reason']}" for program, start in waiting.items()]
+
+
+def forces_text(forces: dict[str, Any]) -> str:
+    """``ctd.pressure = 5 by ada, ...``, of many the first few and how many more."""
+    shown = [
+        f"{tag} = {value_text(force['value'])}" + (f" by {force['by']}" if force["by"] else "")
+        for tag, force in list(forces.items())[:MAX_FORCES]
+    ]
+    more = len(forces) - len(shown)
+    return ", ".join(shown) + (f" and {more} more" if more else "")
+
+
+def line(session: RunSession) -> str:
+    """The run in one line."""
+    gateway, plc = session.gateway_status or {}, session.plc_status or {}
+    parts = [f"t={session.elapsed_s:.0f}s"]
+    parts += [f"{program}={state}" for program, state in session.states.current.items()]
+    for name, device in gateway.get("devices", {}).items():
+        parts.append(f"{name}={'good' if device['online'] else 'bad'}")
+    tags = gateway.get("tags", {})
+    parts.append(f"tags_good={sum(t['quality'] == 'good' for t in tags.values())}/{len(tags)}")
+    requests = sum(_requests(bus) for bus in gateway.get("buses", {}).values())
+    parts.append(f"requests={requests}")
+    if plc:
+        parts.append(f"scans={plc.get('scans')} late_p99_us={_p99(plc)}")
+    parts.append(f"errors={len(session.errors)}")
+    if plc.get("state") == "paused":
+        parts.append("PLC PAUSED")
+    if plc.get("waiting"):
+        parts.append(f"PLC WAITING={','.join(plc['waiting'])}")
+    if plc.get("forces"):
+        parts.append(f"FORCED={','.join(plc['forces'])}")
+    if not gateway.get("plc", {}).get("alive", True):
+        parts.append("PLC LOST")
+    return " ".join(parts)
+
+
+def _requests(bus: dict[str, Any]) -> int:
+    return int(bus["counters"].get("requests", 0) or bus["counters"].get("sdo_requests", 0))
+
+
+def _p99(plc: dict[str, Any]) -> str:
+    value = plc.get("lateness_us", {}).get("p99")
+    return "-" if value is None else f"{value:.0f}"
+
+
+def render(session: RunSession) -> RenderableType:
+    """The live table, as wide as the terminal allows."""
+    kind = "prototype" if session.options.prototype else "plant"
+    left = session.options.duration_s
+    clock = f"{session.elapsed_s:5.1f} s" + (f" of {left:.0f} s" if left else "")
+    head = Text.assemble((f" {session.system.name} ", "bold reverse"), f" {kind}  {clock}  ", _states(session))
+    parts: list[RenderableType] = [head, _devices(session), _foot(session)]
+    parts += [Text(text, style="bold yellow") for text in interference(session)]
+    parts += [Text(f"! {trouble}", style="red") for trouble in troubles(session)[-MAX_TROUBLES:]]
+    parts.append(_tags(session))  # last: a low terminal cuts off the end of them and nothing else
+    return Group(*parts)
+
+
+def _states(session: RunSession) -> Text:
+    text = Text()
+    for program, state in session.states.current.items():
+        text.append(f"{program} ", "dim")
+        text.append(state, "bold green" if state == "ACTIVE" else "bold")
+    return text
+
+
+def _devices(session: RunSession) -> Table:
+    table = Table(expand=False, pad_edge=False, box=None, header_style="dim")
+    for column, justify in (
+        ("device", "left"),
+        ("state", "left"),
+        ("bus", "left"),
+        ("requests", "right"),
+        ("replies", "right"),
+        ("errors", "right"),
+    ):
+        table.add_column(column, justify=justify, no_wrap=True)  # type: ignore[arg-type]
+    gateway = session.gateway_status or {}
+    buses = gateway.get("buses", {})
+    for name, device in gateway.get("devices", {}).items():
+        counters = buses.get(device["bus"], {}).get("counters", {})
+        good = device["online"]
+        table.add_row(
+            name,
+            Text("good", "green") if good else Text("bad", "red"),  # why stands below, where there is room
+            f"{device['bus']}:{device['address']}",
+            str(counters.get("requests", counters.get("sdo_requests", 0))),
+            str(counters.get("replies", counters.get("sdo_replies", 0))),
+            str(device["errors"]),
+        )
+    return table
+
+
+def _tags(session: RunSession) -> Table:
+    table = Table(expand=False, pad_edge=False, box=None, header_style="dim")
+    table.add_column("tag", no_wrap=True)
+    table.add_column("value", justify="right", no_wrap=True)
+    table.add_column("unit", no_wrap=True)
+    table.add_column("quality", no_wrap=True)
+    table.add_column("age", justify="right", no_wrap=True)
+    secrets = {
+        f"{d.name}.{t.name}" for d in session.system.devices.values() for t in d.profile.tags.values() if t.secret
+    }
+    units = {f"{d.name}.{t.name}": t.unit for d in session.system.devices.values() for t in d.profile.tags.values()}
+    for name, tag in list((session.gateway_status or {}).get("tags", {}).items())[:MAX_TAGS]:
+        quality = tag["quality"] + (f" ({tag['reason']})" if tag["reason"] != "none" else "")
+        table.add_row(
+            name,
+            "(secret)" if name in secrets else value_text(tag["value"]),
+            units.get(name, ""),
+            Text(quality, COLOUR.get(tag["quality"], "")),
+            age_text(tag["age_s"]),
+        )
+    return table
+
+
+def value_text(value: Any) -> str:
+    """A value for a person: floats with six digits, none as a dash."""
+    if value is None:
+        return "-"
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def age_text(age_s: float | None) -> str:
+    return "-" if age_s is None else f"{age_s:.2f} s" if age_s < 100 else f"{age_s:.0f} s"
+
+
+def _foot(session: RunSession) -> Text:
+    gateway, plc = session.gateway_status or {}, session.plc_status or {}
+    text = Text()
+    if plc:
+        late = plc.get("lateness_us", {})
+        lateness = " ".join(f"{key} {_us(late, key)}" for key in ("p50", "p99", "max"))
+        text.append("scan ", "dim")
+        text.append(f"{plc.get('cycle_ms', 0):g} ms  #{plc.get('scans')}  late {lateness}")
+        text.append(f"  missed {plc.get('missed_periods')}  {plc.get('state')}")
+    elif session.children.get("plc"):
+        text.append("PLC: no answer", "bold red")
+    for name, box in gateway.get("mailboxes", {}).items():
+        text.append(f"\n{name} ", "dim")
+        text.append(f"received {box['received']}  sent {box['sent']}  taken {box['taken']}  waiting {box['queued']}")
+    text.append("\nlogged ", "dim")
+    text.append(f"{gateway.get('logged', 0)}")
+    if session.options.prototype:
+        oracle = session.oracle.describe()
+        text.append(f"   published values checked {oracle['checked']}, wrong {oracle['wrong']}")
+    return text
+
+
+def _us(late: dict[str, Any], key: str) -> str:
+    value = late.get(key)
+    return "-" if value is None else f"{value / 1000:.2f} ms"
+
+
+def print_summary(summary: dict[str, Any]) -> None:
+    """The end of a run, for a person, on stdout."""
+    kind = "prototype" if summary["prototype"] else "plant"
+    data.print(f"[bold]{summary['system']}[/bold] ({kind}), {summary['duration_s']:.1f} s")
+    for name, device in summary["devices"].items():
+        mark = "[green]good[/green]" if device["state"] == "good" else f"[red]bad[/red] {device['error']}"
+        plays = f", from {device['plays']}" if "plays" in device else ""
+        data.print(f"  {name:<14} {mark}{plays}", soft_wrap=True, highlight=False)
+    for program, states in summary["states"].items():
+        data.print(f"  {program:<14} {' → '.join(states) or 'no scan seen'}")
+    for bus, row in summary["exchanges"].items():
+        data.print(f"  {bus:<14} {_exchange_text(row)}", soft_wrap=True)
+    print_faults(summary["faults"])
+    published = summary["published"]
+    if summary["prototype"]:
+        checked = f"{published['checked']} compared with what the devices held, {published['wrong']} wrong"
+        if published.get("unknown"):
+            checked += f"; {published['unknown']} from when the field side went, and nobody can say"
+        data.print(f"  published      {checked}", soft_wrap=True)
+    else:
+        values = "not known" if published["values"] is None else f"{published['values']} good values"
+        data.print(f"  published      {values}")
+    if (field := summary["field"]) and field["losses"]:
+        data.print(f"  field side     lost {_times(field['losses'])}, away for {field['away_s']:.1f} s", soft_wrap=True)
+    if far := summary["far_end"]:
+        data.print(f"  far end        commands {far['commands_sent']}, responses {far['responses']}")
+    data.print(f"  logged         {summary['logged']} exchanges")
+    if thread := summary["thread"]:
+        data.print(f"  thread         {_thread_text(thread)}", soft_wrap=True, markup=False, highlight=False)
+    for name, learnt in summary["learnt"].items():
+        data.print(f"  {name:<14} {_learnt_text(learnt, kind)}", soft_wrap=True, markup=False)
+    for text in without_texts(summary["plc"]):
+        data.print(f"  [yellow]start[/yellow]          {text}", soft_wrap=True, highlight=False)
+    if acts := summary["plc"].get("acts"):
+        left = summary["plc"].get("forces")
+        data.print(f"  [yellow]by hand[/yellow]        the PLC: {acts_text(acts)}", soft_wrap=True)
+        if left:
+            data.print(f"  [yellow]FORCED[/yellow]         at the end: {forces_text(left)}", soft_wrap=True)
+    _print_refused(summary)
+    for one in summary["invariants"]:
+        if one["verdict"] != "failed":  # those that failed are among the errors
+            said = "holds" if one["verdict"] == "passed" else "not judged"
+            text = f"  {one['number']}: {one['text']}: {said}, {one['got']}"
+            data.print(text, soft_wrap=True, markup=False, highlight=False)
+    told = {f"{name}: {device['error']}" for name, device in summary["devices"].items() if device["state"] != "good"}
+    for error in summary["errors"]:
+        if error in told:  # beside the device, above
+            continue
+        data.print(f"  [red]error[/red]          {escape(error)}", soft_wrap=True)
+    for what in summary["not_judged"]:
+        data.print(f"  [yellow]not judged[/yellow]     {what}", soft_wrap=True, highlight=False)
+    data.print("[bold green]ok[/bold green]" if summary["ok"] else "[bold red]not ok[/bold red]")
+
+
+def _print_refused(summary: dict[str, Any]) -> None:
+    """The writes that did not reach their device and are no error, by cause: by design, tried again, or asked by a client."""
+    by_design = sorted({e["tag"] for e in summary["refused"] if e["cause"] == READ_ONLY})
+    if by_design:
+        text = f"{', '.join(by_design)}: not written, the plant is read-only (--allow-writes)"
+        data.print(f"  not written    {text}", soft_wrap=True, markup=False, highlight=False)
+    others = [e for e in summary["refused"] if e["cause"] != READ_ONLY and not e["fault"]]
+    for entry in others[:MAX_REFUSED]:
+        text = refusal_text(entry["tag"], entry)
+        data.print(f"  not written    {text}", soft_wrap=True, markup=False, highlight=False)
+    if len(others) > MAX_REFUSED:
+        data.print(f"  not written    {len(others) - MAX_REFUSED} more, see the audit log", soft_wrap=True)
+
+
+def print_faults(faults: list[dict[str, Any]]) -> None:
+    """Print how often each fault of a run struck."""
+    from fieldtwin.results.fault_counts import struck_of
+
+    for fault in faults[:MOST_FAULTS]:
+        colour = "yellow" if not fault["struck"] and not fault["optional"] else "default"
+        data.print(
+            f"  [{colour}]fault[/{colour}]          {escape(struck_of(fault).text)}", soft_wrap=True, highlight=False
+        )
+    if len(faults) > MOST_FAULTS:
+        idle = sum(not fault["struck"] for fault in faults)
+        data.print(f"  faults         {len(faults)} in all, {idle} of them never struck", soft_wrap=True)
+
+
+def _times(count: int) -> str:
+    return "once" if count == 1 else f"{count} times"
+
+
+def _thread_text(thread: dict[str, Any]) -> str:
+    """What the plant's side of the digital thread kept and sent, and what is wrong with store or carrier."""
+    text = f"{thread['written']} events kept, {thread['waiting']} not confirmed by the other side"
+    troubles = [t for t in (thread["store_trouble"], thread["trouble"]) if t]
+    return "; ".join([text, *troubles])
+
+
+def _learnt_text(learnt: dict[str, Any], kind: str) -> str:
+    """What a device, or what stood in for it, taught; the line for its profile last, so that it can be taken as it is."""
+    parts = []
+    if learnt["missing"]:
+        parts.append(f"does not have {', '.join(learnt['missing'])}")
+    if learnt["borders"]:
+        parts.append(
+            f"takes fewer registers at once than `limits: read_registers` says: {', '.join(learnt['borders'])}"
+        )
+    if learnt["line"]:
+        parts.append(f"for the profile of {learnt['profile']}: {learnt['line']}")
+    return f"learnt from the {kind}: " + "; ".join(parts)
+
+
+def _exchange_text(row: dict[str, Any]) -> str:
+    gateway = row["gateway"]
+    text = f"gateway {gateway['requests']} requests, {gateway['replies']} replies"
+    if "pdos" in gateway:
+        text += f", {gateway['pdos']} PDOs, {gateway['heartbeats']} heartbeats"
+    if "emulators" in row:
+        text += f"; emulators {row['emulators']['requests']} / {row['emulators']['replies']}"
+        text += f", with those of {row['shared']}" if "shared" in row else ""
+        text += f", and {row['others']['requests']} requests of other clients" if "others" in row else ""
+    if row["timeouts"] or row["crc_errors"]:
+        text += f"; {row['timeouts']} timeouts, {row['crc_errors']} CRC errors"
+    return text

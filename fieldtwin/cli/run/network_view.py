@@ -1,0 +1,298 @@
+"""`fieldtwin run NETWORK`: several systems and the water between them, in virtual time or on this host."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import signal
+import sys
+from contextlib import AsyncExitStack
+from pathlib import Path
+from typing import Any
+
+from rich.console import Group
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from fieldtwin.cli.run.live_view import print_faults, troubles
+from fieldtwin.cli.run.network_request import NetworkRequest
+from fieldtwin.cli.run.virtual_view import parse_seeds, progress_bar, run_many, shown_time
+from fieldtwin.cli.template_question import consent
+from fieldtwin.console import data, show_warnings, talk
+from fieldtwin.emulators.faults.schema import load_faults
+from fieldtwin.gateway.core.errors import FieldtwinError, UsageError
+from fieldtwin.gateway.wallclock import WallClock
+from fieldtwin.run.live.network_session import NetworkOptions, NetworkSession
+from fieldtwin.run.live.network_summary import summarise_network
+from fieldtwin.run.live.session import RunSession
+from fieldtwin.run.live.summary import summarise
+from fieldtwin.run.processes.topside import Scripted, script
+from fieldtwin.run.template import agree
+from fieldtwin.run.virtual.network_run import VirtualNetworkOptions
+from fieldtwin.twin.network.faults import check_network_fault
+from fieldtwin.twin.network.network import SHIP, Network, load_network
+
+FIRST_S = 1.0
+BASE_S = 10
+"""What the ship orders, and when, where nothing is said."""
+THREAD = "tcp://127.0.0.1:0"
+REFRESH_S = 0.25
+LINE_S = 5.0
+MAX_TROUBLES = 5
+
+
+def run_network(request: NetworkRequest) -> int:
+    """The exit status: 0 when all is well, on every system."""
+    if request.virtual and request.duration_s <= 0:
+        raise UsageError("--virtual needs an end", expected="--for 24h")
+    if not request.virtual and (request.seed is not None or request.trace):
+        raise UsageError("--seed and --trace go with --virtual")
+    if request.thread and (request.virtual or request.thread != THREAD):
+        raise UsageError(
+            "each system of a network has a thread and a port of its own",
+            expected=f"--thread {THREAD}, without --virtual",
+        )
+    if not request.virtual and (request.seeds or request.faults == "random"):
+        raise UsageError("--seeds and random faults go with --virtual")
+    network = load_network(request.path, [Path(p) for p in request.profiles])
+    members = [(member.system, member.prototype.path) for member in network.members.values()]
+    agree(consent(trust=request.trust), request.path, members, beside=request.path, virtual=request.virtual)
+    if request.virtual and request.seeds:
+        return _many(request, network)
+    _print_network(network)
+    return _virtual(request, network) if request.virtual else asyncio.run(_on_this_host(request, network))
+
+
+def _faults(request: NetworkRequest, network: Network) -> tuple[dict[str, Any], ...]:
+    if request.faults in ("", "random"):
+        return ()
+    return load_faults(Path(request.faults), lambda spec: check_network_fault(network, spec))
+
+
+def _commands(request: NetworkRequest) -> tuple[Scripted, ...]:
+    if request.commands is None:
+        return (Scripted(FIRST_S, BASE_S),)
+    return tuple(script(request.commands, request.duration_s or 20.0)) if request.commands else ()
+
+
+def _print_network(network: Network) -> None:
+    """Who is there, and who hears whom."""
+    show_warnings(dict.fromkeys(warning for member in network.members.values() for warning in member.system.warnings))
+    sea = network.medium(network.seed)
+    talk.print(f"[bold]network[/bold] {network.name}, prototypes of {len(network.members)} systems", highlight=False)
+    for name in network.places:
+        heard = ", ".join(sea.neighbours(name)) or "nobody"
+        what = f" ({network.members[name].system.name})" if name in network.members else ""
+        talk.print(f"  {name}{what}: hears {heard}", soft_wrap=True, highlight=False)
+
+
+def _options(request: NetworkRequest, network: Network) -> VirtualNetworkOptions:
+    return VirtualNetworkOptions(
+        str(request.path),
+        request.duration_s,
+        request.seed,
+        tuple(Path(p) for p in request.profiles),
+        _commands(request),
+        _faults(request, network),
+        request.random_faults,
+        Path(request.trace) if request.trace else None,
+    )
+
+
+def _many(request: NetworkRequest, network: Network) -> int:
+    if request.trace or request.seed is not None:
+        raise UsageError("--seeds makes many runs", hint="--seed and --trace belong to one")
+    ledger = Path(request.ledger) if request.ledger else None
+    return run_many(_options(request, network), parse_seeds(request.seeds), request.jobs, request.as_json, ledger)
+
+
+def _virtual(request: NetworkRequest, network: Network) -> int:
+    options = _options(request, network)
+    run = options.make()
+    talk.print(f"virtual time, seed {run.seed}, {shown_time(options.duration_s)}", markup=False, highlight=False)
+    began_ns = WallClock().monotonic_ns()
+    with progress_bar(options.duration_s) as at:
+        run.run(at)
+    took_s = (WallClock().monotonic_ns() - began_ns) / 1e9
+    summary = run.summary()
+    if request.as_json:
+        return _as_json(summary)
+    print_network_summary(summary)
+    trace = summary["trace"]
+    data.print(f"  trace          {trace['events']} events, sha256 {trace['sha256']}", soft_wrap=True)
+    data.print(f"  took           {took_s:.1f} s, {run.elapsed_s / took_s:,.0f} times as fast as time", soft_wrap=True)
+    return _verdict(summary)
+
+
+async def _on_this_host(request: NetworkRequest, network: Network) -> int:
+    options = NetworkOptions(
+        request.instance,
+        request.duration_s,
+        None,
+        tuple(Path(p) for p in request.profiles),
+        request.cold,
+        commands=_commands(request),
+        faults=_faults(request, network),
+        thread=request.thread,
+    )
+    session = NetworkSession(network, options)
+    interrupted = started = False
+    me = asyncio.current_task()
+    assert me is not None
+
+    def interrupt() -> None:
+        nonlocal interrupted
+        interrupted = True
+        session.stopped.set()
+        if not started:
+            me.cancel()
+
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, interrupt)
+    async with AsyncExitStack() as stack:
+        try:
+            await stack.enter_async_context(session)
+        except (asyncio.CancelledError, FieldtwinError):
+            if interrupted:
+                return 130
+            raise
+        started = True
+        for name, one in session.sessions.items():
+            talk.print(f"  {name}: instance {one.instance.name} in {one.instance.dir}", soft_wrap=True, highlight=False)
+            if one.thread_place:
+                talk.print(f"  {name}: digital thread  ←  {one.thread_place}", soft_wrap=True, highlight=False)
+        if session.ship is not None:
+            talk.print(f"  the ship's modem  →  {session.ship}", soft_wrap=True, highlight=False)
+        showing = asyncio.create_task(_show(session, quiet=request.as_json))
+        try:
+            await session.wait()
+        finally:
+            showing.cancel()
+            await asyncio.wait([showing])
+        elapsed_s = session.elapsed_s
+    if not showing.cancelled() and (failed := showing.exception()) is not None:
+        raise failed
+    systems = {name: summarise(one) for name, one in session.sessions.items()}
+    ship = session.shore.describe() if session.shore is not None else None
+    summary = summarise_network(network, systems, session.counters(), ship, [], session.faults.history.describe())
+    summary["duration_s"] = round(elapsed_s, 3)
+    if request.as_json:
+        code = _as_json(summary)
+    else:
+        print_network_summary(summary)
+        code = _verdict(summary)
+    return 130 if interrupted and options.duration_s else code
+
+
+# -- while it runs ------------------------------------------------------------------------------------------------------
+
+
+async def _show(session: NetworkSession, quiet: bool) -> None:
+    """On a terminal a table, elsewhere a line for each system now and then."""
+    if quiet:
+        return
+    if talk.is_terminal:
+        with Live(_table(session), console=talk, auto_refresh=False, transient=True) as live:
+            while True:
+                live.update(_table(session), refresh=True)
+                await asyncio.sleep(REFRESH_S)
+    told: set[str] = set()
+    while True:
+        await asyncio.sleep(LINE_S)
+        now = _troubles(session)
+        for trouble in now:
+            if trouble not in told:
+                talk.print(f"! {trouble}", soft_wrap=True, markup=False, highlight=False)
+        told = set(now)
+        parts = [f"{name} {_states(one)} {_outputs(one)}".strip() for name, one in session.sessions.items()]
+        talk.print(f"{session.elapsed_s:6.0f} s  {' | '.join(parts)}", soft_wrap=True, markup=False, highlight=False)
+
+
+def _table(session: NetworkSession) -> Group:
+    table = Table(expand=False, pad_edge=False, box=None, header_style="dim")
+    for column, right in (
+        ("system", 0), ("state", 0), ("outputs", 0), ("devices", 0), ("said", 1), ("heard", 1), ("lost", 1)
+    ):  # fmt: skip
+        table.add_column(column, justify="right" if right else "left", no_wrap=True)
+    counters = session.counters()
+    for name in session.network.places:
+        one, sea = session.sessions.get(name), counters[name]
+        lost = sum(sea[why] for why in ("collision", "speaking", "chance", "fault"))
+        row = [name, "", "", ""] if one is None else [name, _states(one), _outputs(one), _devices(one)]
+        table.add_row(*row, str(sea["said"]), str(sea["heard"]), str(lost))
+    head = Text(f"{session.network.name}, {session.elapsed_s:.0f} s")
+    lines = [Text(f"! {trouble}", style="red") for trouble in _troubles(session)[-MAX_TROUBLES:]]
+    return Group(head, table, *lines)
+
+
+def _states(session: RunSession) -> str:
+    return " ".join(session.states.current.values())
+
+
+def _outputs(session: RunSession) -> str:
+    """What the control logic wants of its devices."""
+    outputs = (session.gateway_status or {}).get("outputs", [])
+    return " ".join(f"{o['tag'].partition('.')[2]} {o['wanted']:g}" for o in outputs if o["wanted"] is not None)
+
+
+def _devices(session: RunSession) -> str:
+    devices = (session.gateway_status or {}).get("devices", {})
+    bad = [name for name, device in devices.items() if not device["online"]]
+    return f"{', '.join(bad)} bad" if bad else f"{len(devices)} good" if devices else ""
+
+
+def _troubles(session: NetworkSession) -> list[str]:
+    return [f"{name}: {text}" for name, one in session.sessions.items() for text in troubles(one)]
+
+
+# -- at the end ---------------------------------------------------------------------------------------------------------
+
+
+def _as_json(summary: dict[str, Any]) -> int:
+    json.dump(summary, sys.stdout, indent=2)
+    sys.stdout.write("\n")
+    return 0 if summary["ok"] else 1
+
+
+def _verdict(summary: dict[str, Any]) -> int:
+    data.print("[bold green]ok[/bold green]" if summary["ok"] else "[bold red]not ok[/bold red]")
+    return 0 if summary["ok"] else 1
+
+
+def print_network_summary(summary: dict[str, Any]) -> None:
+    """The end of a run, for a person, on stdout, but for the verdict."""
+    data.print(f"[bold]{summary['network']}[/bold] (network of prototypes), {summary['duration_s']:.1f} s")
+    for name, one in summary["systems"].items():
+        good = [device for device, d in one["devices"].items() if d["state"] == "good"]
+        devices = f"{', '.join(good)} [green]good[/green]" if good else ""
+        bad = [f"{device} [red]bad[/red] {d['error']}" for device, d in one["devices"].items() if device not in good]
+        data.print(
+            f"  {name:<14} {'; '.join([*([devices] if devices else []), *bad])}", soft_wrap=True, highlight=False
+        )
+        for states in one["states"].values():
+            data.print(f"  {'':<14} {' → '.join(states) or 'no scan seen'}", soft_wrap=True, highlight=False)
+        published = one["published"]
+        data.print(
+            f"  {'':<14} published {published['checked']} compared with what the devices held, {published['wrong']} wrong;"
+            f" logged {one['logged']}",
+            soft_wrap=True,
+            highlight=False,
+        )
+        print_faults(one["faults"])
+        for error in one["errors"]:
+            data.print(f"  {'':<14} [red]error[/red] {error}", soft_wrap=True, highlight=False)
+    for name, sea in summary["water"].items():
+        lost = ", ".join(f"{sea[why]} by {why}" for why in ("chance", "collision", "speaking", "fault") if sea[why])
+        text = f"said {sea['said']}, heard {sea['heard']}" + (f"; missed {lost}" if lost else "")
+        data.print(
+            f"  {'water' if name == next(iter(summary['water'])) else '':<14} {name}: {text}",
+            soft_wrap=True,
+            highlight=False,
+        )
+    print_faults(summary["faults"])
+    if ship := summary["ship"]:
+        data.print(f"  {SHIP:<14} commands {ship['commands_sent']}, heard {ship['responses']}", highlight=False)
+    for error in summary["errors"]:
+        data.print(f"  [red]error[/red]          {error}", soft_wrap=True)

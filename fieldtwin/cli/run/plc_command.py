@@ -1,0 +1,300 @@
+"""`fieldtwin plc`: look into the PLC of a running instance, force, step, and ask why; draw and prove its programs."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import click
+
+from fieldtwin.cli.options import NegativeNumbers, json_option, profiles_option
+from fieldtwin.cli.output_files import write_text
+from fieldtwin.cli.template_question import consent, trust_option
+from fieldtwin.console import talk
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.twin.site.system import System, load_system
+
+instance_option = click.option(
+    "--instance", default="", metavar="NAME", help="Which one; default: the only one that runs."
+)
+yes_option = click.option("--yes", is_flag=True, help="Do not ask.")
+
+
+@click.group("plc")
+def command() -> None:
+    """The soft PLC: status, tags, forces, single steps, reasons, diagrams and proofs.
+
+    Forces, pauses and restarts change what a plant does. Each asks first, showing what is and what will be; without a
+    terminal it needs --yes. Forces stay until they are taken away, and every status lists them.
+    """
+
+
+def _emit(value: Any) -> int:
+    json.dump(value, sys.stdout, indent=2)
+    sys.stdout.write("\n")
+    return 0
+
+
+def _sure(question: str, yes: bool) -> None:
+    """Raises `UsageError` where nobody can be asked, `Abort` where the answer is no."""
+    if yes:
+        return
+    if not sys.stdin.isatty():
+        raise UsageError(f"{question}: nobody to ask", hint="--yes, if that is what is meant")
+    click.confirm(question, abort=True, err=True)
+
+
+def _status(instance: str, brief: bool) -> dict[str, Any]:
+    from fieldtwin.run.processes.plc_client import talk_to
+
+    found = talk_to(instance, lambda client: client.call("get", brief=brief))
+    assert isinstance(found, dict)
+    return found
+
+
+def _tags(instance: str, patterns: tuple[str, ...]) -> list[dict[str, Any]]:
+    from fieldtwin.cli.run.plc_views import ask_tags
+    from fieldtwin.run.processes.plc_client import talk_to
+
+    return talk_to(instance, lambda client: ask_tags(client, patterns))
+
+
+def _call(instance: str, verb: str, **args: Any) -> Any:
+    from fieldtwin.run.processes.plc_client import talk_to
+
+    return talk_to(instance, lambda client: client.call(verb, **args))
+
+
+def _act(instance: str, verb: str, **args: Any) -> Any:
+    """A verb that changes something: on record with the user's name."""
+    import getpass
+
+    return _call(instance, verb, by=getpass.getuser(), **args)
+
+
+@command.command("status")
+@instance_option
+@json_option
+def status(instance: str, as_json: bool) -> int:
+    """State, cycle statistics of each task, forces, retained variables, counters."""
+    from fieldtwin.cli.run.plc_views import print_status, tags_as_data
+
+    found = _status(instance, brief=not as_json)
+    if as_json:
+        return _emit({**found, "tags": tags_as_data(_tags(instance, ()))})
+    print_status(found)
+    return 0
+
+
+@command.command("watch")
+@click.argument("tags", nargs=-1)
+@click.option("--once", is_flag=True, help="Print once and end.")
+@instance_option
+@json_option
+def watch(tags: tuple[str, ...], once: bool, instance: str, as_json: bool) -> int:
+    """Live values of TAGS (all, if none is named), with unit, limits, quality, age and forces. Ctrl-C ends it.
+
+    Each is a tag, a device or a program for all of its tags, or a pattern such as '*.state'.
+    """
+    import asyncio
+
+    from fieldtwin.cli.run.plc_views import print_tags, tags_as_data, watch_live
+    from fieldtwin.run.processes.plc_client import choose
+
+    if once or as_json or not sys.stdout.isatty():
+        rows = _tags(instance, tags)
+        if as_json:
+            return _emit(tags_as_data(rows))
+        print_tags(rows)
+        return 0
+    asyncio.run(watch_live(choose(instance), tags))
+    return 0
+
+
+@command.command("force", cls=NegativeNumbers)
+@click.argument("tag")
+@click.argument("value")
+@yes_option
+@instance_option
+def force(tag: str, value: str, yes: bool, instance: str) -> int:
+    """Put VALUE in the place of TAG, an input, an output or a local, until it is unforced: true, false, a number, a state."""
+    from fieldtwin.cli.run.plc_views import is_now
+    from fieldtwin.run.processes.plc_client import parse_value
+
+    rows = [row for row in _tags(instance, (tag,)) if row["tag"] == tag]
+    now = is_now(rows, tag)
+    codes = {word: int(code) for code, word in rows[-1]["words"].items()}
+    wanted = codes[value] if value in codes else parse_value(value, tuple(codes))
+    _sure(f"{tag} is {now}; force it to {value}", yes)
+    _act(instance, "force", tag=tag, value=wanted)
+    talk.print(f"{tag} is forced to {value}", markup=False)
+    return 0
+
+
+@command.command("unforce")
+@click.argument("tag", required=False)
+@click.option("--all", "every", is_flag=True, help="Take all forces away.")
+@instance_option
+def unforce(tag: str | None, every: bool, instance: str) -> int:
+    """Take the force of TAG away. The safe direction: it does not ask."""
+    if bool(tag) == every:
+        raise UsageError("what is to be unforced", expected="a TAG, or --all")
+    done = _act(instance, "unforce", all=True) if every else _act(instance, "unforce", tag=tag)
+    talk.print(f"{done['removed']} taken away", markup=False)
+    return 0
+
+
+@command.command("pause")
+@yes_option
+@instance_option
+def pause(yes: bool, instance: str) -> int:
+    """Execute nothing more; outputs stay as they are, and the plant keeps them."""
+    _sure("pause the PLC: its outputs stay as they are, whatever the plant does", yes)
+    _act(instance, "pause")
+    talk.print("paused; fieldtwin plc step, fieldtwin plc go")
+    return 0
+
+
+@command.command("go")
+@instance_option
+def go(instance: str) -> int:
+    """Go on after a pause."""
+    _act(instance, "go")
+    talk.print("running")
+    return 0
+
+
+@command.command("step", cls=NegativeNumbers)
+@click.argument("count", type=click.IntRange(1, 10_000), default=1)
+@instance_option
+def step(count: int, instance: str) -> int:
+    """While paused, execute COUNT scans (1) of the fastest task, and of the others those that fall due in that time."""
+    import getpass
+
+    from fieldtwin.run.processes.plc_client import step_and_wait, talk_to
+
+    scans = talk_to(instance, lambda client: step_and_wait(client.call, count, getpass.getuser()))
+    texts = [f"{name + ': ' if len(scans) > 1 else ''}{n} scan{'' if n == 1 else 's'}" for name, n in scans.items()]
+    talk.print(", ".join(texts), markup=False)
+    return 0
+
+
+@command.command("restart")
+@click.option("--cold", is_flag=True, help="Without what is retained.")
+@yes_option
+@instance_option
+def restart(cold: bool, yes: bool, instance: str) -> int:
+    """Make the programs anew: first scan, initial values, and (unless --cold) what is retained."""
+    _sure(f"restart the PLC {'cold' if cold else 'warm'}: its outputs are made safe in between", yes)
+    talk.print(_act(instance, "restart", cold=cold)["start"], markup=False)
+    return 0
+
+
+@command.command("why")
+@click.argument("tag")
+@instance_option
+@json_option
+def why(tag: str, instance: str, as_json: bool) -> int:
+    """Which program last changed TAG (an output or local), when, and what its inputs were then.
+
+    Without --json it also says what the program waits for, where it has not started.
+    """
+    from fieldtwin.cli.run.plc_views import print_why
+
+    answer = _call(instance, "why", tag=tag)
+    if as_json:
+        return _emit(answer["changes"])
+    print_why(tag, answer["changes"], answer["waits_for"])
+    return 0
+
+
+def _agreed(system: str, profiles: tuple[str, ...], *, trust: bool) -> System:
+    """The system of which a program is to be looked at: it is imported, and nothing is opened."""
+    from fieldtwin.run.template import system_file
+
+    folders = [Path(p) for p in profiles]
+    return load_system(system_file(system, consent(trust=trust), plant=True, profiles=folders), folders)
+
+
+@command.command("diagram")
+@click.argument("system")
+@click.option(
+    "--program", default="", metavar="NAME", help="Of which program; default: the only one with a state table."
+)
+@click.option(
+    "-o", "--output", type=click.Path(dir_okay=False, path_type=Path), help="Write it there; default: stdout."
+)
+@trust_option
+@profiles_option
+def diagram(system: str, program: str, output: Path | None, trust: bool, profiles: tuple[str, ...]) -> int:
+    """Draw the state table of a program of SYSTEM as SVG."""
+    from fieldtwin.plc.diagram import svg
+    from fieldtwin.run.processes.plc_client import chosen, table_of
+
+    loaded = _agreed(system, profiles, trust=trust)
+    name, table = chosen(loaded, program, table_of, "a state table")
+    drawn = svg(table, f"{loaded.name}: {name}")
+    if output is None:
+        sys.stdout.write(drawn)
+    else:
+        write_text(output, drawn)
+    return 0
+
+
+@command.command("prove")
+@click.argument("system")
+@click.option("--program", default="", metavar="NAME", help="Of which program; default: the only one with a proof.")
+@click.option("--max-states", type=click.IntRange(1), default=200_000, show_default=True)
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(dir_okay=False, path_type=Path),
+    help="Write a counterexample there, as a scenario.",
+)
+@trust_option
+@profiles_option
+@json_option
+def prove(
+    system: str,
+    program: str,
+    max_states: int,
+    output: Path | None,
+    trust: bool,
+    profiles: tuple[str, ...],
+    as_json: bool,
+) -> int:
+    """Look at every state that a program of SYSTEM can get into, against its invariants.
+
+    Breadth first over states, inputs, qualities and timer phases, as the PROOF beside the program says (its module's name with
+    _proof behind). Exit 1 with a shortest counterexample, or when the bounds were reached before everything was seen.
+    """
+    from fieldtwin.cli.run.plc_views import print_proof
+    from fieldtwin.plc.prove import prove as look
+    from fieldtwin.run.processes.plc_client import chosen, proof_of
+    from fieldtwin.scenarios.language.counterexample import scenario
+
+    loaded = _agreed(system, profiles, trust=trust)
+    name, proof = chosen(loaded, program, proof_of, "a proof")
+    result = look(proof, max_states)
+    text = scenario(loaded, name, proof, result) if result.broken else ""
+    if output is not None and text:
+        write_text(output, text)
+    if as_json:
+        _emit(
+            {
+                "program": name,
+                "proved": result.proved,
+                "states": result.states,
+                "transitions": result.transitions,
+                "depth": result.depth,
+                "invariants": list(proof.invariants),
+                "broken": result.broken,
+                "reason": result.reason,
+                "way": [given.describe() for given in result.way],
+            }
+        )
+    else:
+        print_proof(name, proof, result, text)
+    return 0 if result.proved else 1

@@ -1,0 +1,267 @@
+"""What `fieldtwin plc` shows: tables on a terminal, the same as plain lines elsewhere."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from fieldtwin.console import data, talk
+from fieldtwin.gateway.core.control import ControlClient
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.plc.prove import Proof, Result
+from fieldtwin.plc.tag_view import MAX_AT_ONCE, matches
+
+REFRESH_S = 0.25
+IN_A_PIPE = 500
+ROOM_FOR_LIMITS = 100
+"""Columns of a terminal from which limits are shown, too."""
+_WHOLE_TYPES = {
+    span
+    for bits in (8, 16, 32, 64)
+    for span in ((0, 2**bits - 1), (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1), (0, 2.0**bits))
+}
+
+AT_TIMEOUT = {
+    "wait": "reported as an error after {:g} s",
+    "stop": "the PLC stops after {:g} s",
+    "start_anyway": "it starts anyway after {:g} s",
+}
+
+Row = dict[str, Any]
+"""One tag as the PLC's `image` verb describes it."""
+
+
+async def chosen_tags(client: ControlClient, patterns: tuple[str, ...]) -> list[str]:
+    """The names that match. Raises `UsageError` for a pattern that nothing matches."""
+    names: list[str] = (await client.call("image"))["names"]
+    for pattern in patterns:
+        if not any(matches(name, pattern) for name in names):
+            raise UsageError(f"no tag {pattern!r}", expected=", ".join(names[:12]) + (", ..." if names[12:] else ""))
+    return [name for name in names if not patterns or any(matches(name, p) for p in patterns)]
+
+
+async def ask_rows(client: ControlClient, names: list[str]) -> list[Row]:
+    """Rows of tags, inputs before outputs, asked for in pieces so that no scan is late for it."""
+    rows: list[Row] = []
+    for at in range(0, len(names), MAX_AT_ONCE):
+        rows += (await client.call("image", tags=names[at : at + MAX_AT_ONCE]))["tags"]
+    return sorted(rows, key=lambda row: row["side"])  # which keeps their order otherwise
+
+
+async def ask_tags(client: ControlClient, patterns: tuple[str, ...]) -> list[Row]:
+    return await ask_rows(client, await chosen_tags(client, patterns))
+
+
+def tags_as_data(rows: list[Row]) -> dict[str, Row]:
+    """For JSON: by tag. One that is read back stands in both regions: what is commanded, with what was read as `input`."""
+    found: dict[str, Row] = {}
+    for row in rows:
+        before = found.get(row["tag"])
+        found[row["tag"]] = row if before is None else {**row, "input": before}
+    return found
+
+
+def tag_table(rows: list[Row]) -> Table:
+    table = Table(box=None, pad_edge=False)
+    names = ["tag", "value", "unit", "limits", "quality", "age", ""]
+    if _width() < ROOM_FOR_LIMITS or not any(_limits(row["limits"]) for row in rows):
+        names.remove("limits")
+    for name in names:
+        justify: Any = "right" if name in ("value", "age") else "left"
+        table.add_column(name, justify=justify, no_wrap=name not in ("quality", "limits"))
+    for row in rows:
+        forced = row["forced"]
+        style = "yellow" if forced else "red" if row["quality"] == "bad" else ""
+        cells = {
+            "tag": row["tag"],
+            "value": _named(row, row["value"]),
+            "unit": row["unit"],
+            "limits": _limits(row["limits"]),
+            "quality": _quality(row),
+            "age": "-" if row["age_s"] is None else _age(row["age_s"] * 1000),
+            "": f"FORCED {row['side']}" if forced else row["side"],
+        }
+        table.add_row(*(Text(cells[name]) for name in names), style=style)
+    return table
+
+
+def _named(row: Row, value: Any) -> str:
+    """A value by its word where it has one, such as a state's name."""
+    return str(row["words"].get(str(value), _value(value)))
+
+
+def _limits(limits: list[float] | None) -> str:
+    """Nothing for those that only say how many bits an integer has."""
+    if limits is None or tuple(limits) in _WHOLE_TYPES:
+        return ""
+    return f"{limits[0]:.6g}..{limits[1]:.6g}"
+
+
+def _quality(row: Row) -> str:
+    """With its reason, and what programs see in place of it."""
+    text = str(row["quality"]) + ("" if row["reason"] == "none" else f": {row['reason']}")
+    for variable, seen in row["seen"].items():
+        text += f"; {variable} sees {_value(seen['value'])} ({seen['quality']})"
+    return text
+
+
+def print_tags(rows: list[Row]) -> None:
+    _print_table(tag_table(rows))
+
+
+def _width() -> int:
+    """Columns: a terminal's, and in a pipe as many as it takes, so that nothing is cut off there."""
+    return data.width if data.is_terminal else IN_A_PIPE
+
+
+def _print_table(table: Table) -> None:
+    console = data if data.is_terminal else Console(file=data.file, width=IN_A_PIPE, highlight=False, emoji=False)
+    console.print(table)
+
+
+async def watch_live(path: Path, patterns: tuple[str, ...]) -> None:
+    client = await ControlClient.connect_unix(path)
+    try:
+        names = await chosen_tags(client, patterns)
+        with Live(console=data, auto_refresh=False, transient=True) as live:
+            while True:
+                live.update(tag_table(await ask_rows(client, names)), refresh=True)
+                await asyncio.sleep(REFRESH_S)
+    finally:
+        await client.aclose()
+
+
+def print_status(status: dict[str, Any]) -> None:
+    head = f"{status['state']}"
+    if status["stop_reason"] != "none":
+        head += f" ({status['stop_reason']})"
+    if status["restart_in_ms"] is not None:
+        head += f", restarts in {status['restart_in_ms'] / 1000:.1f} s"
+    data.print(f"PLC: {head}", markup=False)
+    if status["error"]:
+        data.print(f"  {status['error']}", markup=False, soft_wrap=True)
+    for text in [*waiting_texts(status), *without_texts(status)]:
+        data.print(f"  {text}", style="yellow", markup=False, soft_wrap=True)
+    data.print(f"gateway: {'alive' if status['gateway_alive'] else 'DEAD: every input is bad'}", markup=False)
+    table = Table(box=None, pad_edge=False)
+    for name in (
+        "task",
+        "every",
+        "scans",
+        "missed",
+        "overrun",
+        "late\np50",
+        "\np99",
+        "\nmax",
+        "takes\np50",
+        "\np99",
+        "\nmax",
+    ):
+        is_text = name in ("task", "every")
+        table.add_column(name, justify="left" if is_text else "right", no_wrap=not is_text, overflow="fold")
+    for name, task in status["tasks"].items():
+        late, took = task["lateness_us"], task["duration_us"]
+        every = f"on {task['single']}" if task["single"] else f"{task['cycle_ms']:g} ms"
+        table.add_row(
+            name, every, str(task["scans"]), str(task["missed_periods"]), str(task["overruns"]),
+            *(_us(late[k]) for k in ("p50", "p99", "max")), *(_us(took[k]) for k in ("p50", "p99", "max")),
+        )  # fmt: skip
+    _print_table(table)
+    data.print(f"restarts: {status['restarts']}; {status['retain']['start']}", markup=False)
+    granted, refused = status["realtime"]["granted"], status["realtime"]["refused"]
+    data.print("granted: " + (", ".join(granted) or "nothing"), markup=False, soft_wrap=True)
+    if refused:
+        data.print("refused: " + ", ".join(f"{k} ({v})" for k, v in refused.items()), markup=False, soft_wrap=True)
+    counters = {name: count for name, count in status["counters"].items() if count}
+    if counters:
+        data.print("counted: " + ", ".join(f"{n} {c}" for n, c in counters.items()), markup=False)
+    if status["acts"]:
+        data.print("done to it: " + acts_text(status["acts"]), markup=False)
+    if status["forces"]:
+        data.print(f"FORCED: {len(status['forces'])}", style="yellow")
+        for tag, force in status["forces"].items():
+            by = f" by {force['by']}" if force["by"] else ""
+            data.print(f"  {tag} = {force['value']}{by}, {_age(force['age_ms'])} ago", style="yellow", markup=False)
+    else:
+        data.print("nothing is forced")
+
+
+def waiting_texts(plc: dict[str, Any]) -> list[str]:
+    """One line for each program that has not started: what it waits for, how long already, and what happens at the timeout."""
+    return [
+        f"WAITING: program {program} starts after its inputs have been good once; missing {start['reason']}; "
+        f"{start['since_s']:.0f} s so far, {AT_TIMEOUT[start['at_timeout']].format(start['timeout_s'])}"
+        for program, start in plc.get("waiting", {}).items()
+    ]
+
+
+def without_texts(plc: dict[str, Any]) -> list[str]:
+    """One line for each program that started although inputs were missing."""
+    return [
+        f"program {program} started without " + ", ".join(f"{tag} ({reason})" for tag, reason in missing.items())
+        for program, missing in plc.get("started_without", {}).items()
+    ]
+
+
+def is_now(rows: list[Row], tag: str) -> str:
+    """What a tag is before it is forced, with unit and limits; the command where it is read back, too."""
+    if not rows:
+        raise UsageError(f"no tag {tag!r}", expected="a tag without *")
+    row = rows[-1]
+    about = [row["side"], _quality(row), *([_limits(row["limits"])] if _limits(row["limits"]) else [])]
+    return f"{_named(row, row['value'])} {row['unit']}".strip() + f" ({', '.join(about)})"
+
+
+def acts_text(acts: dict[str, int]) -> str:
+    """What people did to a PLC, and how often: ``2 x force, 1 x pause``."""
+    return ", ".join(f"{count} x {what}" for what, count in acts.items())
+
+
+def print_why(tag: str, changes: list[dict[str, Any]], waits_for: str = "") -> None:
+    """`waits_for`: what the program that writes the tag waits for before it starts."""
+    if waits_for:
+        data.print(f"{tag}: its program has not started; missing {waits_for}", markup=False, soft_wrap=True)
+    elif not changes:
+        data.print(f"{tag} has not changed since the programs began", markup=False)
+    for change in changes:
+        by = "a force, through" if change["forced"] else ""
+        data.print(
+            f"{_age(change['age_ms'])} ago, scan {change['scan']}: {_value(change['before'])} to {_value(change['after'])}, "
+            f"by {by + ' ' if by else ''}program {change['program']}",
+            markup=False,
+        )
+        for name, value in change["inputs"].items():
+            data.print(f"    {name} was {_value(value)}", markup=False)
+
+
+def print_proof(name: str, proof: Proof, result: Result, text: str) -> None:
+    seen = f"{result.states} states, {result.transitions} scans, {result.depth} deep"
+    if result.proved:
+        data.print(f"{name}: proved over {seen}", markup=False)
+        for invariant in proof.invariants:
+            data.print(f"  holds: {invariant}", markup=False, soft_wrap=True)
+    elif result.broken:
+        data.print(f"{name}: broken after {len(result.way)} scans: {result.broken}", markup=False, soft_wrap=True)
+        data.print(text, markup=False, highlight=False, soft_wrap=True, end="")
+    else:
+        data.print(f"{name}: nothing broken in {seen}, but no proof: {result.reason}", markup=False, soft_wrap=True)
+        if result.bounded:
+            talk.print("raise --max-states")
+
+
+def _us(us: float) -> str:
+    return f"{us:.0f}us" if us < 10_000 else f"{us / 1000:.1f}ms"
+
+
+def _age(ms: float) -> str:
+    return f"{ms:.0f} ms" if ms < 10_000 else f"{ms / 1000:.0f} s" if ms < 600_000 else f"{ms / 60_000:.0f} min"
+
+
+def _value(value: Any) -> str:
+    return "-" if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,419 @@
+"""`fieldtwin run`: a plant, or its prototype, from one and the same system file."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import signal
+import sys
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import click
+
+from fieldtwin.cli.campaign_options import Choice, fault_choice
+from fieldtwin.cli.options import Duration, Secret, json_option, pairs, profiles_option
+from fieldtwin.cli.run.network_request import NetworkRequest
+from fieldtwin.cli.template_question import consent, trust_option
+from fieldtwin.gateway.core.errors import FieldtwinError, UsageError
+from fieldtwin.run.live.options import RunOptions
+from fieldtwin.run.live.session import RunSession
+from fieldtwin.run.live.summary import summarise
+from fieldtwin.run.processes.topside import DEFAULT_SCRIPT, parse_periods
+from fieldtwin.run.template import system_file
+from fieldtwin.service.attached import Service, ServiceOptions, check
+from fieldtwin.service.journal import Format
+from fieldtwin.service.notify import Notifier
+from fieldtwin.twin.site.data_files import network_file
+
+if TYPE_CHECKING:
+    from fieldtwin.run.virtual.fault_schedule import RandomFaults
+    from fieldtwin.run.virtual.run import VirtualOptions
+
+NEITHER = """run needs --plant or --prototype; neither is a default.
+  --prototype   the field side is emulated, as NAME.prototype.yaml says: nothing real is touched
+  --plant       the endpoints in the system file, on real hardware; read-only without --allow-writes"""
+
+
+@click.command("run")
+@click.argument("system")
+@click.option("--prototype", is_flag=True, help="Emulate the field side, as NAME.prototype.yaml says.")
+@click.option("--plant", is_flag=True, help="Use the endpoints in the system file: real hardware.")
+@click.option("--allow-writes", is_flag=True, help="With --plant: write what the system file marks writable.")
+@click.option(
+    "--for", "duration_s", type=Duration(), default=0.0, help="Stop after a time such as 20s; default: run on."
+)
+@click.option("--instance", default="", help="Name of the run directory; default: the system's name.")
+@click.option("--prototype-file", type=click.Path(exists=True, dir_okay=False), help="Another prototype file.")
+@click.option(
+    "--field",
+    "field_host",
+    default="",
+    metavar="HOST[:PORT]",
+    help="The field side runs there already (fieldtwin emulate).",
+)
+@click.option(
+    "--token",
+    type=Secret(),
+    default="",
+    metavar="@FILE",
+    help="Token of that field side's control channel; or in FIELDTWIN_RUN_TOKEN.",
+)
+@click.option(
+    "--recording", "recordings", multiple=True, metavar="DEVICE=FILE", help="Play this recording for a device."
+)
+@click.option("--speed", type=float, default=0.0, help="Play recordings this much faster.")
+@click.option("--listen", multiple=True, metavar="BUS=ENDPOINT", help="Let a bus's emulators listen elsewhere.")
+@click.option(
+    "--can", default="", metavar="INTERFACE/CHANNEL", help="Emulated CAN buses on this interface, e.g. socketcan/vcan0."
+)
+@click.option(
+    "--commands",
+    default=None,
+    metavar="1,2,0,-1",
+    help="Periods to command from the far end, spread over the run; or none.",
+)
+@click.option(
+    "--capture", type=click.Path(dir_okay=False), help="Write what goes over the wires to this file (JSON lines)."
+)
+@click.option("--virtual", is_flag=True, help="With --prototype: in virtual time, in this process, as fast as it goes.")
+@click.option("--seed", type=int, default=None, help="Another seed than the prototype file's (with --virtual).")
+@click.option("--seeds", default="", metavar="1..200", help="With --virtual: a run for each of these seeds.")
+@click.option("--jobs", type=click.IntRange(1, 256), default=1, help="So many runs of --seeds at once.")
+@click.option(
+    "--ledger",
+    type=click.Path(dir_okay=False),
+    help="With --seeds: add each run to this file, and leave out those in it.",
+)
+@click.option("--trace", type=click.Path(dir_okay=False), help="With --virtual: every event to this file (JSON lines).")
+@click.option(
+    "--compare",
+    type=click.Path(exists=True, dir_okay=False),
+    help="With --virtual: hold the run against an older one's trace (fieldtwin trace --against); exit code 1 if it differs.",
+)
+@click.option(
+    "--faults",
+    default="",
+    metavar="FILE|random",
+    help="With --prototype: put these faults in (fieldtwin faults); random, with --virtual: ones that the seed chooses.",
+)
+@click.option(
+    "--thread",
+    default="",
+    metavar="URL",
+    help="A digital thread for `fieldtwin shadow` and `twin`: tcp://127.0.0.1:PORT or tls://... to listen on, "
+    "mqtt://HOST/GROUP/NODE, or modem: for the system's own modem.",
+)
+@click.option(
+    "--thread-store", default="", metavar="FILE|URL", help="What keeps the thread's log; default: in the run directory."
+)
+@click.option(
+    "--thread-every",
+    "thread_every_s",
+    type=Duration(),
+    default=None,
+    help="A tag's new value goes into the thread at most so often; default: each one, over a modem one a second.",
+)
+@click.option(
+    "--metrics",
+    default="",
+    metavar="HOST:PORT",
+    help="Serve metrics for Prometheus, e.g. 127.0.0.1:9464; without a host on loopback (docs/service.md).",
+)
+@click.option(
+    "--log",
+    type=click.Choice(["text", "json", "journal"]),
+    default=None,
+    help="Instead of a live view, events: as text, JSON lines, or to the journal with fields.",
+)
+@fault_choice
+@trust_option
+@click.option("--cold", is_flag=True, help="Retained variables of the PLC begin with their initial values.")
+@profiles_option
+@json_option
+def command(
+    system: str,
+    prototype: bool,
+    plant: bool,
+    allow_writes: bool,
+    duration_s: float,
+    instance: str,
+    prototype_file: str | None,
+    field_host: str,
+    token: str,
+    recordings: tuple[str, ...],
+    speed: float,
+    listen: tuple[str, ...],
+    can: str,
+    commands: str | None,
+    capture: str | None,
+    virtual: bool,
+    seed: int | None,
+    seeds: str,
+    jobs: int,
+    ledger: str | None,
+    trace: str | None,
+    compare: str | None,
+    faults: str,
+    thread: str,
+    thread_store: str,
+    thread_every_s: float | None,
+    metrics: str,
+    log: Format | None,
+    trust: bool,
+    cold: bool,
+    profiles: tuple[str, ...],
+    as_json: bool,
+    choice: Choice,
+) -> int:
+    """Run SYSTEM: gateway and PLC, each in its own process.
+
+    SYSTEM is a file, the name of a shipped one such as `observatory`, or a template (fieldtwin template): a zip or a folder. With
+    --prototype also a network, such as `ocean_network`: several systems, and the water between their modems.
+
+    With --prototype the field side is emulated in a process of its own, on real wires: a pty for each serial line, TCP sockets, a
+    software CAN bus (or a kernel one, with --can). The same system file runs the plant with --plant.
+    """
+    if prototype == plant:
+        raise UsageError(NEITHER if not plant else "--plant and --prototype exclude each other")
+    random_faults = choice.of(faults)
+    network = network_file(system, [Path(p) for p in profiles])
+    if network is not None:
+        others = {
+            "--field": field_host, "--recording": recordings, "--speed": speed, "--listen": listen, "--can": can,
+            "--capture": capture, "--compare": compare, "--thread-store": thread_store, "--metrics": metrics, "--log": log,
+            "--prototype-file": prototype_file,
+        }  # fmt: skip
+        return _run_network(
+            NetworkRequest(
+                network, virtual, duration_s, seed, instance, profiles,
+                parse_periods(commands) if commands is not None else None, trace, cold, as_json, thread,
+                faults, seeds, jobs, ledger, trust, random_faults,
+            ),
+            plant,
+            [option for option, said in others.items() if said],
+        )  # fmt: skip
+    if plant and faults:
+        raise UsageError("a plant has no faults but its own", hint="--faults goes with --prototype")
+    if plant and (field_host or recordings or listen or can or speed or prototype_file or commands):
+        raise UsageError(
+            "a plant is not emulated",
+            hint="--field, --recording, --speed, --listen, --can, --commands go with --prototype",
+        )
+    if prototype and allow_writes:
+        raise UsageError("--allow-writes is for --plant", hint="a prototype's emulators may be written to anyway")
+    system = system_file(
+        system,
+        consent(trust=trust),
+        plant=plant,
+        virtual=virtual,
+        prototype_file=Path(prototype_file) if prototype_file else None,
+        profiles=[Path(p) for p in profiles],
+    )
+    if (thread_store or thread_every_s is not None) and not thread:
+        raise UsageError("--thread-store and --thread-every go with --thread")
+    if virtual:
+        if plant or field_host or listen or can or capture or thread or metrics or log:
+            raise UsageError(
+                "--virtual is a prototype in this process, its wires in memory",
+                hint="--plant, --field, --listen, --can, --capture, --thread, --metrics, --log: real wires; --trace has frames",
+            )
+        if duration_s <= 0:
+            raise UsageError("--virtual needs an end", expected="--for 24h")
+        return _run_virtual(
+            VirtualRequest(
+                system,
+                duration_s,
+                seed,
+                profiles,
+                prototype_file,
+                recordings,
+                speed,
+                commands,
+                trace,
+                compare,
+                faults,
+                random_faults,
+            ),
+            seeds,
+            jobs,
+            Path(ledger) if ledger else None,
+            as_json,
+        )
+    if seeds or seed is not None or trace or compare or jobs != 1:
+        raise UsageError("--seed, --seeds, --jobs, --trace and --compare go with --virtual")
+    options = RunOptions(
+        system=system,
+        prototype=prototype,
+        allow_writes=allow_writes,
+        duration_s=duration_s,
+        instance=instance,
+        profiles=tuple(Path(p) for p in profiles),
+        prototype_file=Path(prototype_file) if prototype_file else None,
+        field_host=field_host,
+        token=token,
+        recordings=pairs(recordings, "--recording"),
+        speed=speed,
+        listen=pairs(listen, "--listen"),
+        can=can,
+        commands=parse_periods(commands)
+        if commands is not None
+        else ()
+        if thread.startswith("modem:")
+        else DEFAULT_SCRIPT,
+        capture=Path(capture) if capture else None,
+        cold=cold,
+        thread=thread,
+        thread_store=thread_store,
+        thread_every_s=thread_every_s,
+        faults=_faults(faults, system, profiles) if faults else (),
+    )
+    return asyncio.run(_run(options, ServiceOptions(metrics=metrics, log=log), as_json))
+
+
+def _run_network(request: NetworkRequest, plant: bool, others: list[str]) -> int:
+    from fieldtwin.cli.run.network_view import run_network
+
+    if plant:
+        raise UsageError(
+            "a network file is of prototypes: each of its systems is a plant of its own",
+            hint="run each where it is, with its own system file",
+        )
+    if others:
+        raise UsageError(
+            f"{', '.join(others)}: nothing of a network",
+            expected="--for, --virtual, --seed, --seeds, --jobs, --ledger, --faults, --trace, --commands, --instance, --thread, "
+            "--cold, --json",
+            hint="its systems can be run one by one",
+        )
+    return run_network(request)
+
+
+def _faults(path: str, system: str, profiles: tuple[str, ...]) -> tuple[dict[str, Any], ...]:
+    from fieldtwin.emulators.faults.schema import load_faults
+    from fieldtwin.twin.prototype.fault_aims import target
+    from fieldtwin.twin.site.system import load_system
+
+    if path == "random":
+        raise UsageError("random faults go with --virtual")
+    aimed_at = load_system(system, [Path(p) for p in profiles])
+    return load_faults(Path(path), lambda spec: target(aimed_at, spec))
+
+
+class VirtualRequest(NamedTuple):
+    """What the command line says of a run in virtual time."""
+
+    system: str
+    duration_s: float
+    seed: int | None
+    profiles: tuple[str, ...]
+    prototype_file: str | None
+    recordings: tuple[str, ...]
+    speed: float
+    commands: str | None
+    trace: str | None
+    compare: str | None
+    faults: str
+    random_faults: RandomFaults | None
+
+
+def _run_virtual(request: VirtualRequest, seeds: str, jobs: int, ledger: Path | None, as_json: bool) -> int:
+    from fieldtwin.cli.run.virtual_view import parse_seeds, run_many, run_one
+    from fieldtwin.run.virtual.run import VirtualOptions
+
+    options = VirtualOptions(
+        system=request.system,
+        duration_s=request.duration_s,
+        seed=request.seed,
+        profiles=tuple(Path(p) for p in request.profiles),
+        prototype_file=Path(request.prototype_file) if request.prototype_file else None,
+        recordings=pairs(request.recordings, "--recording"),
+        speed=request.speed,
+        commands=parse_periods(request.commands) if request.commands is not None else DEFAULT_SCRIPT,
+        trace=Path(request.trace) if request.trace else None,
+        faults=_faults(request.faults, request.system, request.profiles)
+        if request.faults not in ("", "random")
+        else (),
+        random_faults=request.random_faults,
+    )
+    if not seeds:
+        if ledger is not None:
+            raise UsageError("--ledger goes with --seeds")
+        return _run_against(options, Path(request.compare), as_json) if request.compare else run_one(options, as_json)
+    if request.trace or request.compare or request.seed is not None:
+        raise UsageError("--seeds makes many runs", hint="--seed, --trace and --compare belong to one")
+    return run_many(options, parse_seeds(seeds), jobs, as_json, ledger)
+
+
+def _run_against(options: VirtualOptions, old: Path, as_json: bool) -> int:
+    """The run, and then what of it is otherwise than in the trace `old`; the worse of both exit codes."""
+    from fieldtwin.cli.recordings.regression_view import judged, show
+    from fieldtwin.cli.run.virtual_view import run_one
+    from fieldtwin.scenarios.regression.comparing import Allowed
+    from fieldtwin.twin.site.system import load_system
+
+    if as_json:
+        raise UsageError(
+            "--compare with --json", hint="--trace NEW, then fieldtwin trace NEW SYSTEM --against OLD --json"
+        )
+    with TemporaryDirectory(prefix="ft-") as folder:
+        trace = options.trace or Path(folder) / "trace.jsonl"
+        code = run_one(replace(options, trace=trace), as_json)
+        return max(
+            code, show(judged(load_system(options.system, options.profiles), old, trace, Allowed()), old, as_json=False)
+        )
+
+
+async def _run(options: RunOptions, service_options: ServiceOptions, as_json: bool) -> int:
+    from fieldtwin.cli.run.live_view import LiveView, print_mapping, print_metrics, print_summary
+    from fieldtwin.console import show_warnings
+
+    check(service_options)
+    notifier = Notifier.from_environment()
+    session = RunSession(options)
+    interrupted = started = False
+    me = asyncio.current_task()
+    assert me is not None
+
+    def interrupt() -> None:
+        nonlocal interrupted
+        interrupted = True
+        session.stopped.set()
+        if not started:  # on a busy computer that takes a while, and nobody waits for it any more
+            me.cancel()
+
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, interrupt)
+    try:
+        async with session:
+            started = True
+            if service_options.log is None:
+                print_mapping(session)
+                show_warnings(session.system.warnings)
+            async with Service(session, service_options, notifier) as service:
+                if service_options.log is None:
+                    print_metrics(service.url)
+                if hasattr(signal, "SIGHUP"):
+                    # From a terminal it says that nobody watches any more; to a service, that its configuration changed.
+                    watched = not notifier.wanted and any(map(os.isatty, range(3)))
+                    loop.add_signal_handler(signal.SIGHUP, interrupt if watched else service.hang_up)
+                async with LiveView(session, quiet=as_json or service_options.log is not None):
+                    await session.wait()
+    except (asyncio.CancelledError, FieldtwinError):
+        if interrupted and not started:
+            return 130
+        raise
+    notifier.close()
+    summary = summarise(session)
+    if as_json:
+        json.dump(summary, sys.stdout, indent=2)
+        sys.stdout.write("\n")
+    else:
+        print_summary(summary)
+    if interrupted and options.duration_s:
+        return 130
+    return 0 if summary["ok"] else 1

@@ -1,0 +1,130 @@
+"""`fieldtwin shore`: the far end of a system's transmitter, on its own."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import signal
+import sys
+from pathlib import Path
+
+import click
+
+from fieldtwin.cli.options import Duration, Secret, json_option, profiles_option
+from fieldtwin.console import talk
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.wallclock import WallClock
+from fieldtwin.run.processes.field_contact import connect_control, reachable
+from fieldtwin.run.processes.topside import Shore, parse_periods, script
+from fieldtwin.twin.site.system import System, load_system
+
+
+@click.command("shore")
+@click.argument("system")
+@click.option("--far", default="", metavar="ENDPOINT", help="Where the far modem is, such as tcp://modem-ashore:502.")
+@click.option(
+    "--field",
+    "field_host",
+    default="",
+    metavar="HOST[:PORT]",
+    help="Or: ask this field side where its far modem listens.",
+)
+@click.option(
+    "--token",
+    type=Secret(),
+    default="",
+    metavar="@FILE",
+    help="Token of that field side's control channel; or in FIELDTWIN_SHORE_TOKEN.",
+)
+@click.option("--device", default="", help="The transmitter; default: the system's only one.")
+@click.option(
+    "--commands", default="none", metavar="1,2,0,-1", help="Periods to command, spread over the run; or none."
+)
+@click.option(
+    "--for", "duration_s", type=Duration(), default=0.0, help="Stop after a time such as 20s; default: run on."
+)
+@profiles_option
+@json_option
+def command(
+    system: str,
+    far: str,
+    field_host: str,
+    token: str,
+    device: str,
+    commands: str,
+    duration_s: float,
+    profiles: tuple[str, ...],
+    as_json: bool,
+) -> int:
+    """Send commands to SYSTEM from the far end of its transmitter, and show what comes back."""
+    loaded = load_system(system, tuple(Path(p) for p in profiles))
+    if bool(far) == bool(field_host):
+        raise UsageError("where is the far modem?", expected="--far ENDPOINT or --field HOST")
+    periods = parse_periods(commands)
+    return asyncio.run(_run(loaded, _transmitter(loaded, device), far, field_host, token, periods, duration_s, as_json))
+
+
+def _transmitter(system: System, name: str) -> str:
+    transmitters = [d.name for d in system.devices.values() if d.profile.inbox is not None]
+    if name and name not in transmitters:
+        raise UsageError(f"{name!r} is no transmitter", expected=", ".join(transmitters) or "none in this system")
+    if not name and len(transmitters) != 1:
+        raise UsageError("which transmitter?", expected="--device with one of " + (", ".join(transmitters) or "none"))
+    return name or transmitters[0]
+
+
+async def _run(
+    system: System,
+    device: str,
+    far: str,
+    field_host: str,
+    token: str,
+    periods: tuple[int, ...],
+    duration_s: float,
+    as_json: bool,
+) -> int:
+    stop = asyncio.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    endpoint = Endpoint.parse(far) if far else await _ask_field(device, field_host, token)
+    shore = Shore(system, device, endpoint, WallClock())
+    talk.print(f"far end of {device} at {endpoint}", soft_wrap=True)
+    serving = asyncio.create_task(shore.run(script(periods, duration_s or 20.0)))
+    showing = asyncio.create_task(_show(shore)) if not as_json else None
+    stopping = asyncio.create_task(stop.wait())
+    try:
+        await asyncio.wait([serving, stopping], timeout=duration_s or None, return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        for task in (stopping, showing, serving):
+            if task is not None:
+                task.cancel()
+                await asyncio.gather(task, return_exceptions=True)
+    seen = shore.describe()
+    if as_json:
+        json.dump(seen, sys.stdout)
+        sys.stdout.write("\n")
+    else:
+        talk.print(f"commands {seen['commands_sent']}, responses {seen['responses']}")
+    return 0 if seen["responses"] or not periods else 1
+
+
+async def _ask_field(device: str, field_host: str, token: str) -> Endpoint:
+    client, host = await connect_control(field_host, token)
+    try:
+        far = (await client.call("get"))["far"]
+    finally:
+        await client.aclose()
+    if device not in far:
+        raise UsageError(f"that field side has no far end of {device!r}", expected=", ".join(far) or "none")
+    return reachable(Endpoint.parse(far[device]), host)
+
+
+async def _show(shore: Shore) -> None:
+    shown = 0
+    while True:
+        await asyncio.sleep(0.2)
+        new = shore.responses_received - shown
+        for response in list(shore.responses)[-new:] if new else []:
+            talk.print(f"response {response.hex()}", soft_wrap=True)
+        shown = shore.responses_received

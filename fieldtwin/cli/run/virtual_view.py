@@ -1,0 +1,226 @@
+"""`fieldtwin run --virtual` on a terminal: how far it is, what came of it, and of many seeds which failed."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rich.progress import BarColumn, Progress, TextColumn
+from rich.table import Table
+
+from fieldtwin.cli.output_files import write_text
+from fieldtwin.cli.run.live_view import print_summary
+from fieldtwin.console import data, show_warnings, talk
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.wallclock import WallClock
+
+if TYPE_CHECKING:
+    from fieldtwin.run.campaigns.many_seeds import Options, SeedResult
+    from fieldtwin.run.virtual.run import VirtualOptions
+
+
+def parse_seeds(text: str) -> range:
+    """``7`` or ``1..200``. Raises `UsageError`."""
+    from fieldtwin.run.campaigns.many_seeds import MAX_SEEDS
+
+    first, dots, last = text.partition("..")
+    if not first.isdigit() or (dots and not last.isdigit()):
+        raise UsageError("seeds", expected="a number, or 1..200", got=text)
+    seeds = range(int(first), int(last or first) + 1)
+    if not 0 < len(seeds) <= MAX_SEEDS:
+        raise UsageError("seeds", expected=f"1 to {MAX_SEEDS} of them, the lower first", got=text)
+    return seeds
+
+
+def run_one(options: VirtualOptions, as_json: bool) -> int:
+    """One run, its summary on stdout. The exit status: 0 when all is well."""
+    from fieldtwin.run.virtual.run import VirtualRun
+
+    run = VirtualRun(options)
+    talk.print(
+        f"{run.system.name} (prototype, virtual time), seed {run.seed}, {shown_time(options.duration_s)}", markup=False
+    )
+    show_warnings(run.system.warnings)
+    began_ns = WallClock().monotonic_ns()
+    with progress_bar(options.duration_s) as at:
+        run.run(at)
+    took_s = (WallClock().monotonic_ns() - began_ns) / 1e9
+    summary = run.summary()
+    if as_json:
+        json.dump(summary, sys.stdout, indent=2)
+        sys.stdout.write("\n")
+    else:
+        print_summary(summary)
+        trace = summary["trace"]
+        data.print(f"  trace          {trace['events']} events, sha256 {trace['sha256']}", soft_wrap=True)
+        data.print(
+            f"  took           {took_s:.1f} s, {run.elapsed_s / took_s:,.0f} times as fast as time", soft_wrap=True
+        )
+    return 0 if summary["ok"] else 1
+
+
+def again(seed: int) -> str:
+    """The command line that repeats the run of one seed, of those that are run now."""
+    words, skip = [], False
+    for word in sys.argv[1:]:
+        if skip:
+            skip = False
+        elif word in ("--seeds", "--jobs", "--ledger"):
+            skip = True
+        elif not word.startswith(("--seeds=", "--jobs=", "--ledger=")):
+            words.append(word)
+    return shlex.join(["fieldtwin", *words, "--seed", str(seed)])
+
+
+def run_many(
+    options: Options,
+    seeds: range,
+    jobs: int,
+    as_json: bool,
+    ledger_path: Path | None = None,
+) -> int:
+    """A run a seed. The exit status: 0 when all were well.
+
+    With a ledger, seeds that it has are not run again, and each that ends is written down at once.
+    """
+    from fieldtwin.run.campaigns.ledger import Ledger
+    from fieldtwin.run.campaigns.many_seeds import run_seeds, what_runs
+
+    began_ns = WallClock().monotonic_ns()
+    ledger = Ledger(ledger_path) if ledger_path is not None else None
+    what = what_runs(options)
+    left = [seed for seed in seeds if ledger is None or seed not in ledger.done(what)]
+    count = 0
+    with progress_bar(float(len(left)), "seeds") as at:
+
+        def ended(result: SeedResult) -> None:
+            nonlocal count
+            count += 1
+            at(float(count))
+            if ledger is not None:
+                ledger.add(what, options.duration_s / 3600, result)
+
+        results = run_seeds(options, left, jobs, ended)
+    took_s = (WallClock().monotonic_ns() - began_ns) / 1e9
+    failed = [r for r in results if not r.ok]
+    before = sorted(ledger.failed_of(what, seeds) - {r.seed for r in failed}) if ledger is not None else []
+    untested = (
+        options.random_faults is not None
+        and bool(results)
+        and not any(struck for r in results for _, _, struck in r.faults)
+    )
+    if as_json:
+        json.dump(
+            {"results": [_plain(r) for r in results], "failed": sorted([*before, *(r.seed for r in failed)])},
+            sys.stdout,
+            indent=2,
+        )
+        sys.stdout.write("\n")
+        return 1 if failed or before or untested else 0
+    for result in failed:
+        data.print(f"[red]seed {result.seed}[/red]", soft_wrap=True)
+        for error in result.errors:
+            data.print(f"  {error}", soft_wrap=True, markup=False)
+        data.print(f"  {again(result.seed)}", soft_wrap=True, markup=False)
+    if failed and (options.random_faults is not None or options.faults):
+        _shrink(options, failed[0])
+    table = Table(box=None, show_header=False, pad_edge=False)
+    table.add_row("seeds", f"{len(results)}, {len(failed)} failed")
+    table.add_row("virtual time", shown_time(options.duration_s * len(results)))
+    checked, wrong = sum(r.checked for r in results), sum(r.wrong for r in results)
+    table.add_row("published", f"{checked} compared with what the devices held, {wrong} wrong")
+    table.add_row("faults", faults_text([one for r in results for one in r.faults]))
+    table.add_row("took", f"{took_s:.1f} s, {options.duration_s * len(results) / took_s:,.0f} times as fast as time")
+    if ledger is not None:
+        table.add_row("not run again", f"{len(seeds) - len(left)} seeds that the ledger has")
+        bad = f", {len(ledger.failed)} runs failed, {ledger.wrong} wrong values" if ledger.failed else ", no run failed"
+        table.add_row("the ledger", f"{ledger.hours:g} virtual hours in {len(ledger.entries)} runs{bad}")
+    data.print(table)
+    for seed in before:
+        data.print(f"[red]seed {seed}[/red] failed before, by the ledger: {again(seed)}", soft_wrap=True)
+    if untested and not failed and not before:
+        data.print("no fault struck in any run, so nothing was tested with faults: try a longer --for", soft_wrap=True)
+        data.print("[bold yellow]inconclusive[/bold yellow]")
+        return 1
+    data.print("[bold red]not ok[/bold red]" if failed or before else "[bold green]ok[/bold green]")
+    return 1 if failed or before else 0
+
+
+def faults_text(faults: Sequence[tuple[str, int, int]]) -> str:
+    """Return how many faults all runs had, and how often they struck, by name."""
+    if not faults:
+        return "none was put in"
+    of = {name: [(put_in, struck) for other, put_in, struck in faults if other == name] for name, _, _ in faults}
+    parts = [f"{name} {sum(n for n, _ in each)} (struck {sum(m for _, m in each)} times)" for name, each in of.items()]
+    return f"{sum(n for _, n, _ in faults)} put in: {', '.join(sorted(parts))}"
+
+
+def _shrink(options: Options, failed: SeedResult) -> None:
+    """Write the smallest part of the first failing schedule as a scenario into the working directory, once it is confirmed."""
+    from fieldtwin.run.campaigns.confirming import confirm_run
+    from fieldtwin.run.campaigns.many_seeds import shrunk
+    from fieldtwin.run.campaigns.shrink import as_scenario
+
+    talk.print(f"shrinking the faults of seed {failed.seed}", markup=False)
+    small = shrunk(options, failed)
+    if small.result.ok:
+        data.print(
+            f"seed {failed.seed} does not fail again with the same faults: no scenario is written", soft_wrap=True
+        )
+        return
+    path = Path(f"{Path(options.system).stem}-seed{failed.seed}.scenario.yaml")
+    title = f"what failed with seed {failed.seed}"
+    acts = [(at_s, {"send": {"period_s": period_s}}) for at_s, period_s in small.scripted]
+    text = as_scenario(title, options.system, failed.seed, options.duration_s, small.faults, small.result.errors, acts)
+    write_text(path, text)
+    told = shrunk_texts(failed.seed, len(small.faults), small.minimal, small.without.ok, small.without.errors)
+    told += [f"it is written to {path}", confirm_run(path, small.result, options.profiles)]
+    for line in told:
+        data.print(line, soft_wrap=True, markup=False, highlight=False)
+
+
+def shrunk_texts(seed: int, count: int, minimal: bool, passes_without: bool, otherwise: Sequence[str]) -> list[str]:
+    """Return in words which faults the failure of a seed takes, and what happens without any of them."""
+    if not count:
+        return [f"seed {seed} fails without any fault: the faults are not the cause"]
+    what = f"{count} fault{'s' if count > 1 else ''}"
+    least = f"; none of {'them' if count > 1 else 'it'} can be left out" if minimal and count > 1 else ""
+    without = (
+        "without faults the run passes" if passes_without else f"without faults it fails otherwise: {otherwise[0]}"
+    )
+    return [f"seed {seed} fails with {what} of its schedule{least}; {without}"]
+
+
+def _plain(result: SeedResult) -> dict[str, Any]:
+    return {name: getattr(result, name) for name in result.__slots__}
+
+
+def shown_time(seconds: float) -> str:
+    """A length of virtual time, for a person."""
+    if seconds >= 2 * 3600:
+        return f"{seconds / 3600:g} h"
+    return f"{seconds / 60:g} min" if seconds >= 120 else f"{seconds:g} s"
+
+
+class progress_bar:
+    """A progress bar on stderr where that is a terminal. ``with progress_bar(60.0) as at: at(12.0)``."""
+
+    def __init__(self, total: float, unit: str = "s") -> None:
+        columns = (
+            TextColumn("{task.percentage:3.0f} %"),
+            BarColumn(),
+            TextColumn("{task.completed:g} {task.fields[unit]}"),
+        )
+        self._progress = Progress(*columns, console=talk, transient=True, disable=not talk.is_terminal)
+        self._task = self._progress.add_task("", total=total, unit=unit)
+
+    def __enter__(self) -> Callable[[float], None]:
+        self._progress.start()
+        return lambda value: self._progress.update(self._task, completed=value)
+
+    def __exit__(self, *exc: object) -> None:
+        self._progress.stop()

@@ -1,0 +1,1 @@
+"""Commands for the files of a system, for this computer, and for reports."""

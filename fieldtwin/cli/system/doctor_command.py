@@ -1,0 +1,39 @@
+"""`fieldtwin doctor`: what this computer can do, and what to change where it cannot."""
+
+from __future__ import annotations
+
+import json
+import sys
+
+import click
+
+from fieldtwin.cli.options import json_option
+from fieldtwin.console import data
+from fieldtwin.doctor.checks import examine
+from fieldtwin.doctor.verdicts import Check, Verdict
+
+MARK = {Verdict.OK: "[green]ok[/green]  ", Verdict.NOTE: "[yellow]note[/yellow]", Verdict.BAD: "[red]bad[/red] "}
+
+
+@click.command("doctor")
+@json_option
+def command(as_json: bool) -> int:
+    """Check Python, shipped data, ports, CAN, real-time limits, processors, clock, files, disk; exit 1 if something is broken."""
+    checks = examine()
+    if as_json:
+        json.dump(
+            [{"check": c.name, "verdict": c.verdict.value, "found": c.found, "advice": c.advice} for c in checks],
+            sys.stdout,
+            indent=2,
+        )
+        sys.stdout.write("\n")
+    else:
+        for check in checks:
+            _show(check)
+    return 1 if any(c.verdict is Verdict.BAD for c in checks) else 0
+
+
+def _show(check: Check) -> None:
+    data.print(f"{MARK[check.verdict]} {check.name:<16} {check.found}", soft_wrap=True)
+    if check.advice:
+        data.print(f"{'':21}{check.advice}", soft_wrap=True)

@@ -1,0 +1,80 @@
+"""`fieldtwin draw`: who hangs on which wire of a system, as text or as a picture."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import click
+
+from fieldtwin.cli.options import json_option, profiles_option
+from fieldtwin.gateway.core.errors import UsageError
+
+
+@click.command("draw")
+@click.argument("system")
+@click.option("--prototype", is_flag=True, help="Also what is emulated, with what, and where.")
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(dir_okay=False, allow_dash=True, path_type=Path),
+    help="An SVG there; - is stdout.",
+)
+@profiles_option
+@json_option
+def command(system: str, prototype: bool, output: Path | None, profiles: tuple[str, ...], as_json: bool) -> int:
+    """Draw the wires of SYSTEM, and who hangs on each: as text, or with -o as SVG, which is light or dark as its reader is.
+
+    Of a network, such as `ocean_network`: where its systems are, and who hears whom.
+
+    Reads the files only: nothing is opened, and no control logic is run.
+    """
+    from fieldtwin.reports.drawing.svg import svg
+    from fieldtwin.reports.drawing.tree import tree
+    from fieldtwin.reports.drawing.wiring import wiring
+    from fieldtwin.run.template import system_file
+    from fieldtwin.twin.prototype.file import load_prototype
+    from fieldtwin.twin.site.data_files import network_file
+    from fieldtwin.twin.site.system import load_system
+
+    if as_json and output is not None:
+        raise UsageError("--json and -o at once", expected="one of them")
+    folders = [Path(folder) for folder in profiles]
+    if (network := network_file(system, folders)) is not None:
+        return _put(*_network(network, folders), output, as_json)
+    loaded = load_system(system_file(system, lambda _: True, plant=False), folders)
+    wires = wiring(loaded, load_prototype(loaded) if prototype else None)
+    return _put(wires.as_data(), tree(wires, *_room()), lambda: svg(wires), output, as_json)
+
+
+def _network(path: Path, profiles: list[Path]) -> tuple[Any, str, Callable[[], str]]:
+    from fieldtwin.reports.drawing.network import network_map, svg, text
+    from fieldtwin.twin.network.network import load_network
+
+    drawn = network_map(load_network(path, profiles))
+    return drawn.as_data(), text(drawn), lambda: svg(drawn)
+
+
+def _put(facts: Any, text: str, svg: Callable[[], str], output: Path | None, as_json: bool) -> int:
+    """Where it is wanted: a file, or stdout. Raises `UsageError` for a file that cannot be written."""
+    if as_json:
+        text = json.dumps(facts, indent=2) + "\n"
+    elif output is not None:
+        text = svg()
+    if output is None or str(output) == "-":
+        sys.stdout.write(text)
+        return 0
+    try:
+        output.write_text(text, encoding="utf-8")
+    except OSError as e:
+        raise UsageError(f"cannot write {output}: {e.strerror}") from e
+    return 0
+
+
+def _room() -> tuple[int, ...]:
+    """The terminal's width; a pipe takes whole lines."""
+    return (shutil.get_terminal_size().columns,) if sys.stdout.isatty() else ()

@@ -1,0 +1,216 @@
+"""`fieldtwin template`: pack a system into one file, look into such a file, unpack it, compare two."""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.markup import escape
+
+from fieldtwin.__about__ import __version__
+from fieldtwin.cli.options import json_option, profiles_option
+from fieldtwin.cli.template_question import ask_about, shown
+from fieldtwin.console import data, talk
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.escaping import visible
+from fieldtwin.gateway.wallclock import WallClock
+from fieldtwin.run.template import Stranger
+from fieldtwin.twin.prototype.file import prototype_path
+from fieldtwin.twin.site.system import load_system
+from fieldtwin.twin.template.check import Difference, differences, examine, put_together, software_difference, unified
+from fieldtwin.twin.template.pack import Extras, collect, pack
+from fieldtwin.twin.template.package import FolderPackage, open_package, unpack
+from fieldtwin.twin.template.software import modules_hash
+from fieldtwin.twin.template.template import DOCUMENTS, DocumentKind, Manifest
+
+KINDS: dict[str, DocumentKind] = {kind: kind for kind in DOCUMENTS}
+
+
+@click.group("template")
+def command() -> None:
+    """A system and all that it takes, as one file: pack, check, compare, unpack.
+
+    A template has the system file, profiles, EDS files, control logic, recordings, the digital model, the version and hash of the
+    control software, and documents. `fieldtwin run T.zip --prototype` works from it alone.
+    """
+
+
+@command.command("pack")
+@click.argument("system")
+@click.option(
+    "-o", "--out", required=True, type=click.Path(path_type=Path), help="The template: FILE.zip, or a new folder."
+)
+@click.option(
+    "--prototype-file", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="Another prototype file."
+)
+@click.option(
+    "--document", "documents", multiple=True, metavar="KIND=FILE", help="A document: " + ", ".join(KINDS) + "."
+)
+@click.option(
+    "--wheel", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="Put this wheel of fieldtwin in."
+)
+@profiles_option
+@json_option
+def pack_command(
+    system: str,
+    out: Path,
+    prototype_file: Path | None,
+    documents: tuple[str, ...],
+    wheel: Path | None,
+    profiles: tuple[str, ...],
+    as_json: bool,
+) -> int:
+    """Pack SYSTEM and everything that it names into a template. The same files give the same bytes."""
+    folders = tuple(Path(p) for p in profiles)
+    loaded = load_system(system, folders)
+    beside = prototype_path(loaded)
+    collected = collect(loaded, folders, prototype_file or (beside if beside.is_file() else None))
+    manifest = pack(loaded, collected, Extras(_documents(documents), wheel), __version__, out)
+    if as_json:
+        _print_json({"template": str(out), **_described(manifest)})
+        return 0
+    total = sum(file.bytes for file in manifest.files)
+    talk.print(
+        f"{escape(str(out))}: {len(manifest.files)} files, {total:,} bytes; template {manifest.id[:16]}", soft_wrap=True
+    )
+    if not manifest.prototype_file:
+        talk.print("it has no prototype file: it runs as a plant only")
+    return 0
+
+
+def _documents(values: tuple[str, ...]) -> dict[DocumentKind, tuple[Path, ...]]:
+    found: dict[DocumentKind, tuple[Path, ...]] = {}
+    for value in values:
+        kind, equals, name = value.partition("=")
+        if kind not in KINDS or not equals:
+            raise UsageError("a document", expected="KIND=FILE with a kind of " + ", ".join(KINDS), got=value)
+        if not Path(name).is_file():
+            raise UsageError("no such document", got=name)
+        found[KINDS[kind]] = (*found.get(KINDS[kind], ()), Path(name))
+    return found
+
+
+@command.command("unpack")
+@click.argument("template", type=click.Path(exists=True, path_type=Path))
+@click.option("-o", "--out", type=click.Path(path_type=Path), help="The folder; default: the template's name, here.")
+@json_option
+def unpack_command(template: Path, out: Path | None, as_json: bool) -> int:
+    """Write TEMPLATE as a folder. Every file is compared with its hash; nothing of it is run."""
+    out = out or Path(template.stem)
+    with open_package(template) as package:
+        unpack(package, out)
+        manifest = package.manifest
+    if as_json:
+        _print_json({"folder": str(out), **_described(manifest)})
+        return 0
+    talk.print(
+        f"{escape(str(out))}: {len(manifest.files)} files, as packed; template {manifest.id[:16]}", soft_wrap=True
+    )
+    if manifest.code:
+        talk.print(
+            f"control logic in Python, not run: {shown(manifest.code)}. Read it before you do.",
+            soft_wrap=True,
+        )
+    return 0
+
+
+@command.command("check")
+@click.argument("template", type=click.Path(exists=True, path_type=Path))
+@click.option("--trust", is_flag=True, help="Import control logic in Python that the template brings, without asking.")
+@json_option
+def check_command(template: Path, trust: bool, as_json: bool) -> int:
+    """Say whether TEMPLATE is whole: every hash, every file that its system names, and that a prototype could start.
+
+    Control logic in Python is imported after a yes only; without one the rest is checked.
+    """
+    with open_package(template) as package, tempfile.TemporaryDirectory() as place:
+        if package.path.is_dir():
+            package.verify()
+            folder = package.path
+        else:
+            folder = Path(place) / "template"
+            unpack(package, folder)
+        here = FolderPackage(folder)
+        manifest = here.manifest
+        system = examine(folder, manifest, shown=package.path)
+        may_run = not here.code or trust or (not as_json and ask_about(Stranger(package.path, package.code)))
+        if may_run:
+            put_together(manifest, system, folder, WallClock())
+    same = manifest.software.modules_sha256 == modules_hash()
+    if as_json:
+        _print_json({**_described(manifest), "ok": True, "control_logic_checked": may_run, "same_software_here": same})
+        return 0
+    _print_files(manifest)
+    talk.print("every hash is right, and nothing that the system names is missing")
+    if not may_run:
+        talk.print("its control logic was not looked at")
+    if not same:
+        there = f"{manifest.software.version}, modules {manifest.software.modules_sha256[:12]}"
+        here_is = f"{__version__}, modules {modules_hash()[:12]}"
+        talk.print(f"it was packed by other software: {there}; here is {here_is}", soft_wrap=True)
+    return 0
+
+
+@command.command("diff")
+@click.argument("before", type=click.Path(exists=True, path_type=Path))
+@click.argument("after", type=click.Path(exists=True, path_type=Path))
+@click.option("--names", is_flag=True, help="Only which files differ.")
+@json_option
+def diff_command(before: Path, after: Path, names: bool, as_json: bool) -> int:
+    """Compare two templates: zip files, folders, or one of each. Exit code 1 when they differ.
+
+    The files of a folder are compared as they are now, edited or not. A zip is compared as it was packed.
+    A damaged zip is refused.
+    """
+    with open_package(before, edited=True) as a, open_package(after, edited=True) as b:
+        old, new = a.contents(), b.contents()
+        found = [*software_difference(a.manifest.software, b.manifest.software), *differences(old, new)]
+        if as_json:
+            _print_json(
+                [{"path": d.path, "kind": d.kind, "what": d.what, "before": d.before, "after": d.after} for d in found]
+            )
+            return 1 if found else 0
+        for difference in found:
+            _print_difference(difference)
+            path = difference.path
+            if not names and difference.kind != "software":
+                for line in unified(path, (a, old.get(path)), (b, new.get(path))):
+                    data.print(visible(line), style=_style(line), markup=False, soft_wrap=True)
+    if not found:
+        talk.print("no difference")
+    return 1 if found else 0
+
+
+def _print_difference(d: Difference) -> None:
+    def short(side: str) -> str:
+        version, _, digest = side.rpartition(" ")
+        return f"{version} {digest[:12]}".strip() or "nothing"
+
+    style = {"added": "green", "removed": "red", "changed": "yellow"}[d.what]
+    data.print(f"[{style}]{d.what:8}[/] {escape(d.path)}  {short(d.before)} -> {short(d.after)}", soft_wrap=True)
+
+
+def _style(line: str) -> str:
+    return "green" if line.startswith("+") else "red" if line.startswith("-") else "dim" if line.startswith("@") else ""
+
+
+def _print_files(manifest: Manifest) -> None:
+    data.print(f"{manifest.system}: template {manifest.id[:16]}, fieldtwin {manifest.software.version}", soft_wrap=True)
+    data.print(f"  {'SHA-256':12}  {'bytes':>13}  {'kind':17}  file")
+    for file in manifest.files:  # the path comes last and whole: somebody copies it
+        words = f"  {file.sha256[:12]}  {file.bytes:13,}  {file.document or file.kind:17}  {escape(file.path)}"
+        data.print(words, soft_wrap=True, highlight=False)
+
+
+def _described(manifest: Manifest) -> dict[str, Any]:
+    described: dict[str, Any] = json.loads(manifest.to_json())
+    return {"id": manifest.id, **described}
+
+
+def _print_json(value: object) -> None:
+    json.dump(value, sys.stdout, indent=1)
+    sys.stdout.write("\n")

@@ -1,0 +1,1 @@
+"""Commands that test: scenarios and conformance tests."""

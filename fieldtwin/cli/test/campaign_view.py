@@ -1,0 +1,103 @@
+"""`fieldtwin test --seeds`: a campaign on a terminal, and its results for reports."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from rich.markup import escape
+
+from fieldtwin.cli.campaign_options import CampaignRequest
+from fieldtwin.cli.output_files import write_text
+from fieldtwin.cli.run.virtual_view import parse_seeds, progress_bar, shrunk_texts
+from fieldtwin.console import data, talk
+from fieldtwin.results.model import ScenarioResult, Verdict
+from fieldtwin.run.campaigns.campaign import Campaign, run_campaign, verdict_of
+from fieldtwin.run.campaigns.confirming import CONFIRMED
+from fieldtwin.run.campaigns.shrink_failure import confirm, scenario_of, shrink_seed
+
+_COLOUR = {"passed": "green", "failed": "red", "error": "red", "inconclusive": "yellow", "skipped": "yellow"}
+FAULTS_SHOWN = 12
+
+
+def run_scenario_campaign(
+    path: Path, profiles: tuple[Path, ...], request: CampaignRequest, show: Callable[[ScenarioResult], None] | None
+) -> list[ScenarioResult]:
+    """Run a scenario with each seed; return the result of the campaign as a whole, of each seed, and of the scenario that the
+    first failing seed was shrunk to. `show` None: nothing is printed to stdout."""
+    seeds = parse_seeds(request.seeds)
+    campaign = Campaign(path, profiles, request.choice.of(request.faults), request.duration_s, _words(request))
+    with progress_bar(float(len(seeds)), "seeds") as at:
+        count = 0
+
+        def ended(result: ScenarioResult) -> None:
+            nonlocal count
+            count += 1
+            at(float(count))
+
+        results = run_campaign(campaign, seeds, request.jobs, ended)
+    whole = verdict_of(campaign, results)
+    if show is not None:
+        for result in results:
+            _show_seed(result, show)
+    small = next((result for result in results if result.verdict.bad), None)
+    found = [] if small is None or campaign.random_faults is None else _shrink(campaign, small, show is not None)
+    if show is not None:
+        _show_whole(whole)
+    return [whole, *results, *found]
+
+
+def _words(request: CampaignRequest) -> tuple[str, ...]:
+    """The options that make a seed's run, besides the seed."""
+    every_s, kinds, aims = request.choice
+    said = {
+        "--faults": request.faults or "",
+        "--for": f"{request.duration_s:g}s" if request.duration_s else "",
+        "--fault-every": f"{every_s:g}s" if every_s is not None else "",
+        "--fault-kinds": ",".join(kinds),
+        "--fault-aims": ",".join(aims),
+    }
+    return tuple(word for option, value in said.items() if value for word in (option, value))
+
+
+def _show_seed(result: ScenarioResult, show: Callable[[ScenarioResult], None]) -> None:
+    """A line for a seed that passed, with the faults that struck; everything about one that did not."""
+    if result.verdict is not Verdict.PASSED:
+        show(result)
+        return
+    struck = [f"{one.name} on {one.on} ({one.struck} times)" for one in result.faults if one.struck]
+    idle = sum(not one.struck for one in result.faults)
+    told = [*struck[:FAULTS_SHOWN], *([f"{len(struck) - FAULTS_SHOWN} more"] if len(struck) > FAULTS_SHOWN else [])]
+    told += [f"{idle} never struck"] if idle else []
+    text = "; ".join(told) or "no fault"
+    data.print(f"[green]passed[/green]  seed {result.seed}  [dim]{escape(text)}[/dim]", soft_wrap=True, highlight=False)
+
+
+def _show_whole(whole: ScenarioResult) -> None:
+    colour = _COLOUR[whole.verdict.value]
+    data.print(f"[{colour}]{whole.verdict.value}[/{colour}]  {escape(whole.title)}", soft_wrap=True, highlight=False)
+    for check in whole.checks:
+        text = f"  {check.number}: {check.text}: {check.got}"
+        data.print(text, soft_wrap=True, markup=False, highlight=False)
+
+
+def _shrink(campaign: Campaign, failed: ScenarioResult, told: bool) -> list[ScenarioResult]:
+    """Write the smallest failing schedule as a scenario into the working directory, and confirm it."""
+    talk.print(f"shrinking the faults of seed {failed.seed}", markup=False)
+    small = shrink_seed(campaign, failed)
+    if not small.result.verdict.bad:
+        talk.print(f"seed {small.seed} does not fail again with the same faults: no scenario is written", markup=False)
+        return []
+    path = Path(f"{campaign.path.name.removesuffix('.scenario.yaml')}-seed{small.seed}.scenario.yaml")
+    write_text(path, scenario_of(campaign, small, Path()))
+    confirmed = confirm(path, campaign, small)
+    lines = shrunk_texts(
+        small.seed, len(small.faults), small.minimal, small.without.verdict is Verdict.PASSED, [small.without.reason]
+    )
+    lines.append(f"it is written to {path}")
+    lines.append(
+        CONFIRMED if confirmed else f"not confirmed: this scenario ends otherwise; use {small.result.reproduce}"
+    )
+    for line in lines if told else ():
+        data.print(f"  {line}", soft_wrap=True, markup=False, highlight=False)
+    return [confirmed] if confirmed is not None else []

@@ -1,0 +1,232 @@
+"""What `fieldtwin check modbus` and `check canopen` share: options, the question, running with a bar, the files written."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import shlex
+import signal
+import sys
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import click
+
+from fieldtwin.cli.options import Duration, json_option, junit_flavour_option
+from fieldtwin.cli.test.fail_on import bases_of, fail_on_option, print_not_counted
+from fieldtwin.gateway.core.errors import NotAllowed, UsageError
+
+if TYPE_CHECKING:
+    from fieldtwin.conformance.devices.checked import Checked
+    from fieldtwin.conformance.devices.device_case import DeviceCase, DeviceResult
+    from fieldtwin.conformance.devices.run import Plan
+    from fieldtwin.results.subject import Subject
+
+DANGERS = ("observe", "read", "write", "disrupt")
+_WRITES = "writes, wrong ones too; what is given by --write gets back what was there"
+MEANS = {
+    "modbus": {
+        "write": _WRITES,
+        "disrupt": "unknown functions, long frames, FC 08, many connections: the device or others may stop answering",
+    },
+    "canopen": {
+        "write": _WRITES,
+        "disrupt": "NMT, guarding, LSS, unknown commands: the node is stopped and restarted",
+    },
+}
+FILE = click.Path(dir_okay=False, path_type=Path)
+INTERRUPTED = 130
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def shared(function: F) -> F:
+    """Options of every check of a device."""
+    options = [
+        click.option(
+            "--allow", type=click.Choice(DANGERS), help="The most dangerous cases to play.  [default: read; write with --write]"
+        ),
+        click.option("--yes", is_flag=True, help="Do not ask before cases that write or disrupt."),
+        click.option("--i-know", is_flag=True, help="Also what reaches every device on the line, or restarts this one."),
+        click.option("--dry-run", is_flag=True, help="Show what would be sent, and send nothing."),
+        click.option("--only", metavar="IDS", help="These cases or rows only, with commas: MB-036,MB-045a."),
+        click.option("--rate", type=click.FloatRange(0.1, 10_000), default=20.0, show_default=True,
+                     help="Requests a second, at most."),
+        click.option("--for", "for_s", type=Duration(), default="0", help="Begin no case after this time."),
+        click.option("--waivers", "waivers_path", type=click.Path(path_type=Path), help="YAML: id, reason, expires."),
+        fail_on_option,
+        click.option("--by", help="Who checks; stands in the reports.  [default: the name you are logged in by]"),
+        click.option("--html", type=FILE, help="Write a report with every byte."),
+        click.option("--junit", type=FILE, help="Write the verdicts as JUnit XML."),
+        junit_flavour_option,
+        click.option("-o", "--out", type=FILE, help="Write the JSON to a file, for `fieldtwin report`."),
+        click.option("--log", "log_path", type=FILE, help="Append all that is sent and heard, as JSON lines."),
+        click.option("--list", "list_only", is_flag=True, help="Show the cases and end."),
+        json_option,
+    ]  # fmt: skip
+    for option in reversed(options):
+        function = option(function)
+    return function
+
+
+class Check:
+    """What the two commands have in common: the plan, the question, the files."""
+
+    def __init__(self, protocol: str, endpoint: str, address: int, options: dict[str, Any]) -> None:
+        self.protocol, self.endpoint, self.address, self.options = protocol, endpoint, address, options
+        self.words = "fieldtwin " + shlex.join(sys.argv[1:])
+        self.interrupted = False
+
+    def plan(self, cases: Sequence[DeviceCase[Any]], has: set[str], writes: bool) -> Plan:
+        """What may be played. Reads the waivers too: a wrong file is said before anything is sent."""
+        from fieldtwin.cli.test.check_cases import only_of
+        from fieldtwin.conformance.core.case import Danger
+        from fieldtwin.conformance.core.waivers import Waivers, load_waivers
+        from fieldtwin.conformance.devices.run import Plan
+
+        path = self.options["waivers_path"]
+        known = {case.id for case in cases} | {case.row for case in cases}
+        self.waivers = load_waivers(path, known) if path else Waivers()
+        allow = self.options["allow"] or ("write" if writes else "read")
+        if writes and Danger(allow).rank < Danger.WRITE.rank:
+            raise UsageError("--write with cases that only read", expected="--allow write or disrupt", got=allow)
+        if self.options["i_know"]:
+            has = has | {"i-know"}
+        return Plan(only_of(self.options["only"], cases), Danger(allow), frozenset(has), self.options["for_s"])
+
+    def ask(self, cases: Sequence[DeviceCase[Any]], plan: Plan, traits: frozenset[str]) -> None:
+        """Ask about what is more than reading. Raises `NotAllowed` where nobody can answer, `Abort` on a no."""
+        from fieldtwin.conformance.core.case import Danger
+        from fieldtwin.conformance.devices.run import why_not
+        from fieldtwin.console import talk
+
+        played = [c for c in cases if c.chosen(plan.only) and not why_not(c, plan, traits)]
+        risky = [c for c in played if c.danger.rank > Danger.READ.rank]
+        if not risky or self.options["yes"]:
+            return
+        for danger, means in MEANS[self.protocol].items():
+            ids = [c.id for c in risky if c.danger.value == danger]
+            if ids:
+                talk.print(f"{len(ids)} cases of danger {danger}: {means}.\n  {', '.join(ids)}", markup=False)
+        if not sys.stdin.isatty():
+            raise NotAllowed("cases that do more than reading are confirmed", expected="--yes, or a terminal to ask on")
+        click.confirm("Play them?", abort=True, err=True)
+
+    def done(self, subject: Subject, checked: Checked) -> int:
+        """Waive, write the files, show the table. The exit code."""
+        from fieldtwin.cli.test.check_view import print_results
+        from fieldtwin.conformance.core.results import exit_code, waive
+        from fieldtwin.conformance.devices.results import as_json, as_report
+
+        fail_on = bases_of(self.options["fail_on"])
+        today = datetime.fromisoformat(subject.started).date()
+        results: list[DeviceResult] = [waive(result, self.waivers, today) for result in checked.results]  # type: ignore[misc]
+        document = as_json(subject, results)
+        if self.options["out"] is not None:
+            _write(self.options["out"], json.dumps(document, indent=2) + "\n")
+        if self.options["junit"] is not None:
+            from fieldtwin.reports.junit import Flavour, write_junit
+
+            flavour = Flavour(self.options["junit_flavour"])
+            write_junit(as_report(subject, results, self.words, fail_on), self.options["junit"], flavour)
+        if self.options["html"] is not None:
+            from fieldtwin.reports.conformance.device import write_html
+
+            write_html(subject, results, self.words, self.options["html"])
+        if self.options["as_json"]:
+            json.dump(document, sys.stdout, indent=2)
+            sys.stdout.write("\n")
+        else:
+            print_results(results, "what is asked", all_wires=bool(self.options["only"]))
+            print_not_counted(results, fail_on)
+        return INTERRUPTED if self.interrupted else exit_code(results, fail_on)
+
+    def play(self, most: int, check: Callable[..., Any]) -> Checked:
+        """Run ``check(taps, go_on, say, tell)`` with a bar, and with a log where one is wanted.
+
+        Ctrl-C ends it behind the case that is played, a second one at once; what was lent is put back in any case.
+        """
+        from fieldtwin.cli.test.check_view import Progress
+        from fieldtwin.commissioning.access.frame_log import WireLog
+        from fieldtwin.console import talk
+        from fieldtwin.gateway.wallclock import run
+
+        with ExitStack() as stack:
+            path = self.options["log_path"]
+            log = stack.enter_context(WireLog(path, self.words)) if path is not None else None
+            progress = stack.enter_context(Progress(most, "looking how it answers"))
+
+            def go_on() -> str:
+                if self.interrupted:
+                    return "interrupted"
+                return "the log of what is sent is full" if log is not None and log.full else ""
+
+            async def main() -> Checked:
+                taps = (log,) if log is not None else ()
+                task = asyncio.ensure_future(check(taps, go_on, progress.say, progress.tell))
+
+                def stop() -> None:
+                    if self.interrupted:
+                        task.cancel()
+                    self.interrupted = True
+                    talk.print("ends behind this case; Ctrl-C again: at once", markup=False)
+
+                with suppress(NotImplementedError):  # elsewhere than on Unix
+                    asyncio.get_running_loop().add_signal_handler(signal.SIGINT, stop)
+                checked: Checked = await task
+                return checked
+
+            try:
+                return run(main())
+            except asyncio.CancelledError:
+                raise KeyboardInterrupt from None
+
+    def subject(
+        self, checked: Checked, plan: Plan, began: datetime, wrote: tuple[str, ...], timeout_s: float
+    ) -> Subject:
+        from fieldtwin.results.subject import Subject, who
+
+        return Subject(
+            self.protocol, self.endpoint, self.address, checked.identity, began.isoformat(timespec="seconds"),
+            round((datetime.now(UTC) - began).total_seconds(), 1), self.options["by"] or who(), self.words,
+            plan.at_most.value, wrote, timeout_s,
+        )  # fmt: skip
+
+    def estimate(self, on_paper: Checked) -> None:
+        """Say how many cases there are and how long they take with a device that answers at once."""
+        from fieldtwin.console import talk
+
+        played = sum(bool(result.spoken) for result in on_paper.results)
+        talk.print(
+            f"{played} cases, about {max(1, round(on_paper.took_s))} s where it answers at once; Ctrl-C stops",
+            markup=False,
+        )
+
+    def on_paper(self, checked: Checked) -> int:
+        """What would be sent."""
+        from fieldtwin.cli.test.check_view import print_paper
+
+        print_paper(checked, as_json=self.options["as_json"])
+        return 0
+
+
+def list_cases(cases: Sequence[DeviceCase[Any]], as_json: bool) -> int:
+    from fieldtwin.cli.test.check_view import listed, print_cases
+
+    if as_json:
+        json.dump([listed(c) | {"wires": c.wires, "needs": c.needs} for c in cases], sys.stdout, indent=2)
+        sys.stdout.write("\n")
+    else:
+        print_cases(cases, "what is sent", "what the device must do")
+    return 0
+
+
+def _write(path: Path, text: str) -> None:
+    from fieldtwin.gateway.core.errors import FileInvalid
+
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as e:
+        raise FileInvalid(f"cannot write the file: {e.strerror or e}", path=str(path)) from e

@@ -1,0 +1,171 @@
+"""`fieldtwin check modbus` and `fieldtwin check canopen`: devices that we did not write are judged from outside."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import click
+
+from fieldtwin.cli.options import Duration
+from fieldtwin.cli.test.check_device import Check, list_cases, shared
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import UsageError
+
+_CELL = re.compile(r"^(holding|coil|input|discrete):(0[xX][0-9A-Fa-f]{1,4}|\d{1,5})(?:\+(\d{1,3}))?$")
+_OBJECT = re.compile(r"^([0-9A-Fa-f]{4})h?(?::([0-9A-Fa-f]{1,2}))?$")
+
+
+@click.command("modbus")
+@click.argument("endpoint", required=False)
+@click.option("--unit", type=click.IntRange(0, 255), default=1, show_default=True, help="The unit id.")
+@click.option(
+    "--read", "reads", multiple=True, metavar="TABLE:ADDRESS",
+    help="A cell that can be read, such as holding:100 or holding:0x163, if none is near 0, 1, 100, 1000, 40000; repeatable.",
+)  # fmt: skip
+@click.option(
+    "--write", "writes", multiple=True, metavar="TABLE:ADDRESS[+COUNT]",
+    help="A cell that may be written, holding or coil, also in hexadecimal; what was there is put back. Repeatable.",
+)  # fmt: skip
+@click.option("--timeout", "timeout_s", type=Duration(), default="1s", show_default=True, help="For each reply.")
+@click.option("--echo", is_flag=True, help="The adapter hears what it sends.")
+@click.option("--share-bus", is_flag=True, help="Also on a line on which somebody else talks.")
+@shared
+def modbus(
+    endpoint: str | None,
+    unit: int,
+    reads: tuple[str, ...],
+    writes: tuple[str, ...],
+    timeout_s: float,
+    echo: bool,
+    share_bus: bool,
+    **options: Any,
+) -> int:
+    """Judge a Modbus device from outside: the rows of the catalogue that a master can ask for.
+
+    \b
+    fieldtwin check modbus tcp://192.0.2.7:502 --unit 1 --html unit1.html
+    fieldtwin check modbus 'rtu:/dev/ttyUSB0?baudrate=9600&frame=8N1' --unit 17
+    fieldtwin check modbus tcp://192.0.2.7:502 --write holding:100 --dry-run
+
+    Reads only, unless told otherwise. Exit code 0 when cases passed and no case that --fail-on counts has failed, else 1.
+    """
+    from fieldtwin.conformance.devices.dry_run import modbus_on_paper
+    from fieldtwin.conformance.devices.modbus.cases import CASES
+    from fieldtwin.conformance.devices.modbus.session import ModbusOptions, check_modbus, traits_of
+
+    if options["list_only"]:
+        return list_cases(CASES, options["as_json"])
+    if not endpoint:
+        raise UsageError("no device to check", expected="an endpoint such as tcp://192.0.2.7:502")
+    traits = traits_of(Endpoint.parse(endpoint))
+    may_write = {table: (at, count) for table, at, count in map(_cell, writes)}
+    if set(may_write) - {"holding", "coil"}:
+        raise UsageError("--write", expected="holding:ADDRESS or coil:ADDRESS", got=", ".join(writes))
+    check = Check("modbus", endpoint, unit, options)
+    plan = check.plan(CASES, set(may_write), bool(writes))
+    to_do = ModbusOptions(
+        endpoint, unit, plan, timeout_s, 1 / options["rate"], echo, share_bus=share_bus,
+        given={table: at for table, at, _ in map(_cell, reads)}, may_write=may_write,
+    )  # fmt: skip
+    on_paper = modbus_on_paper(to_do)
+    if options["dry_run"]:
+        return check.on_paper(on_paper)
+    check.ask(CASES, plan, traits)
+    check.estimate(on_paper)
+    began = datetime.now(UTC)
+    checked = check.play(
+        len([c for c in CASES if c.chosen(plan.only)]),
+        lambda taps, go_on, say, tell: check_modbus(replace(to_do, taps=taps, go_on=go_on), say, tell),
+    )  # fmt: skip
+    return check.done(check.subject(checked, plan, began, writes, timeout_s), checked)
+
+
+@click.command("canopen")
+@click.argument("endpoint", required=False)
+@click.option("--node", type=click.IntRange(1, 127), help="The node id.")
+@click.option(
+    "--eds",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    help="Its data sheet, EDS or DCF: for limits and access.",
+)
+@click.option("--bitrate", type=click.IntRange(10_000, 1_000_000), help="bit/s, where the bus does not know it.")
+@click.option(
+    "--write", "writes", multiple=True, metavar="INDEX:SUB",
+    help="An object that may be written, such as 2000:00 or 1017:00; what was there is put back. Repeatable.",
+)  # fmt: skip
+@click.option("--timeout", "timeout_s", type=Duration(), default="500ms", show_default=True, help="For each SDO reply.")
+@click.option(
+    "--boot", "boot_s", type=Duration(), default="10s", show_default=True, help="For a boot-up after a reset."
+)
+@click.option("--share-bus", is_flag=True, help="Also a node that another master speaks SDO with.")
+@shared
+def canopen(
+    endpoint: str | None,
+    node: int | None,
+    eds: Path | None,
+    bitrate: int | None,
+    writes: tuple[str, ...],
+    timeout_s: float,
+    boot_s: float,
+    share_bus: bool,
+    **options: Any,
+) -> int:
+    """Judge a CANopen node from outside: the rows of the catalogue that a master can ask for.
+
+    \b
+    fieldtwin check canopen can:socketcan/can0 --node 5 --eds inclinometer.eds
+    fieldtwin check canopen can:fieldtwin/127.0.0.1:29536 --node 5 --write 1017:00
+
+    Uploads only, unless told otherwise. Exit code 0 when cases passed and no case that --fail-on counts has failed, else 1.
+    """
+    from fieldtwin.conformance.devices.canopen.cases import CASES
+    from fieldtwin.conformance.devices.canopen.session import CanopenOptions, check_canopen
+    from fieldtwin.conformance.devices.dry_run import canopen_on_paper
+
+    if options["list_only"]:
+        return list_cases(CASES, options["as_json"])
+    if not endpoint or node is None:
+        raise UsageError("no node to check", expected="an endpoint such as can:socketcan/can0, and --node")
+    if not Endpoint.parse(endpoint).is_can:
+        raise UsageError("CANopen is spoken on a CAN bus", expected="such as can:socketcan/can0", got=endpoint)
+    may_write = tuple(_object(text) for text in writes)
+    check = Check("canopen", endpoint, node, options)
+    has = ({"object"} if may_write else set()) | ({"eds"} if eds is not None else set())
+    plan = check.plan(CASES, has, bool(writes))
+    to_do = CanopenOptions(
+        endpoint, node, plan, bitrate or 0, timeout_s, 1 / options["rate"], boot_s, eds, share_bus, may_write
+    )
+    on_paper = canopen_on_paper(to_do)
+    if options["dry_run"]:
+        return check.on_paper(on_paper)
+    check.ask(CASES, plan, frozenset({"can"}))
+    check.estimate(on_paper)
+    began = datetime.now(UTC)
+    checked = check.play(
+        len([c for c in CASES if c.chosen(plan.only)]),
+        lambda taps, go_on, say, tell: check_canopen(replace(to_do, taps=taps, go_on=go_on), say, tell),
+    )  # fmt: skip
+    return check.done(check.subject(checked, plan, began, writes, timeout_s), checked)
+
+
+def _object(text: str) -> tuple[int, int]:
+    match = _OBJECT.match(text)
+    if not match:
+        raise UsageError("an object", expected="index and subindex in hex, such as 2000:00", got=repr(text))
+    return int(match[1], 16), int(match[2] or "0", 16)
+
+
+def _cell(text: str) -> tuple[str, int, int]:
+    match = _CELL.match(text)
+    address = -1 if not match else int(match[2], 16 if match[2][:2].lower() == "0x" else 10)
+    if not match or address > 0xFFFF or address + int(match[3] or 1) > 0x10000 or match[3] == "0":
+        raise UsageError(
+            "a cell",
+            expected="such as holding:100, holding:0x163 or coil:5, with +COUNT after it if need be",
+            got=repr(text),
+        )
+    return match[1], address, int(match[3] or 1)

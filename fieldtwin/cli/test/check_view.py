@@ -1,0 +1,198 @@
+"""`fieldtwin check` on a terminal: how far it is, and the table of verdicts."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections import Counter
+from collections.abc import Sequence
+from itertools import groupby
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+from rich import box
+from rich.markup import escape
+from rich.progress import BarColumn, TextColumn
+from rich.progress import Progress as Bar
+from rich.table import Table
+
+from fieldtwin.conformance.core.case import OTHER_WIRE, Basis
+from fieldtwin.conformance.core.results import FOUND, called
+from fieldtwin.console import data, talk
+from fieldtwin.gateway.core.connection import Direction
+from fieldtwin.results.model import Verdict
+
+if TYPE_CHECKING:
+    from fieldtwin.conformance.core.case import About
+    from fieldtwin.conformance.core.results import CaseResult
+    from fieldtwin.conformance.devices.checked import Checked
+    from fieldtwin.conformance.devices.device_case import Spoken
+
+STYLE = {
+    Verdict.PASSED: "green", Verdict.FAILED: "bold red", Verdict.ERROR: "bold red",
+    Verdict.INCONCLUSIVE: "yellow", Verdict.SKIPPED: "dim",
+}  # fmt: skip
+FINDING = {Basis.ROBUSTNESS: "yellow", Basis.FIELD: "magenta"}
+"""Colours of failures that are no deviation from the standard: never red."""
+BASIS = {Basis.STANDARD: "default", **FINDING}
+MARK = {
+    Verdict.PASSED: "✓", Verdict.FAILED: "✗", Verdict.ERROR: "!", Verdict.INCONCLUSIVE: "?", Verdict.SKIPPED: "-",
+}  # fmt: skip
+DANGER = {"observe": "dim", "read": "cyan", "write": "yellow", "disrupt": "magenta"}
+
+
+class Progress:
+    """A bar on a terminal; where there is none, only what fails is said as it comes."""
+
+    def __init__(self, most: int, at_first: str = "learning how it polls") -> None:
+        self._bar = Bar(
+            TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed:.0f} cases"), console=talk,
+            transient=True, disable=not talk.is_terminal,
+        )  # fmt: skip
+        self._task = self._bar.add_task(at_first, total=most)
+
+    def __enter__(self) -> Progress:
+        self._bar.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        self._bar.stop()
+
+    def say(self, text: str) -> None:
+        """A line of talk."""
+        talk.print(text, markup=False, soft_wrap=True)
+
+    def tell(self, result: CaseResult) -> None:
+        """A case is done."""
+        self._bar.update(self._task, advance=1, description=f"{result.case.id} {result.verdict.value}")
+        if result.verdict.bad:
+            mark = f"[{style_of(result)}]{MARK[result.verdict] if result.deviates else '!'}[/]"
+            kind = why(result)
+            talk.print(
+                f"{mark} {result.case.id} {escape(result.case.title)} ({escape(kind)}): {escape(result.reason)}",
+                soft_wrap=not talk.is_terminal,
+            )
+
+
+def style_of(result: CaseResult) -> str:
+    """The colour of a result: red only for a deviation from the standard."""
+    return FINDING.get(result.case.basis, STYLE[result.verdict]) if result.verdict.bad else STYLE[result.verdict]
+
+
+def why(result: CaseResult) -> str:
+    """Why a failure counts, or that it does not: ``required by TG 4.4.1.3``, ``robustness`` or ``field problem``."""
+    return f"required by {result.case.required_by}" if result.deviates else called(result)
+
+
+def print_results(results: Sequence[CaseResult], does: str = "the device", *, all_wires: bool = False) -> None:
+    """The table on stdout, with what a case is about below `does`; without a terminal one line a case, nothing cut.
+
+    Cases for other wires are only counted, unless `all_wires`.
+    """
+    elsewhere = [] if all_wires else [r for r in results if r.reason == OTHER_WIRE]
+    results = [r for r in results if r not in elsewhere]
+    _print_each(results, does)
+    styles = {called(r): style_of(r) for r in results}
+    counts = Counter(called(r) for r in results)
+    order = ("passed", *FOUND.values(), "error", "inconclusive", "skipped")
+    parts = [f"[{styles[word]}]{counts[word]} {word}[/]" for word in order if counts[word]]
+    data.print(", ".join(parts) or "no case was chosen")
+    if elsewhere:
+        talk.print(f"{len(elsewhere)} more cases are for other wires", markup=False)
+
+
+def _print_each(results: Sequence[CaseResult], does: str) -> None:
+    if not data.is_terminal:
+        for r in results:
+            reason = f": {r.reason}" if r.reason else ""
+            reason += f" ({why(r)})" if r.deviates else ""
+            line = f"{called(r):<13} {r.case.id:<7} {r.case.danger.value:<8} {r.case.title}{reason}"
+            data.print(line, markup=False, soft_wrap=True)
+    else:
+        table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+        table.add_column("")
+        table.add_column("case", no_wrap=True)
+        table.add_column("danger", no_wrap=True)
+        table.add_column(does, ratio=2)
+        table.add_column("what was found", ratio=3)
+        for r in results:
+            style, danger = style_of(r), r.case.danger.value
+            found = r.reason or r.verdict.value
+            mark = MARK[r.verdict]
+            if r.verdict.bad and not r.deviates:
+                found, mark = f"{called(r)}: {found}", "!"
+            elif r.verdict.bad:
+                found = f"{found} ({why(r)})"
+            table.add_row(
+                f"[{style}]{mark}[/]", f"[{style}]{r.case.id}[/]", f"[{DANGER[danger]}]{danger}[/]",
+                escape(r.case.title), f"[{style}]{escape(found)}[/]",
+            )  # fmt: skip
+        data.print(table)
+
+
+def print_cases(
+    cases: Sequence[About], does: str = "what the device does", must: str = "what the master must do"
+) -> None:
+    """All cases, for `--list`: a table, or without a terminal one line for each case."""
+    if not data.is_terminal:
+        for case in cases:
+            words = f"{case.title}: {case.does}; expected: {case.must} [{case.sources}]"
+            line = f"{case.id:<7} {case.bases:<25} {case.danger.value:<8} {words}"
+            data.print(line, markup=False, soft_wrap=True)
+        return
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    for name in ("case", "basis", "danger", does, must, "source"):
+        table.add_column(name, overflow="fold", no_wrap=name == "case")
+    for case in cases:
+        danger, basis = case.danger.value, BASIS[case.basis]
+        table.add_row(
+            case.id, f"[{basis}]{escape(case.bases)}[/]", f"[{DANGER[danger]}]{danger}[/]", escape(case.does),
+            escape(case.must), escape(case.sources),
+        )  # fmt: skip
+    data.print(table)
+
+
+def listed(case: About) -> dict[str, Any]:
+    """The case for `--list --json`. `elsewhere` has its basis and clause on single kinds of wire, where they differ."""
+    keys = ("id", "title", "clause", "does", "must")
+    elsewhere = [{"wire": e.wire, "basis": e.basis.value, "clause": e.clause} for e in case.elsewhere]
+    return {k: getattr(case, k) for k in keys} | {
+        "basis": case.basis.value, "danger": case.danger.value, "role": case.role, "elsewhere": elsewhere,
+    }  # fmt: skip
+
+
+def print_paper(checked: Checked, *, as_json: bool) -> None:
+    """What a check would send, case by case; what is not played is left out."""
+    played = [r for r in checked.results if r.spoken]
+    if as_json:
+        cases = [
+            {"id": "before", "title": "how it answers, and who it is", "danger": "read", "sent": _sent(checked.before)}
+        ]
+        cases += [
+            {"id": r.case.id, "title": r.case.title, "danger": r.case.danger.value, "sent": _sent(r.spoken)}
+            for r in played
+        ]
+        json.dump({"kind": "fieldtwin check dry run", "cases": cases}, sys.stdout, indent=2)
+        sys.stdout.write("\n")
+        return
+    data.print("before: how it answers, and who it is", markup=False)
+    _print_sent(_sent(checked.before))
+    for r in played:
+        danger = r.case.danger.value
+        data.print(f"{r.case.id} [{DANGER[danger]}]{danger}[/] {escape(r.case.title)}", soft_wrap=True)
+        _print_sent(_sent(r.spoken))
+    talk.print(
+        f"{len(played)} cases. The usual read stands before each as well. As a device answers that does all it must; "
+        "another leads to other frames in places.", markup=False, soft_wrap=True,
+    )  # fmt: skip
+
+
+def _sent(spoken: Sequence[Spoken]) -> list[str]:
+    return [s.text for s in spoken if s.direction is Direction.SENT]
+
+
+def _print_sent(frames: Sequence[str]) -> None:
+    """A frame a line; the same ones in a row once, with how often."""
+    for text, same in groupby(frames):
+        times = len(list(same))
+        data.print(f"  {text}" + (f"   x {times}" if times > 1 else ""), markup=False, soft_wrap=True)

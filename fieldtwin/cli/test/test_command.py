@@ -1,0 +1,364 @@
+"""`fieldtwin test`: scenarios, judged; a table for people, JSON, JUnit and HTML for others."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import shutil
+import sys
+from dataclasses import asdict, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+from click.core import ParameterSource
+from rich.markup import escape
+from rich.table import Table
+
+from fieldtwin.__about__ import __version__
+from fieldtwin.cli.campaign_options import CampaignRequest, campaign_options
+from fieldtwin.cli.options import Secret, json_option, junit_flavour_option, profiles_option
+from fieldtwin.cli.template_question import consent, trust_option
+from fieldtwin.conformance.core.case import Danger
+from fieldtwin.console import data, show_warnings
+from fieldtwin.gateway.core.errors import UsageError
+
+if TYPE_CHECKING:
+    from fieldtwin.results.model import Machine, SystemKey
+    from fieldtwin.twin.site.system import System
+
+SUFFIX = ".scenario.yaml"
+_CONTROLLER = "fieldtwin.controller"
+_COLOUR = {"passed": "green", "failed": "red", "error": "red", "inconclusive": "yellow", "skipped": "yellow"}
+
+
+class _WithCommand(click.Command):
+    """A command whose line may end with ``--with -- CMD [ARG]...``: CMD and its arguments go to `controller_words`."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        if "--with" in args and "--" in args[args.index("--with") :]:
+            at = args.index("--", args.index("--with"))
+            ctx.meta[_CONTROLLER] = tuple(args[at + 1 :])
+            args = args[:at]
+        return super().parse_args(ctx, args)
+
+
+@click.command("test", cls=_WithCommand)
+@click.argument("files", nargs=-1, type=click.Path(exists=True))
+@click.option(
+    "--target",
+    type=click.Choice(["virtual", "local", "compose", "real"]),
+    default="virtual",
+    show_default=True,
+    help="Virtual time; processes on this host; containers; a plant.",
+)
+@click.option(
+    "--allow",
+    type=click.Choice([danger.value for danger in Danger]),
+    default=Danger.READ.value,
+    show_default=True,
+    help="With --target real: what steps may do at most.",
+)
+@click.option("--instance", default="", help="With compose, real: what runs on this host under that name.")
+@click.option("--field", "field_host", default="", metavar="HOST[:PORT]", help="With compose: the field side.")
+@click.option(
+    "--with",
+    "with_command",
+    is_flag=True,
+    help="With local: CMD after -- controls instead of our gateway and PLC, in the environment of `fieldtwin with`.",
+)
+@click.option(
+    "--token",
+    type=Secret(),
+    default="",
+    metavar="@FILE",
+    help="Token of that field side's control channel; or in FIELDTWIN_TEST_TOKEN.",
+)
+@click.option("--far", default="", metavar="ENDPOINT", help="With real: where the far modem is, for `send`.")
+@click.option(
+    "--capture",
+    type=click.Path(exists=True, dir_okay=False),
+    help="With --instance: the file that its wires are captured to.",
+)
+@click.option(
+    "--can",
+    default="",
+    metavar="INTERFACE/CHANNEL",
+    help="With local: emulated CAN buses on this interface, e.g. socketcan/vcan0.",
+)
+@click.option("--waivers", type=click.Path(exists=True, dir_okay=False), help="Failures that somebody answers for.")
+@click.option(
+    "--retry-inconclusive",
+    "retries",
+    type=click.IntRange(0, 100),
+    default=0,
+    metavar="N",
+    help="Off virtual time: run a scenario that is inconclusive again, at most N times.",
+)
+@click.option("--seed", type=int, default=None, help="Another seed than the scenario's.")
+@click.option("--junit", type=click.Path(dir_okay=False), help="JUnit XML to this file.")
+@junit_flavour_option
+@click.option("--html", type=click.Path(dir_okay=False), help="One page with verdicts and diagrams to this file.")
+@click.option(
+    "--trace", type=click.Path(dir_okay=False), help="Every event of a single scenario to this file (JSON lines)."
+)
+@campaign_options
+@trust_option
+@profiles_option
+@json_option
+def command(
+    files: tuple[str, ...],
+    target: str,
+    allow: str,
+    instance: str,
+    field_host: str,
+    with_command: bool,
+    token: str,
+    far: str,
+    capture: str | None,
+    can: str,
+    waivers: str | None,
+    retries: int,
+    seed: int | None,
+    junit: str | None,
+    junit_flavour: str,
+    html: str | None,
+    trace: str | None,
+    trust: bool,
+    profiles: tuple[str, ...],
+    as_json: bool,
+    campaign: CampaignRequest,
+) -> int:
+    """Run the scenarios in FILES (*.scenario.yaml; of a folder all that are in it; without FILES those of this folder).
+
+    The exit code is 0 when all passed and 1 otherwise: a scenario that was skipped or stayed inconclusive has not passed.
+
+    
+    --target local       gateway, PLC and emulators as processes, on ptys and sockets of this host
+    --target compose     what runs already, judged beside it: docker compose exec controller fieldtwin test ...
+    --target real        the plant: no faults, nothing set, read-only without --allow write
+    --with -- CMD        your own control program against the simulated devices, started anew for each scenario
+    --seeds 1..200 --faults random    a campaign: what always holds is judged while random faults strike
+    """
+    from fieldtwin.conformance.core.waivers import Waivers, load_waivers
+    from fieldtwin.results.model import Report, ScenarioResult, key_of
+    from fieldtwin.run.targets.scenario_targets import Target, run_scenario
+    from fieldtwin.run.targets.template_scenarios import agree_to_scenario
+    from fieldtwin.scenarios.judging.waiving import all_well, ids_of, waive
+    from fieldtwin.scenarios.language.form import load_scenario
+
+    target, controller = _controller(target, with_command)
+    paths = _found(files)
+    if trace and len(paths) != 1:
+        raise UsageError("--trace belongs to one scenario", got=f"{len(paths)} of them")
+    _check(target, allow, instance, far, capture, can)
+    if retries and target == "real" and Danger(allow).rank > Danger.READ.rank:
+        raise UsageError(
+            "--retry-inconclusive would repeat what a scenario writes to a plant",
+            expected="--allow read, or no retries",
+        )
+    _check_campaign(campaign, target, (seed, trace, retries))
+    folders = tuple(map(Path, profiles))
+    for path in paths:
+        agree_to_scenario(consent(trust=trust), path, folders, plant=target == "real", virtual=target == "virtual")
+    scenarios = [load_scenario(path, folders) for path in paths]
+    show_warnings(dict.fromkeys(warning for one in scenarios for warning in one.system.warnings))
+    known = [id for one in scenarios for id in ids_of(one.path, one.form.scenario)]
+    waived = load_waivers(Path(waivers), known) if waivers else Waivers()
+    where = Target(
+        target,
+        seed,
+        instance,
+        field_host,
+        token,
+        far,
+        Path(capture) if capture else None,
+        Danger(allow),
+        can,
+        controller,
+    )
+    results: list[ScenarioResult] = []
+    for scenario in scenarios:
+        if campaign.seeds:
+            from fieldtwin.cli.test.campaign_view import run_scenario_campaign
+
+            found = run_scenario_campaign(scenario.path, folders, campaign, None if as_json else _show)
+            found = [replace(result, system=scenario.system) for result in found]
+            results += [waive(result, waived, datetime.now(UTC).date()) for result in found]
+            continue
+        result = run_scenario(scenario, where, Path(trace) if trace else None, retries)
+        result = replace(result, system=scenario.system)
+        results.append(waive(result, waived, datetime.now(UTC).date()))
+        if not as_json:
+            _show(results[-1])
+    machines = _machines([one.system for one in scenarios]) if html else {}
+    report = Report(
+        "scenarios",
+        results,
+        scenarios[0].system,
+        target,
+        seed,
+        reproduce=shlex.join(["fieldtwin", *sys.argv[1:]]),
+        versions={"fieldtwin": __version__},
+        machines=machines[key_of(scenarios[0].system)] if html else (),
+        machines_of=machines,
+        served=(),
+    )
+    if junit:
+        from fieldtwin.reports.junit import Flavour, write_junit
+
+        write_junit(report, Path(junit), Flavour(junit_flavour))
+    if html:
+        from fieldtwin.reports.run.html import write_html
+
+        write_html(report, Path(html))
+    if as_json:
+        json.dump([_plain(result) for result in results], sys.stdout, indent=2)
+        sys.stdout.write("\n")
+    else:
+        counts = ", ".join(f"{n} {verdict.value}" for verdict, n in report.counts.items() if n)
+        data.print(f"[bold]{counts}[/bold]")
+    return 0 if all_well(results) else 1
+
+
+def _check_campaign(campaign: CampaignRequest, target: str, of_one_run: tuple[object, ...]) -> None:
+    """Raise `UsageError` where a campaign cannot do what the other options ask for."""
+    campaign.check()
+    if campaign.seeds and target != "virtual":
+        raise UsageError(
+            "--seeds needs virtual time: elsewhere a seed does not give the same run again",
+            expected="--target virtual, without --with",
+            got=f"--target {target}",
+        )
+    if campaign.seeds and any(of_one_run):
+        raise UsageError("--seeds makes many runs", hint="--seed, --trace and --retry-inconclusive belong to one")
+
+
+def _controller(target: str, with_command: bool) -> tuple[str, tuple[str, ...]]:
+    """The target, and the user's program with its arguments. Raises `UsageError` where the two do not fit."""
+    ctx = click.get_current_context()
+    words: tuple[str, ...] = ctx.meta.get(_CONTROLLER, ())
+    if not with_command:
+        return target, ()
+    if not words:
+        raise UsageError("--with needs a command", expected="fieldtwin test FILE.scenario.yaml --with -- CMD [ARG]...")
+    if ctx.get_parameter_source("target") is ParameterSource.DEFAULT:
+        target = "local"
+    if target == "virtual":
+        raise UsageError(
+            "--with cannot run in virtual time: your program waits on the clock of this host",
+            expected="--target local, which is the default with --with",
+        )
+    if target != "local":
+        raise UsageError(
+            f"--with starts the simulated devices and your program itself, and --target {target} judges what runs already",
+            expected="--target local, which is the default with --with",
+        )
+    if shutil.which(words[0]) is None:
+        raise UsageError(f"cannot start {words[0]!r}: no such program", hint="is it on the PATH, and executable?")
+    return target, words
+
+
+def _check(target: str, allow: str, instance: str, far: str, capture: str | None, can: str) -> None:
+    if can and target != "local":
+        raise UsageError("--can goes with --target local", got=f"--target {target}")
+    if target != "real" and (far or allow != Danger.READ.value):
+        raise UsageError("--far and --allow go with --target real", got=f"--target {target}")
+    if target in ("virtual", "local") and instance:
+        raise UsageError("--instance names what runs already", expected="--target compose or real")
+    if capture and target != "compose" and not instance:
+        raise UsageError(
+            "--capture is of what runs already", expected="--target compose, or --target real --instance NAME"
+        )
+
+
+def _found(files: tuple[str, ...]) -> list[Path]:
+    paths: list[Path] = []
+    for name in files or (".",):
+        path = Path(name)
+        paths += sorted(path.rglob(f"*{SUFFIX}")) if path.is_dir() else [path]
+    if not paths:
+        raise UsageError("no scenarios", expected=f"files that end in {SUFFIX}")
+    return paths
+
+
+def _show(result: object) -> None:
+    from fieldtwin.results.model import ScenarioResult, Verdict
+
+    assert isinstance(result, ScenarioResult)
+    colour = _COLOUR[result.verdict.value]
+    took = f"[dim]{round(result.simulated_s, 3):g} s in {result.took_s:.1f} s[/dim]"
+    data.print(f"[{colour}]{result.verdict.value}[/{colour}]  {escape(result.title)}  {took}", soft_wrap=True)
+    for n, reason in enumerate(result.earlier, 1):
+        data.print(f"  attempt {n} of {result.attempts} was inconclusive: {escape(reason)}", soft_wrap=True)
+    for check in result.checks:
+        if check.reason and check.verdict is Verdict.PASSED:
+            data.print(f"  {check.number}: {escape(check.reason)}", soft_wrap=True)
+        if check.verdict is Verdict.SKIPPED and result.verdict is Verdict.PASSED:
+            data.print(f"  {check.number} skipped: {escape(check.got or check.reason)}", soft_wrap=True)
+    for fault in result.faults:
+        data.print(f"  fault {escape(fault.text)}", soft_wrap=True, highlight=False)
+    if result.verdict is Verdict.PASSED:
+        return
+    if result.reason:
+        data.print(f"  {escape(result.reason)}", soft_wrap=True)
+    table = Table(box=None, show_header=False, pad_edge=False)
+    for check in result.checks:
+        if check.verdict is not Verdict.PASSED:
+            if check.number not in result.reason.partition(":")[0].split():  # what the headline does not name
+                table.add_row(f"  {check.number}", escape(check.text))
+            if check.expected:
+                table.add_row("  expected", escape(check.expected))
+            table.add_row("  got", escape(check.got))
+            table.add_row("  at", f"{(check.t_ns or 0) / 1e9:.3f} s, {escape(check.where)}")
+    if table.row_count:
+        data.print(table)
+    for n, line in enumerate(result.evidence):
+        data.print(f"  {'  ' if n else ''}{escape(line)}", soft_wrap=True, highlight=False)
+    data.print(f"  {escape(result.reproduce)}", soft_wrap=True)
+
+
+def _plain(result: object) -> dict[str, object]:
+    from fieldtwin.results.model import ScenarioResult
+
+    assert isinstance(result, ScenarioResult)
+    return {
+        "name": result.name,
+        "case": result.case,
+        "role": result.role,
+        "danger": result.danger,
+        "verdict": result.verdict.value,
+        "seed": result.seed,
+        "target": result.target,
+        "reason": result.reason,
+        "attempts": result.attempts,
+        "inconclusive_attempts": list(result.earlier),
+        "requirements": list(result.requirements),
+        "simulated_s": result.simulated_s,
+        "trace": result.trace_hash,
+        "reproduce": result.reproduce,
+        "faults": [asdict(fault) for fault in result.faults],
+        "checks": [
+            {
+                "number": c.number,
+                "text": c.text,
+                "verdict": c.verdict.value,
+                "t_s": None if c.t_ns is None else c.t_ns / 1e9,
+                "expected": c.expected,
+                "got": c.got,
+                "reason": c.reason,
+                "where": c.where,
+            }
+            for c in result.checks
+        ],
+        "on_the_wire": list(result.evidence),
+    }
+
+
+def _machines(systems: list[System]) -> dict[SystemKey, tuple[Machine, ...]]:
+    """Return the state machines of each system, whose programs are made once."""
+    from fieldtwin.reports.run.machines import machines_of
+    from fieldtwin.results.model import key_of
+
+    return {key: machines_of(system) for key, system in {key_of(system): system for system in systems}.items()}

@@ -1,0 +1,1 @@
+"""Commands of digital shadows and twins, and of what-if questions."""

@@ -1,0 +1,159 @@
+"""`fieldtwin shadow`: a plant, or its prototype, watched from elsewhere by its digital shadow."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import signal
+import sys
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.markup import escape
+
+from fieldtwin.cli.options import Duration, json_option, profiles_option
+from fieldtwin.console import talk
+from fieldtwin.gateway.core.errors import Unreachable
+from fieldtwin.run.shadow.shadow import Shadowing
+from fieldtwin.run.template import system_file
+from fieldtwin.twin.model.mape.messages import Verdict
+from fieldtwin.twin.plant.instance import Instance
+from fieldtwin.twin.site.system import System, load_system
+
+STYLE = {"mismatch": "bold red", "outside": "red", "bad": "yellow", "stale": "yellow", "unreadable": "red"}
+
+
+class ShadowTalk:
+    """Says each verdict as it is reached; that the states agree, when the state is another than before."""
+
+    def __init__(self, *, quiet: bool) -> None:
+        self._quiet = quiet
+        self._states: dict[str, str] = {}
+
+    def __call__(self, verdict: Verdict) -> None:
+        known = verdict.finding == "agree" and self._states.get(verdict.subject) == verdict.text
+        if self._quiet or known or (verdict.again and verdict.fine):
+            return
+        if verdict.finding == "agree":
+            self._states[verdict.subject] = verdict.text
+        when = _clock(datetime.fromtimestamp(verdict.t_ms / 1000, UTC))
+        style = STYLE.get(verdict.finding, "")
+        word = f"[{style}]{verdict.finding:10}[/]" if style else f"{verdict.finding:10}"
+        subject = f"{verdict.subject}: " if not verdict.text.startswith(verdict.subject) else ""
+        talk.print(f"{when} {word} {escape(subject + verdict.text)}", soft_wrap=True)
+
+    def trouble(self, where: str, text: str) -> None:
+        """What is wrong with thread or store, once, and that it is over."""
+        if not self._quiet:
+            self.line(f"[bold yellow]{where:10}[/]", text or "all is well again")
+
+    def line(self, word: str, text: str) -> None:
+        """Something of now, under a word as it is to be shown."""
+        talk.print(f"{_clock(datetime.now(UTC))} {word} {escape(text)}", soft_wrap=True)
+
+
+def _clock(when: datetime) -> str:
+    """The time of day, UTC, to the millisecond."""
+    return when.strftime("%H:%M:%S.%f")[:-3]
+
+
+@click.command("shadow")
+@click.argument("system")
+@click.option(
+    "--from",
+    "place",
+    required=True,
+    metavar="URL",
+    help="Where the plant's thread is: what `fieldtwin run --thread` printed, or mqtt://HOST/GROUP/NODE.",
+)
+@click.option(
+    "--store", default="", metavar="FILE|URL", help="What keeps the knowledge; default: in the run directory."
+)
+@click.option(
+    "--for", "duration_s", type=Duration(), default=0.0, help="Stop after a time such as 20s; default: run on."
+)
+@click.option("--instance", default="", help="Name of the run directory; default: the system's name and -shadow.")
+@profiles_option
+@json_option
+def command(
+    system: str, place: str, store: str, duration_s: float, instance: str, profiles: tuple[str, ...], as_json: bool
+) -> int:
+    """Shadow SYSTEM: receive what its plant sees, keep the digital model up with it, and say where the two differ.
+
+    Reports a state that is not the model's, values outside their limits, bad and stale ones, and how often and how late
+    the twins agree. A shadow sends no commands: it has nothing to send them with. Exit code 1 when the states differed.
+    SYSTEM may be a template.
+    """
+    loaded = load_system(system_file(system, lambda template: True, plant=True), tuple(Path(p) for p in profiles))
+    with Instance(instance or f"{loaded.name}-shadow") as here:
+        seen = asyncio.run(_run(loaded, place, here, store, duration_s, as_json))
+    if as_json:
+        json.dump(seen, sys.stdout, indent=2)
+        sys.stdout.write("\n")
+    else:
+        print_shadow(seen)
+    if not seen["origins"]:
+        raise Unreachable(f"the plant's thread: {why_nothing(seen, place)}", where=place)
+    return 0 if seen["statuses"] and seen["agreed"] == seen["statuses"] else 1  # of no status, nothing is known
+
+
+async def _run(
+    system: System, place: str, instance: Instance, store: str, duration_s: float, as_json: bool
+) -> dict[str, Any]:
+    stop = asyncio.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    talks = ShadowTalk(quiet=as_json)
+    shadowing = Shadowing(system, place, instance, store=store, on_verdict=talks)
+    shadowing.on_trouble = talks.trouble
+    if not as_json:
+        talk.print(f"[bold]shadow[/bold] of {system.name}, from {escape(place)}", soft_wrap=True)
+    await shadowing.run(stop, duration_s)
+    return shadowing.describe()
+
+
+def why_nothing(seen: dict[str, Any], place: str) -> str:
+    """Of a shadow that was told nothing of its plant, which is at `place`: that need not be said twice."""
+    thread = seen["thread"]
+    why = str(thread.get("trouble") or thread.get("silent") or "no word of its log came")
+    return why.removeprefix(f"{place}: ")
+
+
+def told_of(variables: dict[str, Any], undeclared: int) -> str:
+    """How many of the model's variables were heard of, and how many of them can be trusted."""
+    heard = [variable for variable in variables.values() if variable["t_ms"] is not None]
+    good = sum(variable["quality"] == "good" for variable in heard)
+    more = f"; {undeclared} values of others, which it does not declare" if undeclared else ""
+    return f"{len(variables)}, {len(heard)} of them heard of, {good} good{more}"
+
+
+def _count(number: int, word: str) -> str:
+    return f"{number} {word}{'' if number == 1 else 's'}"
+
+
+def print_shadow(seen: dict[str, Any]) -> None:
+    if not seen["origins"]:
+        return
+    kind = "a prototype" if seen["prototype"] else "a plant"
+    lag, rate, thread = seen["lag_ms"], seen["twinning_rate_hz"], seen["thread"]
+    lines = [
+        ("model", f"{seen['state']}, period {seen['period_s']} s"),
+        ("variables", told_of(seen["variables"], seen["undeclared"])),
+        ("from", f"{', '.join(seen['origins'])}, {kind}"),
+        ("statuses", f"{seen['statuses']}, {seen['agreed']} of them as the model"),
+        (
+            "twinning",
+            f"{f'{rate:.1f} reports a second' if rate else 'too few reports'}, {seen['backfilled']} backfilled",
+        ),
+        ("lag", f"median {lag['median']} ms, 95 % {lag['p95']} ms, most {lag['max']} ms" if lag else "unknown"),
+        ("thread", f"{_count(thread['links'], 'link')}, {_count(thread['duplicates'], 'event')} came twice"),
+    ]
+    if thread["trouble"]:
+        lines.append(("trouble", thread["trouble"]))
+    if seen.get("store_trouble"):
+        lines.append(("store", seen["store_trouble"]))
+    lines += [("wrong now", f"{name}: {', '.join(what)}") for name, what in seen["wrong"].items()]
+    for name, text in lines:
+        talk.print(f"  {name:10} {escape(text)}", soft_wrap=True)

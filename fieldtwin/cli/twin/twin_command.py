@@ -1,0 +1,174 @@
+"""`fieldtwin twin`: a shadow with a way back: it plans, asks its model, and commands the plant."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import signal
+import sys
+from pathlib import Path
+from typing import Any
+
+import click
+
+from fieldtwin.cli.options import Duration, json_option, profiles_option
+from fieldtwin.cli.template_question import consent, trust_option
+from fieldtwin.cli.twin.shadow_command import ShadowTalk, print_shadow, why_nothing
+from fieldtwin.console import talk
+from fieldtwin.gateway.core.errors import Unreachable, UsageError
+from fieldtwin.gateway.core.statemachine import decode_period, encode_period
+from fieldtwin.gateway.core.values import COMMAND
+from fieldtwin.gateway.wallclock import WallClock
+from fieldtwin.run.shadow.rules import Plans, PythonPlanner, load_planner, questions_of
+from fieldtwin.run.shadow.shadow import limits_of
+from fieldtwin.run.shadow.twin import Twinning
+from fieldtwin.run.template import system_file
+from fieldtwin.run.what_if.asking import Asking, Subject
+from fieldtwin.twin.model.mape.plan import RulePlanner
+from fieldtwin.twin.model.mape.what_if import Question
+from fieldtwin.twin.plant.instance import Instance
+from fieldtwin.twin.site.system import System, load_system
+
+
+@click.command("twin")
+@click.argument("system")
+@click.option(
+    "--from", "place", required=True, metavar="URL", help="Where the plant's thread is, as of `fieldtwin shadow`."
+)
+@click.option("--plan", "planner", default="", metavar="FILE", help='Rules (YAML), or "python: module:Class".')
+@click.option("--command", "periods", multiple=True, type=int, metavar="SECONDS", help="A period to plan at the start.")
+@click.option(
+    "--what-if",
+    "horizon_s",
+    type=Duration(),
+    default=0.0,
+    metavar="TIME",
+    help="Ask a prototype what comes of a command so far ahead, such as 30min, before it is sent.",
+)
+@click.option("--require", multiple=True, metavar="EXPRESSION", help="With --what-if: what must hold all the time.")
+@click.option("--finally", "finally_", multiple=True, metavar="EXPRESSION", help="With --what-if: and at the end.")
+@click.option(
+    "--what-if-timeout", "timeout_s", type=Duration(), default="60s", show_default=True, help="No answer then is a no."
+)
+@click.option(
+    "--prototype-file",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    help="Of the prototype that is asked; default: beside the system file.",
+)
+@click.option(
+    "--store", default="", metavar="FILE|URL", help="What keeps the knowledge; default: in the run directory."
+)
+@click.option(
+    "--for", "duration_s", type=Duration(), default=0.0, help="Stop after a time such as 20s; default: run on."
+)
+@click.option("--instance", default="", help="Name of the run directory; default: the system's name and -twin.")
+@trust_option
+@profiles_option
+@json_option
+def command(
+    system: str,
+    place: str,
+    planner: str,
+    periods: tuple[int, ...],
+    horizon_s: float,
+    require: tuple[str, ...],
+    finally_: tuple[str, ...],
+    timeout_s: float,
+    prototype_file: Path | None,
+    store: str,
+    duration_s: float,
+    instance: str,
+    trust: bool,
+    profiles: tuple[str, ...],
+    as_json: bool,
+) -> int:
+    """Twin SYSTEM: as `fieldtwin shadow`, and command the plant by rules over what is found.
+
+    Each command is held against the digital model and the limits in the system file first; with --what-if, or where the rules say
+    so, against a prototype that begins with what the twin knows and does as commanded. Only what they accept is sent.
+    The plant obeys while its own switch says `remote`, inside the limits and the rate in its own file, and no number twice.
+    """
+    folders = tuple(Path(p) for p in profiles)
+    runs_code = bool(horizon_s or planner)  # what a prototype or a planner in Python needs of a template
+    agreed = consent(trust=trust or not runs_code)
+    system = system_file(system, agreed, virtual=True, prototype_file=prototype_file, profiles=folders)
+    loaded = load_system(system, folders)
+    plans = load_planner(planner, loaded) if planner else Plans(RulePlanner(()), limits=limits_of(loaded))
+    question = _question(horizon_s, require, finally_) or plans.question
+    questions = [*([question] if question else []), *questions_of(plans.planner)]
+    with Instance(instance or f"{loaded.name}-twin") as here:
+        by_hand = [encode_period(period) for period in periods]
+        talks = TwinTalk(quiet=as_json)
+        subject = Subject(loaded, folders, prototype_file)
+        asking = (
+            Asking(subject, WallClock(), timeout_s, talks.asks)
+            if questions or isinstance(plans.planner, PythonPlanner)
+            else None
+        )
+        twinning = Twinning(
+            loaded, place, here, store=store, on_verdict=talks, on_command=talks.sent, on_refusal=talks.refused,
+            planner=plans.planner, limits=plans.limits, asking=asking, question=question,
+        )  # fmt: skip
+        twinning.on_trouble = talks.trouble
+        for plan in by_hand:
+            twinning.plan(plan)
+        seen = asyncio.run(_run(loaded, place, twinning, duration_s, as_json, asking, questions))
+    if as_json:
+        json.dump(seen, sys.stdout, indent=2)
+        sys.stdout.write("\n")
+    else:
+        print_shadow(seen)
+        asked = f", {seen['asked']} asked of a prototype" if questions else ""
+        there = f", {seen['refused_by_plant']} refused by the plant" if seen["refused_by_plant"] else ""
+        counts = f"{seen['planned']} planned{asked}, {seen['sent']} sent, {seen['refused']} refused{there}"
+        talk.print(f"  commands   {counts}", soft_wrap=True)
+    if not seen["origins"]:
+        raise Unreachable(f"the plant's thread: {why_nothing(seen, place)}", where=place)
+    return 0 if seen["agreed"] == seen["statuses"] else 1
+
+
+class TwinTalk(ShadowTalk):
+    """Says as well what is asked, sent and refused."""
+
+    def asks(self, command: COMMAND, question: Question) -> None:
+        self._say("asks", f"a prototype of period {decode_period(command)} s, {question.horizon_s:g} s ahead")
+
+    def sent(self, command: COMMAND) -> None:
+        self._say("command", f"period {decode_period(command)} s")
+
+    def refused(self, why: str) -> None:
+        self._say("refused", why)
+
+    def _say(self, word: str, text: str) -> None:
+        if not self._quiet:
+            self.line(f"{word:10}", text)
+
+
+def _question(horizon_s: float, require: tuple[str, ...], finally_: tuple[str, ...]) -> Question | None:
+    if not horizon_s and not require and not finally_:
+        return None
+    if not horizon_s or not (require or finally_):
+        raise UsageError(
+            "half a question", expected="--what-if TIME, and what must hold: --require or --finally EXPRESSION"
+        )
+    return Question(horizon_s, require, finally_)
+
+
+async def _run(
+    system: System,
+    place: str,
+    twinning: Twinning,
+    duration_s: float,
+    as_json: bool,
+    asking: Asking | None,
+    questions: list[Question],
+) -> dict[str, Any]:
+    if asking is not None:
+        await asking.check(questions)
+    stop = asyncio.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    if not as_json:
+        talk.print(f"[bold]twin[/bold] of {system.name}, opposite {place}", soft_wrap=True, markup=True)
+    await twinning.run(stop, duration_s)
+    return twinning.describe()

@@ -1,0 +1,163 @@
+"""``fieldtwin what-if``: what would come of a command, a fault, or a whole plan."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.markup import escape
+
+from fieldtwin.cli.options import Duration, json_option, profiles_option
+from fieldtwin.cli.template_question import consent, trust_option
+from fieldtwin.cli.twin.what_if_view import show
+from fieldtwin.console import data, talk
+from fieldtwin.gateway.core.errors import FileInvalid, UsageError
+from fieldtwin.gateway.core.files.input_file import open_input
+from fieldtwin.run.template import system_file
+from fieldtwin.run.what_if.state import KnownState
+
+
+@click.command("what-if")
+@click.argument("system", required=False)
+@click.option("--from", "source", default="", help="What is known: a state file, a knowledge store, or instance:NAME.")
+@click.option("--origin", default="", help="Whose knowledge, where a store has that of several.")
+@click.option(
+    "--command", "commands", multiple=True, help="A period that the far side commands: PERIOD_S or PERIOD_S@TIME."
+)
+@click.option("--faults", "fault_file", type=click.Path(path_type=Path), help="Faults, as `run --faults` takes them.")
+@click.option("--require", multiple=True, help="An expression that must hold all the time.")
+@click.option("--finally", "finally_", multiple=True, help="An expression that must hold at the end.")
+@click.option("--plans", "plan_file", type=click.Path(path_type=Path), help="Several plans, in a file.")
+@click.option("--horizon", "horizon_s", type=Duration(), default="1h", show_default=True, help="How far ahead.")
+@click.option(
+    "--settle", "settle_s", type=Duration(), default="5s", show_default=True, help="From when on requirements count."
+)
+@click.option("--jobs", type=click.IntRange(1, 64), default=2, show_default=True, help="Processes at once.")
+@click.option("--seed", type=int, help="Instead of the prototype file's.")
+@click.option("--prototype-file", type=click.Path(path_type=Path), help="Instead of the one beside the system file.")
+@click.option("--save-state", type=click.Path(path_type=Path), help="Write what is known to a file, and end.")
+@trust_option
+@profiles_option
+@json_option
+def command(
+    system: str | None,
+    source: str,
+    origin: str,
+    commands: tuple[str, ...],
+    fault_file: Path | None,
+    require: tuple[str, ...],
+    finally_: tuple[str, ...],
+    plan_file: Path | None,
+    horizon_s: float,
+    settle_s: float,
+    jobs: int,
+    seed: int | None,
+    prototype_file: Path | None,
+    save_state: Path | None,
+    trust: bool,
+    profiles: tuple[str, ...],
+    as_json: bool,
+) -> int:
+    """Fork the prototype of SYSTEM in virtual time from what is known, and see what comes of a plan.
+
+    The plant is not touched. Exit status: 0 when a plan meets all that is required, 1 when none does.
+    """
+    from fieldtwin.run.what_if.fork import Fork
+    from fieldtwin.run.what_if.many import answers
+    from fieldtwin.run.what_if.plan import Plan, in_words, load_plans
+    from fieldtwin.run.what_if.plan import command as parsed
+    from fieldtwin.twin.site.system import load_system
+
+    plans: list[Plan] = []
+    if plan_file is not None:
+        named, plans = load_plans(plan_file)
+        beside = plan_file.parent / named
+        system = system or (str(beside) if beside.exists() else named)
+    if system is None:
+        raise UsageError("which system?", expected="SYSTEM, or --plans FILE which names it")
+    folders = tuple(Path(p) for p in profiles)
+    agreed = consent(trust=trust)
+    system = system_file(system, agreed, virtual=True, prototype_file=prototype_file, profiles=folders)
+    loaded = load_system(system, folders)
+    state = _state(source, origin, system, folders)
+    if save_state is not None:
+        try:
+            save_state.write_text(state.dump(loaded), encoding="utf-8")
+        except OSError as e:
+            raise FileInvalid(f"cannot be written: {e.strerror or e}", path=str(save_state)) from e
+        values, programs = len(state.values), len(state.programs)
+        told = f"{values} value{'s'[: values != 1]} and what {programs} program{'s'[: programs != 1]} hold{'s'[: programs == 1]}"
+        talk.print(f"{told} → {escape(str(save_state))}", soft_wrap=True)
+        return 0
+    if commands or require or finally_ or fault_file or not plans:
+        faults = _faults(fault_file, loaded)
+        own = tuple(parsed(c) for c in commands)
+        plans.append(Plan(in_words(own, faults), own, faults, require, finally_))
+    fork = Fork(system, state, horizon_s, folders, prototype_file, seed, settle_s)
+    talk.print(
+        f"{loaded.name}: {len(plans)} plan{'s'[: len(plans) != 1]}, {_ahead(horizon_s)} ahead, from {escape(state.source)}",
+        soft_wrap=True,
+    )
+    outcomes = answers(
+        fork,
+        plans,
+        jobs,
+        lambda o: talk.print(f"  {escape(o.plan)}: {'met' if o.met else 'not met'}, {o.took_s:.1f} s"),
+    )
+    if as_json:
+        found: dict[str, Any] = {
+            "fieldtwin_what_if": 1,
+            "system": loaded.name,
+            "from": state.source,
+            "utc_ms": state.utc_ms,
+        }
+        click.echo(json.dumps(found | {"outcomes": [o.described() for o in outcomes]}, indent=1))
+    else:
+        units = {f"{d.name}.{t.name}": t.unit or "" for d in loaded.devices.values() for t in d.profile.tags.values()}
+        show(data, outcomes, units)
+    return 0 if any(o.met for o in outcomes) else 1
+
+
+def _ahead(seconds: float) -> str:
+    """A horizon as people say it."""
+    for unit, name in ((86_400, "d"), (3600, "h"), (60, "min")):
+        if seconds >= 2 * unit:
+            return f"{seconds / unit:g} {name}"
+    return f"{seconds:g} s"
+
+
+def _state(source: str, origin: str, system: str, folders: tuple[Path, ...]) -> KnownState:
+    from fieldtwin.run.what_if.known import known_state
+    from fieldtwin.run.what_if.state import of_instance, read_state
+    from fieldtwin.twin.site.system import load_system
+
+    loaded = load_system(system, folders)
+    if not source:
+        return KnownState()
+    if source.startswith("instance:"):
+        from fieldtwin.run.processes.plc_client import choose
+
+        return asyncio.run(of_instance(choose(source.removeprefix("instance:")).parent, loaded))
+    if source.startswith(("postgresql:", "postgres:")) or _is_sqlite(Path(source)):
+        return asyncio.run(known_state(source, loaded, origin))
+    return read_state(Path(source), loaded)
+
+
+def _is_sqlite(path: Path) -> bool:
+    try:
+        with open_input(path) as file:
+            return file.read(16) == b"SQLite format 3\0"
+    except (OSError, FileInvalid):
+        return False
+
+
+def _faults(path: Path | None, system: Any) -> tuple[dict[str, Any], ...]:
+    if path is None:
+        return ()
+    from fieldtwin.emulators.faults.schema import load_faults
+    from fieldtwin.twin.prototype.fault_aims import target
+
+    return load_faults(path, lambda spec: target(system, spec))

@@ -1,0 +1,61 @@
+"""Plot histories. This is the only file that uses matplotlib, an optional extra: ``pip install fieldtwin[plot]``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from importlib.util import find_spec
+from pathlib import Path
+
+from fieldtwin.commissioning.access.watching import History
+from fieldtwin.gateway.core.errors import FileInvalid, UsageError
+from fieldtwin.gateway.core.files.profile import Tag
+
+MOST_PANELS = 24
+FORMATS = (".png", ".svg", ".pdf")
+
+
+def check_plot(path: Path) -> None:
+    """Raise `UsageError` if no picture can be made at the end, before an hour of watching."""
+    if path.suffix.lower() not in FORMATS:
+        raise UsageError("no picture of that kind", expected=", ".join(FORMATS), got=path.name)
+    if not _there():
+        raise UsageError(
+            "--plot needs matplotlib", hint="pip install 'fieldtwin[plot]', or --json and a plotter of your own"
+        )
+
+
+def _there() -> bool:
+    try:
+        return find_spec("matplotlib") is not None
+    except ValueError:  # it was removed from the running interpreter
+        return False
+
+
+def plot(path: Path, title: str, tags: Sequence[Tag], histories: Mapping[str, History]) -> int:
+    """Write a picture: a panel for each tag that has numbers, time in seconds below. How many panels; 0: no picture.
+
+    Raises `FileInvalid` when it cannot be written.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    shown = [t for t in tags if any(v is not None for v in histories[t.name].values)][:MOST_PANELS]
+    if not shown:
+        return 0
+    figure = Figure(figsize=(9, 1.2 + 1.5 * len(shown)), layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(len(shown), 1, sharex=True, squeeze=False)[:, 0]
+    for panel, tag in zip(panels, shown, strict=True):
+        history = histories[tag.name]
+        values = [float("nan") if v is None else v for v in history.values]
+        panel.step(list(history.times_s), values, where="post", linewidth=1)
+        panel.set_ylabel(f"{tag.name}\n{tag.unit}".rstrip(), fontsize="small")
+        panel.grid(visible=True, linewidth=0.3)
+        panel.ticklabel_format(useOffset=False, axis="y")
+    panels[-1].set_xlabel("s")
+    figure.suptitle(title, fontsize="medium")
+    try:
+        figure.savefig(path, dpi=120)
+    except OSError as e:
+        raise FileInvalid(f"cannot write the picture: {e.strerror or e}", path=str(path)) from e
+    return len(shown)

@@ -1,0 +1,359 @@
+"""One device on a live connection for the commissioning commands: read tags, write one, show the frames without sending.
+
+It must never decide what may be written (`writing` does), and must not depend on files or displays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+from fieldtwin.commissioning.access.address import AUTO
+from fieldtwin.commissioning.access.connection import frame_of
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import (
+    CrcError,
+    Desync,
+    DeviceRefused,
+    ModbusExceptionReply,
+    NotAllowed,
+    ReplyTimeout,
+    SdoAborted,
+)
+from fieldtwin.gateway.core.files.profile import DeviceProfile, RegisterRange, Tag
+from fieldtwin.gateway.core.files.profile_schema import Limits, ProfileForm
+from fieldtwin.gateway.core.values import Quality, Reason, Scalar, TagValue
+from fieldtwin.gateway.devices.codec import apply_scale, decode, decode_little, encode, reorder
+from fieldtwin.gateway.devices.read_plan import ILLEGAL_ADDRESS, TOO_LONG, GroupPlan, Learnt, Read, plan_reads
+from fieldtwin.gateway.protocols.canopen.master import CanopenMaster
+from fieldtwin.gateway.protocols.canopen.sdo import SdoDownload, SdoUpload
+from fieldtwin.gateway.protocols.modbus.client import ModbusClient
+from fieldtwin.gateway.protocols.modbus.framings import framing_of
+from fieldtwin.gateway.protocols.modbus.request import Request
+from fieldtwin.gateway.protocols.modbus.requests import (
+    ReadBits,
+    ReadRegisters,
+    WriteCoil,
+    WriteCoils,
+    WriteRegister,
+    WriteRegisters,
+)
+
+WIRE_TROUBLE = (ReplyTimeout, CrcError, Desync)
+OBJECT_BYTES = {"bool": 1, "int8": 1, "uint8": 1, "int16": 2, "uint16": 2, "int32": 4, "uint32": 4, "float32": 4}
+"""Number of bytes of an object of that type; 8 for the other numeric types."""
+
+
+MOST_SILENT = 3
+"""Requests in a row without a reply after which a unit counts as dead for the rest of a reading."""
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """A tag's value, or a bad value whose `problem` is the error of the device or the connection."""
+
+    value: TagValue
+    problem: str = ""
+
+
+class Point(Protocol):
+    """A device that can be queried. Frames are as on the bus, one line of hex or candump's text each."""
+
+    protocol: str
+    where: str
+    requests: int
+    """Number of requests, or transfers, sent to it."""
+
+    async def read(
+        self, tags: Sequence[Tag], found: dict[str, Answer] | None = None, *, alone: bool = False
+    ) -> dict[str, Answer]:
+        """Return each tag's value by name, read in as few requests as possible.
+
+        A refused or lost read is an answer too; only errors that end the connection are raised. `found` then holds the
+        values read until then. With `alone` the tags of a request that failed are read again, one by one.
+        """
+        ...
+
+    async def write(self, tag: Tag, data: bytes) -> None:
+        """Write the bytes of `encoded` in one request, once. Raises the errors of connection and device."""
+        ...
+
+    def read_frames(self, tags: Sequence[Tag]) -> list[str]:
+        """Return the first frames that `read` would send."""
+        ...
+
+    def write_frames(self, tag: Tag, data: bytes) -> list[str]:
+        """Return the frames that `write` would send."""
+        ...
+
+
+def encoded(tag: Tag, value: Scalar) -> bytes:
+    """Return the bytes of an engineering value as on the bus: registers, or an object's little-endian bytes.
+
+    Raises `NotAllowed` for a value that the tag cannot hold. Bytes are used unchanged.
+    """
+    if isinstance(value, bytes):
+        return value
+    if isinstance(value, str) and tag.type == "string":
+        return _text(tag, value)
+    data = encode(tag, value)
+    if tag.at is not None:
+        return data
+    big = reorder(data, tag.order)
+    return big[::-1][: OBJECT_BYTES.get(tag.type, 8)]
+
+
+def _text(tag: Tag, value: str) -> bytes:
+    """Return text as a device holds it: padded to whole registers with NULs, its bytes swapped where the order swaps bytes."""
+    if not value.isascii():
+        raise NotAllowed(f"{tag.name}: only ASCII can be written", got=repr(value))
+    raw = value.encode("ascii")
+    if tag.at is None:
+        return raw
+    if len(raw) > 2 * tag.at.count:
+        raise NotAllowed(f"{tag.name}: the text is too long", expected=f"at most {2 * tag.at.count} characters")
+    raw = raw.ljust(2 * tag.at.count, b"\0")
+    return reorder(raw, "BADC") if tag.order in ("BADC", "DCBA") else raw
+
+
+def decoded(tag: Tag, data: bytes, t_ns: int) -> TagValue:
+    """Return the value in `data`.
+
+    An object of unknown type is an unsigned number if it has the length of one, else text or bytes.
+    """
+    if tag.at is not None:
+        return decode(tag, data, t_ns)
+    if tag.type == AUTO:
+        text = len(data) > 4 and data.rstrip(b"\0").isascii() and data.rstrip(b"\0").decode("ascii").isprintable()
+        kind = f"uint{8 * len(data)}" if len(data) in (1, 2, 4) else "string" if text else "bytes"
+        tag = replace(tag, type=kind)
+    size = OBJECT_BYTES.get(tag.type, None if tag.is_text else 8)
+    if size is not None and len(data) != size:  # not the stated type: shown, and never decoded as another type
+        return TagValue(data, Quality.UNCERTAIN, Reason.NOT_A_NUMBER, t_ns, data)
+    return decode_little(tag, data, t_ns)
+
+
+class ModbusPoint:
+    """`unit` at `url`, queried through `client`.
+
+    `profile` gives its limits and gaps; limits that the device reveals are kept in `learnt`.
+    """
+
+    protocol = "modbus"
+
+    def __init__(self, client: ModbusClient | None, url: str, unit: int, profile: DeviceProfile | None = None) -> None:
+        self.where = f"{url} unit {unit}"
+        self.unit = unit
+        self.learnt = Learnt()
+        self.requests = 0
+        self._client = client
+        self._url = url
+        self._profile = profile
+        self._plans: dict[tuple[str, ...], GroupPlan] = {}
+
+    @property
+    def is_broadcast(self) -> bool:
+        """Return whether the unit ID addresses all units of the line."""
+        return self.unit == 0 and framing_of(Endpoint.parse(self._url)) in ("rtu", "ascii")
+
+    @property
+    def client(self) -> ModbusClient:
+        assert self._client is not None, "a dry run sends nothing"
+        return self._client
+
+    async def read(
+        self, tags: Sequence[Tag], found: dict[str, Answer] | None = None, *, alone: bool = False
+    ) -> dict[str, Answer]:
+        """Read as `Point.read`. A tag that is scaled by a second tag reads that tag too.
+
+        With `alone`, a unit that leaves `MOST_SILENT` requests in a row without a reply is not asked again: the tags
+        that were requested together keep the answer that they had then.
+        """
+        found = {} if found is None else found
+        plan = self._plan(self._with_scales(tags))
+        answers: dict[str, Answer] = {}
+        todo, silent = list(plan.reads), 0
+        try:
+            while todo:
+                read = todo.pop(0)
+                if silent >= MOST_SILENT and all(t.name in answers for t in read.tags):
+                    continue
+                try:
+                    raw, t_ns = await self._transaction(read.range)
+                except ModbusExceptionReply as e:
+                    silent = 0
+                    parts = plan.refused(read, e.code) if e.code in (ILLEGAL_ADDRESS, TOO_LONG) else ()
+                    if not parts:
+                        answers |= _bad(read.tags, Reason.REFUSED, e)
+                    todo[:0] = parts or (_singly(read) if alone else ())
+                except WIRE_TROUBLE as e:
+                    timeout = isinstance(e, ReplyTimeout)
+                    silent = silent + 1 if timeout else 0
+                    answers |= _bad(read.tags, Reason.TIMEOUT if timeout else Reason.WIRE_ERROR, e)
+                    todo[:0] = _singly(read) if alone else ()
+                else:
+                    silent = 0
+                    plan.taken(read)
+                    answers |= {t.name: Answer(decode(t, part(read.range, t.registers, raw), t_ns)) for t in read.tags}
+            plan.pass_ended()
+        finally:
+            found |= {t.name: self._scaled(t, answers) for t in tags if t.name in answers}
+        return found
+
+    async def write(self, tag: Tag, data: bytes) -> None:
+        """Write as `Point.write`, with the function that the profile's limits permit."""
+        self.requests += 1
+        await self.client.execute(self.unit, write_request(tag, data, self._functions))
+
+    def read_frames(self, tags: Sequence[Tag]) -> list[str]:
+        return [self._frame(read_request(r.range)) for r in self._plan(self._with_scales(tags)).reads]
+
+    def write_frames(self, tag: Tag, data: bytes) -> list[str]:
+        return [self._frame(write_request(tag, data, self._functions))]
+
+    @property
+    def _functions(self) -> list[int] | None:
+        return self._profile.form.limits.functions if self._profile is not None else None
+
+    def _frame(self, request: Request[Any]) -> str:
+        return frame_of(self._url, self.unit, request).hex(" ")
+
+    async def _transaction(self, at: RegisterRange) -> tuple[bytes, int]:
+        self.requests += 1
+        if at.table == "coil" or at.table == "discrete":
+            bits = await self.client.read_bits(self.unit, at.table, at.address, at.count)
+            return bytes(bits.bits), bits.t_ns
+        reply = await self.client.read_registers(self.unit, at.table, at.address, at.count)
+        return reply.raw, reply.t_ns
+
+    def _with_scales(self, tags: Sequence[Tag]) -> list[Tag]:
+        known = {t.name: t for t in tags}
+        if self._profile is not None:
+            for tag in tags:
+                if tag.scale_by is not None:
+                    known.setdefault(tag.scale_by, self._profile.tags[tag.scale_by])
+        return list(known.values())
+
+    def _scaled(self, tag: Tag, answers: dict[str, Answer]) -> Answer:
+        answer = answers[tag.name]
+        if tag.scale_by is None or answer.problem:
+            return answer
+        by = answers.get(tag.scale_by)
+        return Answer(apply_scale(tag, answer.value, by.value if by is not None else None))
+
+    def _plan(self, tags: Sequence[Tag]) -> GroupPlan:
+        """Return the gateway's own planner over just these tags; later calls use what was learnt."""
+        key = tuple(t.name for t in tags)
+        if key not in self._plans:
+            self._plans[key] = GroupPlan(asked_profile(tags, self._profile), "asked", self.learnt)
+        return self._plans[key]
+
+
+class CanopenPoint:
+    """`node` on the bus at `url`, queried over SDO through `master`; its NMT state is never changed."""
+
+    protocol = "canopen"
+
+    def __init__(self, master: CanopenMaster | None, url: str, node: int) -> None:
+        self.where = f"{url} node {node}"
+        self.node = node
+        self.requests = 0
+        self._master = master
+
+    @property
+    def master(self) -> CanopenMaster:
+        assert self._master is not None, "a dry run sends nothing"
+        return self._master
+
+    async def read(
+        self, tags: Sequence[Tag], found: dict[str, Answer] | None = None, *, alone: bool = False
+    ) -> dict[str, Answer]:
+        """Read as `Point.read`: one transfer a tag, so `alone` has no effect."""
+        answers: dict[str, Answer] = {} if found is None else found
+        for tag in tags:
+            assert tag.object is not None
+            self.requests += 1
+            try:
+                data = await self.master.sdo_upload(self.node, *tag.object)
+            except SdoAborted as e:
+                answers |= _bad([tag], Reason.REFUSED, e)
+            except WIRE_TROUBLE as e:
+                answers |= _bad([tag], Reason.TIMEOUT if isinstance(e, ReplyTimeout) else Reason.WIRE_ERROR, e)
+            else:
+                answers[tag.name] = Answer(decoded(tag, data, 1))
+        return answers
+
+    async def write(self, tag: Tag, data: bytes) -> None:
+        assert tag.object is not None
+        self.requests += 1
+        await self.master.sdo_download(self.node, *tag.object, data)
+
+    def read_frames(self, tags: Sequence[Tag]) -> list[str]:
+        return [str(SdoUpload(self.node, *t.object, 0).start(0)) for t in tags if t.object is not None]
+
+    def write_frames(self, tag: Tag, data: bytes) -> list[str]:
+        assert tag.object is not None
+        return [str(SdoDownload(self.node, *tag.object, 0, data).start(0))]
+
+
+def _singly(read: Read) -> tuple[Read, ...]:
+    """Return a separate read for each tag of `read`; none where it has one tag only, or has to be read whole."""
+    if read.messages or len(read.tags) < 2:
+        return ()
+    return tuple(Read(t.registers, (t,), ()) for t in read.tags)
+
+
+def asked_profile(tags: Sequence[Tag], profile: DeviceProfile | None) -> DeviceProfile:
+    """Return a profile of `tags` alone, in one group ``asked``, with the limits and gaps of `profile`.
+
+    Without `profile` reads are as long as the standard permits, and never include a register that was not requested.
+    """
+    form = profile.form if profile is not None else ProfileForm(
+        device="raw/raw", source="", protocol="modbus", limits=Limits(max_gap=0)
+    )  # fmt: skip
+    named = {t.name: replace(t, poll="asked", access="rw") for t in tags}
+    gaps = profile.gaps if profile is not None else ()
+    return DeviceProfile("", "", form, named, {}, None, None, None, gaps)
+
+
+def planned(tags: Sequence[Tag], profile: DeviceProfile | None) -> tuple[Read, ...]:
+    """Return the fewest reads for `tags` (`plan_reads`)."""
+    return plan_reads(asked_profile(tags, profile), "asked")
+
+
+def part(read: RegisterRange, at: RegisterRange, raw: bytes) -> bytes:
+    """Return the bytes of `at` out of those of `read` (bits one per byte)."""
+    width = 1 if read.table in ("coil", "discrete") else 2
+    start = (at.address - read.address) * width
+    return raw[start : start + at.count * width]
+
+
+def write_request(tag: Tag, data: bytes, functions: Sequence[int] | None) -> Request[Any]:
+    """Return the one request that writes `tag`.
+
+    It is 05 or 0Fh for a coil, 06 for one register if the device has it or is unknown, else 10h.
+    """
+    at = tag.registers
+    if at.table == "coil":
+        value = bool(int.from_bytes(data))
+        if functions is not None and 5 not in functions:
+            return WriteCoils(at.address, (value,))
+        return WriteCoil(at.address, value)
+    words = tuple(int.from_bytes(data[i : i + 2]) for i in range(0, len(data), 2))
+    if len(words) == 1 and (functions is None or 6 in functions):
+        return WriteRegister(at.address, words[0])
+    return WriteRegisters(at.address, words)
+
+
+def read_request(at: RegisterRange) -> Request[Any]:
+    """Return the request that reads a range."""
+    if at.table == "coil" or at.table == "discrete":
+        return ReadBits(at.table, at.address, at.count)
+    return ReadRegisters(at.table, at.address, at.count)
+
+
+def _bad(
+    tags: Sequence[Tag], reason: Reason, error: DeviceRefused | ReplyTimeout | CrcError | Desync
+) -> dict[str, Answer]:
+    return {t.name: Answer(TagValue(None, Quality.BAD, reason), error.message) for t in tags}

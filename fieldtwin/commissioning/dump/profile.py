@@ -1,0 +1,81 @@
+"""Read the tags of a profile in the fewest requests that the limits of the profile and of the device allow.
+
+A generator as `dump_sweep` is, over the planner that runs the plant (`fieldtwin.gateway.devices.read_plan`): a refused
+read is halved, and limits learnt on the way are used from the next pass on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from fieldtwin.commissioning.access.point import asked_profile
+from fieldtwin.commissioning.dump.coverage import joined
+from fieldtwin.commissioning.dump.sweep import MOST_SILENT, Asking, Invalid, Refused, Silent, TableMap, Taken
+from fieldtwin.gateway.core.files.profile import DeviceProfile, RegisterRange, Tag
+from fieldtwin.gateway.devices.read_plan import ILLEGAL_ADDRESS, TOO_LONG, GroupPlan
+
+
+class ProfileSweep:
+    """A sweep that reads `tags` of `profile`. `maps` are the findings by table.
+
+    Where the device is silent, reads are not repeated after `MOST_SILENT` in a row, and end when they have taken
+    `budget_us`.
+    """
+
+    def __init__(self, profile: DeviceProfile, tags: Sequence[Tag], budget_us: int | None = None) -> None:
+        asked = asked_profile(tags, profile)
+        self.plan = GroupPlan(replace(asked, gaps=(*asked.gaps, *_let_alone(profile, tags))), "asked")
+        self.stopped = ""
+        self.patient = True
+        self.maps: dict[str, TableMap] = {}
+        self._budget_us = budget_us
+
+    def asking(self) -> Asking:
+        todo, silent, spent_us, heard = list(self.plan.reads), 0, 0, False
+        while todo and not self.stopped:
+            read = todo.pop(0)
+            self.patient = silent < MOST_SILENT
+            outcome = yield read.range
+            found = self.maps.setdefault(read.range.table, TableMap(read.range.table))
+            if isinstance(outcome, Taken):
+                self.plan.taken(read)
+                found.readable = joined([*found.readable, (read.range.address, read.range.end)])
+                found.max_read = max(found.max_read, read.range.count)
+            elif isinstance(outcome, Refused):
+                found.codes[outcome.code] = found.codes.get(outcome.code, 0) + 1
+            if isinstance(outcome, Refused) and outcome.code in (ILLEGAL_ADDRESS, TOO_LONG):
+                todo[:0] = self.plan.refused(read, outcome.code)
+            elif isinstance(outcome, Silent | Invalid) and heard:  # one register of several may be the reason
+                todo[:0] = self.plan.refused(read)
+            silent = silent + 1 if isinstance(outcome, Silent) else 0
+            heard |= not isinstance(outcome, Silent)
+            spent_us += outcome.us if isinstance(outcome, Silent | Invalid) else 0
+            if silent >= MOST_SILENT and not heard:
+                self.stopped = f"no reply {MOST_SILENT} times in a row"
+            elif self._budget_us is not None and spent_us > self._budget_us:
+                self.stopped = (
+                    f"the time budget of {self._budget_us / 1e6:g} s for questions without a result is used up"
+                )
+        for table, found in self.maps.items():
+            found.stopped = self.stopped if any(r.range.table == table for r in todo) else ""
+        self.plan.pass_ended()
+
+    def reads(self) -> list[RegisterRange]:
+        """Return the reads of the next pass."""
+        return [read.range for read in self.plan.reads]
+
+
+def _let_alone(profile: DeviceProfile, tags: Sequence[Tag]) -> list[RegisterRange]:
+    """Return the registers of tags that are not wanted, so that a read over a gap between two others does not include them."""
+    wanted = [t.registers for t in tags]
+    others = [t.registers for t in profile.tags.values() if t.name not in {w.name for w in tags}]
+    return [o for o in others if not any(w.overlaps(o) for w in wanted)]
+
+
+def dumped_tags(profile: DeviceProfile) -> tuple[list[Tag], list[Tag]]:
+    """Return the tags that a dump reads, and those that it omits: secrets, and tags whose reading has an effect."""
+    touchy = {e.tag.name for e in profile.effects if e.on_read}
+    readable = [t for t in profile.tags.values() if t.readable]
+    wanted = [t for t in readable if not t.secret and t.name not in touchy]
+    return wanted, [t for t in readable if t not in wanted]

@@ -1,0 +1,1 @@
+"""Identify one device, and find the profile that fits it."""

@@ -1,0 +1,325 @@
+"""Find the profile that fits a device, with certainty and reasons. Pure: clues in, a ranking out.
+
+Certainty requires an unambiguous identification by the device itself: its identity objects (2Bh/0Eh), its vendor ID and
+product code (1018h), or the SunSpec header and a model number. Readable and plausible registers never make a profile
+certain: sister models share maps, and an empty register is plausible everywhere.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import IntEnum
+
+from fieldtwin.gateway.core.files.profile import DeviceProfile, Tag
+from fieldtwin.gateway.core.values import Quality, TagValue
+from fieldtwin.gateway.protocols.canopen.configure import Identity
+from fieldtwin.gateway.protocols.canopen.dictionary import ObjectDictionary
+
+ENOUGH_SIGNS = 6
+"""Number of plausible values, out of those that could have been implausible, that make a map likely."""
+TELLING_BYTES = 4
+"""A server id shorter than this is many devices'."""
+_SUNSPEC_PROFILE = re.compile(r"^sunspec/.*-(\d+)$")
+
+
+class Sureness(IntEnum):
+    """The certainty with which a profile fits; ordered."""
+
+    RULED_OUT = 0
+    POSSIBLE = 1
+    LIKELY = 2
+    CERTAIN = 3
+
+    def __str__(self) -> str:
+        return self.name.lower().replace("_", " ")
+
+
+@dataclass(frozen=True, slots=True)
+class SunSpec:
+    """A SunSpec map: its base, and its models as (number, address of the number, number of registers after its length)."""
+
+    base: int
+    models: tuple[tuple[int, int, int], ...]
+    manufacturer: str = ""
+    model: str = ""
+    version: str = ""
+    serial: str = ""
+
+
+@dataclass(slots=True)
+class ModbusClues:
+    """A unit's own identification. None: not obtained, for the reason in `silence` (by function, ``"2B"``)."""
+
+    server_id: bytes | None = None
+    objects: dict[int, str] | None = None
+    sunspec: SunSpec | None = None
+    silence: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(slots=True)
+class CanClues:
+    """A node's own identification."""
+
+    identity: Identity | None = None
+    name: str = ""
+    hardware: str = ""
+    software: str = ""
+    silence: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """A profile, with reasons for and against it."""
+
+    profile: str
+    sureness: Sureness
+    reasons: tuple[str, ...]
+    against: tuple[str, ...] = ()
+    signs: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """A tag that was read for a profile: its value, or the problem. `refused`: the device refused the read."""
+
+    tag: Tag
+    value: TagValue | None
+    problem: str = ""
+    refused: bool = False
+
+
+def rank(candidates: Iterable[Candidate]) -> list[Candidate]:
+    """Sort the candidates, best first."""
+    return sorted(candidates, key=lambda c: (-c.sureness, -c.signs, c.profile))
+
+
+def certain(ranked: Sequence[Candidate]) -> str | None:
+    """Return the one profile that is certain, if there is one."""
+    found = [c.profile for c in ranked if c.sureness is Sureness.CERTAIN]
+    return found[0] if len(found) == 1 else None
+
+
+def summary(ranked: Sequence[Candidate]) -> str:
+    """Return a cautious sentence: several profiles that fit equally well are not an answer."""
+    best = [c for c in ranked if c.sureness is not Sureness.RULED_OUT and c.sureness == ranked[0].sureness]
+    if not best:
+        return "no known profile fits"
+    names = ", ".join(c.profile for c in best)
+    if len(best) > 1:
+        return f"{len(best)} profiles fit equally well ({best[0].sureness}): {names}"
+    return f"{names}: {best[0].sureness}"
+
+
+# -- Modbus -----------------------------------------------------------------------------------------------------------
+
+
+def contradicted(profile: DeviceProfile, clues: ModbusClues) -> str:
+    """Return why `profile` contradicts the unit's identification; empty if it does not.
+
+    Its registers then need not be read.
+    """
+    if clues.objects is not None:
+        for number, label in ((0, "vendor"), (1, "product code")):
+            stated, told = profile.form.identification.get(number), clues.objects.get(number)
+            if stated is not None and told is not None and stated.strip() != told.strip():
+                return f"its {label} is {told!r}, not {stated!r}"
+    model = _SUNSPEC_PROFILE.match(profile.name)
+    if model is not None and clues.sunspec is None and clues.silence.get("sunspec") == "no header":
+        return "it has no SunSpec header"
+    if model is not None and clues.sunspec is not None and int(model[1]) not in [m[0] for m in clues.sunspec.models]:
+        return f"it has no SunSpec model {model[1]}"
+    return ""
+
+
+def judge_modbus(profile: DeviceProfile, clues: ModbusClues, readings: Mapping[str, Reading]) -> Candidate:
+    """Return the certainty that the unit is a device of `profile`.
+
+    `readings`: tags of its `identify`, and others, by name.
+    """
+    against = contradicted(profile, clues)
+    if against:
+        return Candidate(profile.name, Sureness.RULED_OUT, (), (against,))
+    reasons, doubts, certain = _own_words(profile, clues, readings)
+    keyed, wrong = _keys(profile, readings)
+    if wrong:
+        return Candidate(profile.name, Sureness.RULED_OUT, tuple(reasons), tuple(wrong))
+    keys = {entry.tag for entry in profile.form.identify}
+    others = [r for name, r in readings.items() if name not in keys]
+    signs, nonsense = _plausibility(others)
+    if 4 * len(nonsense) > len(signs) + len(keyed) and not certain:
+        return Candidate(profile.name, Sureness.RULED_OUT, tuple(reasons), tuple(nonsense[:3]))
+    doubts += nonsense
+    reasons += keyed
+    if signs:
+        some = ", ".join(signs[:3]) + ("..." if len(signs) > 3 else "")
+        reasons.append(f"{len(signs)} value{'s' * (len(signs) > 1)} that could be nonsense and are not ({some})")
+    total = len(signs) + len(keyed)
+    if certain:
+        sureness = Sureness.CERTAIN
+    elif any("11h" in r for r in reasons) or total >= ENOUGH_SIGNS:
+        sureness = Sureness.LIKELY
+    elif total:
+        sureness = Sureness.POSSIBLE
+    else:
+        return Candidate(profile.name, Sureness.RULED_OUT, (), ("nothing that was read speaks for it",))
+    return Candidate(profile.name, sureness, tuple(reasons), tuple(doubts), total)
+
+
+def _own_words(
+    profile: DeviceProfile, clues: ModbusClues, readings: Mapping[str, Reading]
+) -> tuple[list[str], list[str], bool]:
+    """Compare the unit's identification with `profile`'s: reasons for, doubts, and whether they prove it."""
+    reasons: list[str] = []
+    doubts: list[str] = []
+    certain = False
+    stated = profile.form.identification
+    if {0, 1} <= stated.keys():
+        if clues.objects is None:
+            doubts.append("it does not tell the identity (2Bh/0Eh) that the profile states")
+        elif all(clues.objects.get(n, "").strip() == stated[n].strip() for n in (0, 1)):
+            certain = bool(stated[0].strip() and stated[1].strip())
+            reasons.append(f"vendor {stated[0]!r} and product code {stated[1]!r} as stated (2Bh/0Eh)")
+    if profile.form.server_id is not None and clues.server_id is not None:
+        known, more = bytes.fromhex(profile.form.server_id), bytes.fromhex(profile.form.server_data)
+        # A run indicator may follow, and data after it (AP 6.13).
+        same = clues.server_id in (known, *(known + indicator + more for indicator in (b"\x00", b"\xff")))
+        if same and len(known) >= TELLING_BYTES:
+            reasons.append("its server id (11h) is the profile's")
+        elif not same:
+            doubts.append("its server id (11h) is another")
+    model = _SUNSPEC_PROFILE.match(profile.name)
+    if model is not None and clues.sunspec is not None:
+        where = _model_holds(profile, clues.sunspec, int(model[1]))
+        if where:
+            certain = True
+            reasons.append(f"SunSpec header at {clues.sunspec.base}, {where}: the standard's map, whoever made it")
+        else:
+            doubts.append(f"its SunSpec model {model[1]} stands at other addresses than the profile's")
+    elif model is not None:
+        doubts.append("its SunSpec header cannot be read")
+    return reasons, doubts, certain
+
+
+def _model_holds(profile: DeviceProfile, found: SunSpec, number: int) -> str:
+    """Return, in words, where the profile's registers lie in the device's SunSpec map, or an empty string.
+
+    It is the device's model 1, its model `number`, or the marks around all models ("SunS" and the end model).
+    """
+    blocks = [(at, at + 2 + size) for n, at, size in found.models if n in (1, number)]
+    end = max((at + 2 + size for _, at, size in found.models), default=found.base)
+    blocks += [(found.base, found.base + 2), (end, end + 2)]
+    tags = [t.at for t in profile.tags.values() if t.at is not None]
+    inside = all(any(a <= r.address and r.end <= b for a, b in blocks) for r in tags)
+    return f"model {number}" if inside and tags else ""
+
+
+def _keys(profile: DeviceProfile, readings: Mapping[str, Reading]) -> tuple[list[str], list[str]]:
+    """Check the `identify` entries of the profile: reasons for, and contradictions that rule it out."""
+    good: list[str] = []
+    wrong: list[str] = []
+    for entry in profile.form.identify:
+        reading = readings.get(entry.tag)
+        if reading is None or (reading.value is None and not reading.refused):
+            continue  # lost in transit: no evidence
+        value = reading.value.value if reading.value is not None else None
+        if value is None:
+            wrong.append(f"{entry.tag} cannot be read: {reading.problem or 'no value'}")
+        elif entry.expect is not None:
+            same = str(value).strip() == str(entry.expect).strip()
+            (good if same else wrong).append(f"{entry.tag} is {value!r}" + ("" if same else f", not {entry.expect!r}"))
+        elif entry.between is not None and isinstance(value, int | float):
+            low, high = entry.between
+            inside = low <= value <= high
+            (good if inside else wrong).append(
+                f"{entry.tag} is {value:g}, {'inside' if inside else 'not'} {low:g} to {high:g}"
+            )
+        elif isinstance(value, str):
+            text = value.strip()
+            if len(text) >= 2 and text.isascii() and text.isprintable():
+                good.append(f"{entry.tag} reads {text!r}")
+            else:
+                wrong.append(f"{entry.tag} is no text: {value!r}")
+    return good, wrong
+
+
+def _plausibility(readings: Iterable[Reading]) -> tuple[list[str], list[str]]:
+    """Return the plausible values, out of those that could have been implausible, and the implausible ones."""
+    signs: list[str] = []
+    nonsense: list[str] = []
+    for reading in readings:
+        verdict = _sense(reading)
+        if verdict > 0:
+            signs.append(reading.tag.name)
+        elif verdict < 0:
+            nonsense.append(_shown(reading))
+    return signs, nonsense
+
+
+def _sense(reading: Reading) -> int:
+    """Return 1 for a plausible value that could have been implausible, -1 for an implausible one, 0 for no evidence."""
+    tag = reading.tag
+    if reading.value is None:
+        return -1 if reading.refused else 0
+    value = reading.value.value
+    if value is None or reading.value.quality is Quality.BAD:
+        return 0
+    if tag.is_text:
+        return 0
+    assert isinstance(value, int | float)
+    if tag.type in ("float32", "float64") and tag.scale == 1.0:
+        if value == 0:
+            return 0
+        return 1 if math.isfinite(value) and 1e-6 <= abs(value) <= 1e9 else -1
+    if tag.values:
+        return (1 if value else 0) if int(value) in dict(tag.values) else -1
+    if tag.range is not None:
+        return (1 if value else 0) if tag.range[0] <= value <= tag.range[1] else -1
+    return 0
+
+
+def _shown(reading: Reading) -> str:
+    if reading.value is None:
+        return f"{reading.tag.name} cannot be read: {reading.problem}"
+    return f"{reading.tag.name} would be {reading.value.value!r}"
+
+
+# -- CANopen ----------------------------------------------------------------------------------------------------------
+
+
+def judge_canopen(profile: DeviceProfile, eds: ObjectDictionary | None, clues: CanClues) -> Candidate:
+    """Return the certainty that the node is a device of `profile`, whose data sheet is `eds`."""
+    told = clues.identity
+    if eds is None or told is None:
+        return Candidate(profile.name, Sureness.RULED_OUT, (), ("there is nothing to compare",))
+    entry = eds.get(0x1000)
+    kind = entry.default if entry is not None and isinstance(entry.default, int) else None
+    reasons: list[str] = []
+    against: list[str] = []
+    if kind is not None:
+        if kind == told.device_type:
+            reasons.append(f"device type {kind:08X}h")
+        elif kind & 0xFFFF == told.device_type & 0xFFFF and kind & 0xFFFF:
+            reasons.append(
+                f"the same device profile (CiA {kind & 0xFFFF}), another type of it: {told.device_type:08X}h"
+            )
+        else:
+            against.append(f"its device type is {told.device_type:08X}h, not {kind:08X}h")
+    same_vendor = told.vendor is not None and told.vendor == eds.vendor_number
+    same_product = told.product is not None and told.product == eds.product_number
+    if told.vendor is not None and eds.vendor_number is not None and not same_vendor:
+        against.append(f"its vendor is {told.vendor:X}h, not {eds.vendor_number:X}h")
+    if same_vendor and told.product is not None and eds.product_number is not None and not same_product:
+        against.append(f"its product is {told.product:X}h, not {eds.product_number:X}h")
+    if same_vendor and same_product and not against:
+        reasons.append(f"vendor {told.vendor:X}h and product {told.product:X}h as in its data sheet (1018h)")
+        if told.vendor:
+            return Candidate(profile.name, Sureness.CERTAIN, tuple(reasons), (), 3)
+        return Candidate(profile.name, Sureness.LIKELY, tuple(reasons), ("vendor id 0 is nobody's",), 2)
+    exact = kind is not None and kind == told.device_type and bool(kind & 0xFFFF)
+    if exact and not any("device type" in a for a in against):
+        doubt = ("another maker's device of the same kind: standard objects fit, the maker's own may not",)
+        return Candidate(profile.name, Sureness.POSSIBLE, tuple(reasons), (*against, *doubt), 1)
+    return Candidate(profile.name, Sureness.RULED_OUT, tuple(reasons), tuple(against) or ("nothing speaks for it",))

@@ -1,0 +1,1 @@
+"""Infer the meaning of registers from dumps."""

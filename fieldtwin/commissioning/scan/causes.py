@@ -1,0 +1,383 @@
+"""Find the causes of a silent or garbled line, most likely first. Pure: evidence in, a ranked list out.
+
+A weight is not a probability: it orders the causes, and a weight of 0 is omitted. Each cause states its evidence and
+the remedy; if nothing is wrong, the list is empty.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+from fieldtwin.commissioning.scan.can_listener import BusHeard
+from fieldtwin.commissioning.scan.listening import LineVerdict
+from fieldtwin.commissioning.scan.settings import name_of
+from fieldtwin.commissioning.scan.traffic import Heard
+from fieldtwin.gateway.connections.can_facts import CanFacts
+from fieldtwin.gateway.connections.line_counters import LineCounters
+from fieldtwin.gateway.core.endpoint import SerialSettings
+
+MANY = 0.2
+"""A share of errors that cannot be chance."""
+HEALTHY = 0.97
+ENOUGH_TEXT = 12
+"""Fewer readable bytes are chance."""
+_EDGES = frozenset({0x00, 0x80, 0xC0, 0xE0, 0xF0, 0xF8, 0xFC, 0xFE, 0xFF})
+"""Bytes that a receiver sees when the sender's bits are many times longer than its own."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cause:
+    """One explanation: the cause, its evidence, the remedy. Causes with a larger `weight` are checked first."""
+
+    name: str
+    weight: int
+    why: str
+    remedy: str
+    harmless: bool = False
+    """True for a cause that is normal and not a fault."""
+
+
+@dataclass(frozen=True, slots=True)
+class Probe:
+    """One question that was sent: its echo, and its answer.
+
+    `echo`: ``none``, ``whole`` or ``damaged``. `answer`: ``none``, ``good`` or ``damaged``.
+    """
+
+    unit: int
+    echo: str
+    answer: str
+    heard_bytes: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class SerialEvidence:
+    """The evidence about a serial line. `errors` None: the port has no counters.
+
+    `verdict`: the settings that traffic proved.
+    """
+
+    settings: SerialSettings
+    heard: Heard
+    errors: LineCounters | None = None
+    verdict: LineVerdict | None = None
+    control: tuple[tuple[str, bool], ...] = ()
+    ignored: tuple[str, ...] = ()
+    probe: Probe | None = None
+
+
+def ranked(causes: Iterable[Cause]) -> list[Cause]:
+    """Sort the causes, most likely first, without those of weight 0; of equal names only the one with the largest weight."""
+    best: dict[str, Cause] = {}
+    for cause in causes:
+        if cause.weight > 0 and (cause.name not in best or best[cause.name].weight < cause.weight):
+            best[cause.name] = cause
+    return sorted(best.values(), key=lambda c: (-c.weight, c.name))
+
+
+# -- serial lines -----------------------------------------------------------------------------------------------------
+
+
+def serial_causes(e: SerialEvidence) -> list[Cause]:
+    """Return the causes of silence, of garbage, and of an unanswered question on a serial line."""
+    found: list[Cause] = []
+    if e.ignored:
+        found.append(
+            Cause(
+                "the port ignores settings",
+                70 if e.heard.bytes and not e.heard.sure else 5,
+                f"its driver did not take {', '.join(e.ignored)}",
+                "a virtual port has no parity; else use another adapter",
+            )
+        )
+    if not e.heard.bytes:
+        answered = e.probe is not None and e.probe.answer == "good"
+        found += [] if answered else _of_silence(e)
+    elif e.heard.share < HEALTHY or not e.heard.sure or _elsewhere(e) or _many_errors(e):
+        found += _of_garbage(e)
+    if e.heard.sure:
+        found += _of_talk(e.heard)
+    if e.errors is not None and e.errors.overrun + e.errors.buffer_overrun:
+        lost = e.errors.overrun + e.errors.buffer_overrun
+        found.append(
+            Cause(
+                "this computer reads too slowly", 75, f"{lost} characters were lost in the port", "close what else runs"
+            )
+        )
+    if e.probe is not None:
+        found += _of_probe(e.probe, e)
+    return ranked(found)
+
+
+def _elsewhere(e: SerialEvidence) -> bool:
+    """Return whether traffic proved other settings."""
+    return e.verdict is not None and e.verdict.sure and e.settings not in (e.verdict.settings, *e.verdict.others)
+
+
+def _many_errors(e: SerialEvidence) -> bool:
+    """Return whether the port counts errors although the frames are whole, for example with a wrong parity."""
+    return e.errors is not None and e.errors.parity + e.errors.frame > (1 - HEALTHY) * e.heard.bytes
+
+
+def _of_silence(e: SerialEvidence) -> list[Cause]:
+    causes = []
+    breaks = e.errors.breaks + e.errors.frame if e.errors is not None else 0
+    if breaks:
+        causes.append(
+            Cause(
+                "A and B swapped",
+                90,
+                f"no byte, but {breaks} breaks: the line idles at the wrong level",
+                "swap A and B",
+            )
+        )
+        causes.append(
+            Cause(
+                "the line is held low",
+                60,
+                f"{breaks} breaks",
+                "look for a short, a missing bias, a driver that never lets go",
+            )
+        )
+    elif e.probe is None:
+        causes.append(
+            Cause(
+                "nobody is asking",
+                80,
+                "a Modbus line is silent until its master sends",
+                "that is as it should be without a master: `scan` asks, `--probe UNIT` sends one question",
+                harmless=True,
+            )
+        )
+    control = dict(e.control)
+    inputs = [name for name in ("CTS", "DSR", "DCD") if name in control]
+    if inputs and not any(control[name] for name in inputs):
+        causes.append(
+            Cause("nothing is connected", 35, f"{', '.join(inputs)} are all off (an RS485 adapter may leave them so)",
+                  "is the device on, the cable whole, the port the right one?")
+        )  # fmt: skip
+    else:
+        causes.append(
+            Cause("nothing is connected", 30, "no byte and no error", "is the cable in, the port the right one?")
+        )
+    if e.errors is None and not breaks:
+        causes.append(
+            Cause("A and B swapped", 15, "this port counts no errors that would show it", "swap A and B once")
+        )
+    return causes
+
+
+def _of_garbage(e: SerialEvidence) -> list[Cause]:
+    heard, errors, causes = e.heard, e.errors, []
+    if e.verdict is not None and e.verdict.settings != e.settings and e.verdict.heard and e.verdict.heard.sure:
+        other = e.verdict.settings
+        name = "the baud rate" if other.baudrate != e.settings.baudrate else "the parity or the stop bits"
+        return [
+            Cause(
+                name,
+                100,
+                f"at {name_of(other)} there are {e.verdict.heard.frames} whole frames",
+                f"use {name_of(other)}",
+            )
+        ]
+    total = max(1, heard.bytes)
+    parity = errors.parity / total if errors is not None else 0.0
+    framing = errors.frame / total if errors is not None else 0.0
+    edges = sum(n for value, n in heard.values.items() if value in _EDGES) / total
+    text = sum(n for value, n in heard.values.items() if 0x20 <= value < 0x7F or value in (0x0A, 0x0D)) / total
+    if text > 0.9 and total >= ENOUGH_TEXT and heard.framing == "rtu":
+        colons = heard.values.get(0x3A, 0)
+        what = "Modbus ASCII, perhaps" if colons and heard.values.get(0x0D) else "no Modbus RTU"
+        causes.append(Cause("another protocol", 90, f"{text:.0%} of it is readable text: {what}", "try ascii:PORT"))
+    if heard.frames and heard.share > MANY:
+        if heard.glitches >= max(2, heard.frames // 4):
+            causes.append(
+                Cause("direction control", 85, f"{heard.glitches} stray bytes beside {heard.frames} good frames",
+                      "the transceiver is switched too early or too late: rs485=1, or an adapter that switches by itself")
+            )  # fmt: skip
+        damaged = f"{heard.bad_frames} damaged beside {heard.frames} good frames"
+        causes.append(
+            Cause("termination or noise", 70, damaged, "120 ohms at both ends and nowhere else, bias, shield")
+        )
+        causes.append(Cause("two units answer at once", 40, damaged, "do two devices have the same unit id?"))
+    elif parity > MANY and framing < parity:
+        causes.append(
+            Cause("the parity or the stop bits", 95, f"{parity:.0%} of the bytes have a wrong parity", "8E1, 8O1, 8N1")
+        )
+    if not heard.frames or heard.share <= MANY:
+        faster = edges > 0.6
+        causes.append(
+            Cause("the baud rate", 85 if framing > MANY or faster else 60,
+                  f"{framing:.0%} framing errors" if framing > MANY else
+                  "long bits: the sender is slower than this port" if faster else "bytes, and not one whole frame",
+                  "`scan --listen` tries the others and sends nothing")
+        )  # fmt: skip
+        breaks = errors.breaks if errors is not None else 0
+        causes.append(
+            Cause(
+                "A and B swapped",
+                88 if breaks else 45,
+                f"{breaks} breaks" if breaks else "no whole frame",
+                "swap A and B",
+            )
+        )
+        causes.append(
+            Cause("termination or noise", 30, "no whole frame", "is there a sender at all, or only an open line?")
+        )
+        if text <= 0.9:
+            causes.append(Cause("another protocol", 25, "no whole frame", "what should speak here?"))
+    return causes
+
+
+def _of_talk(heard: Heard) -> list[Cause]:
+    causes = []
+    asked = sum(u.requests for u in heard.units.values())
+    answered = sum(u.replies + u.exceptions for u in heard.units.values())
+    if asked and not answered:
+        causes.append(
+            Cause("only the master is heard", 80, f"{asked} requests and no reply",
+                  "the devices are off, or have other settings; on RS232 a tap hears one direction")
+        )  # fmt: skip
+    elif answered and not asked:
+        causes.append(
+            Cause(
+                "only devices are heard", 80, f"{answered} replies and no request", "a tap on RS232 hears one direction"
+            )
+        )
+    elif heard.silent:
+        units = ", ".join(map(str, heard.silent[:10]))
+        causes.append(
+            Cause(
+                "units that do not answer", 60, f"asked and silent: {units}", "are they on, and is that their unit id?"
+            )
+        )
+    if heard.repeated > asked // 2 and heard.repeated > 2:
+        causes.append(
+            Cause("an echo", 40, f"{heard.repeated} requests came twice", "the sender's adapter hears itself")
+        )
+    return causes
+
+
+def _of_probe(probe: Probe, e: SerialEvidence) -> list[Cause]:
+    if probe.answer == "good":
+        return []
+    unit = f"unit {probe.unit}"
+    if probe.answer == "damaged":
+        return [
+            Cause("termination or noise", 80, f"{unit} answered, damaged", "120 ohms at both ends, bias, shield"),
+            Cause("the parity or the stop bits", 75, f"{unit} answered, damaged", "8E1, 8O1, 8N1"),
+            Cause("two units answer at once", 60, f"{unit} answered, damaged", "do two devices have this unit id?"),
+            Cause(
+                "direction control", 50, f"{unit} answered, damaged", "rs485=1, or an adapter that switches by itself"
+            ),
+        ]
+    if probe.echo == "damaged":
+        return [
+            Cause(
+                "termination or noise",
+                88,
+                "our own question came back damaged",
+                "a short, or another sender on the line",
+            ),
+            Cause("another master", 80, "our own question came back damaged", "listen for longer: `line --listen 60s`"),
+        ]
+    wrong = [
+        Cause("another unit id", 85, f"{unit} does not answer", "`scan` asks all"),
+        Cause("the baud rate", 75, f"{unit} does not answer", "`scan` tries the likely settings"),
+    ]
+    if probe.echo == "whole":
+        return [
+            *wrong,
+            Cause(
+                "A and B swapped", 60, "we hear ourselves and nobody else: this end works", "swap A and B at the device"
+            ),
+            Cause("the device is off", 55, "we hear ourselves and nobody else", "is it on? is the ground connected?"),
+        ]
+    return [
+        *wrong,
+        Cause("A and B swapped", 70, f"no echo, no answer from {unit}", "swap A and B once"),
+        Cause(
+            "direction control",
+            65,
+            "nothing shows that our question left",
+            "rs485=1, or an adapter that switches by itself",
+        ),
+        Cause("nothing is connected", 60, f"no echo, no answer from {unit}", "is the cable in, the device on?"),
+    ]
+
+
+# -- CAN --------------------------------------------------------------------------------------------------------------
+
+
+def can_causes(facts: CanFacts, heard: BusHeard, load: float) -> list[Cause]:
+    """Return the causes of a silent CAN bus, of errors, and of a full bus."""
+    found: list[Cause] = []
+    errors = facts.tx_errors + facts.rx_errors
+    if facts.state == "bus-off":
+        found.append(
+            Cause("the controller is off", 100, "bus-off: its own frames failed 32 times",
+                  "bit rate and wiring first, then `ip link set IFACE down` and `up`")
+        )  # fmt: skip
+    if facts.tx_errors >= 96:
+        why = f"{facts.tx_errors} transmit errors: nobody acknowledges"
+        found.append(Cause("alone on the bus", 85, why, "is another node on, at the same bit rate?"))
+    if heard.errors and not heard.frames:
+        why = f"{heard.errors} error frames and no good one"
+        found.append(Cause("the bit rate", 90, why, "compare with the other nodes"))
+        found.append(Cause("CAN-H and CAN-L swapped", 70, why, "swap them"))
+        found.append(Cause("termination or noise", 60, why, "60 ohms between CAN-H and CAN-L when everything is off"))
+    elif heard.errors or (facts.rx_errors >= 96 and heard.frames):
+        why = f"{heard.errors} error frames beside {heard.frames} good ones"
+        found.append(
+            Cause(
+                "termination or noise", 80, why, "60 ohms between CAN-H and CAN-L when everything is off; short stubs"
+            )
+        )
+        found.append(Cause("a node at another bit rate", 60, why, "take nodes off one by one"))
+    elif not heard.frames:
+        why = "no frame and no error" + (f", {errors} errors counted" if errors else "")
+        found.append(
+            Cause("nobody is sending", 80, why, "nodes without a heartbeat are silent: `scan` asks them", harmless=True)
+        )
+        found.append(Cause("nothing is connected", 45, why, "is the cable in, the interface the right one?"))
+    if load > 0.8:
+        found.append(Cause("the bus is full", 75, f"load {load:.0%}", "longer PDO inhibit times, a higher bit rate"))
+    doubled = [n for n, node in heard.nodes.items() if node.boot_ups > 2]
+    if doubled:
+        why = f"node {', '.join(map(str, doubled))} boots again and again"
+        found.append(Cause("a node restarts", 70, why, "its supply, its watchdog, a master that resets it"))
+    return ranked(found)
+
+
+# -- TCP --------------------------------------------------------------------------------------------------------------
+
+
+def tcp_causes(problem: str, heard: bytes, hung_up: bool, port: int) -> list[Cause]:
+    """Return the causes for a host that cannot be reached (`problem` is the operating system's error), or that misbehaves."""
+    text = problem.lower()
+    table: list[tuple[Callable[[], bool], list[Cause]]] = [
+        (lambda: "refused" in text, [
+            Cause("nothing listens there", 90, f"the host refuses port {port}", "is it 502, 802, 4001? is the service on?"),
+            Cause("a firewall", 40, "some refuse as a host does", "ask whoever runs it"),
+        ]),
+        (lambda: "timed out" in text or "no answer" in text, [
+            Cause("the host is off, or a firewall drops", 90, problem, "ping it; is the address right?"),
+        ]),
+        (lambda: "route" in text or "unreachable" in text, [
+            Cause("no way to that network", 90, problem, "address, netmask and gateway of this computer"),
+        ]),
+        (lambda: "name" in text or "known" in text, [Cause("the name is not known", 90, problem, "use the address")]),
+        (lambda: bool(problem), [Cause("the connection fails", 60, problem, "")]),
+        (lambda: hung_up, [
+            Cause("no room for another client", 80, "it accepts and hangs up at once", "close other masters: many take 1 to 5"),
+            Cause("an allow list", 60, "it accepts and hangs up at once", "add this computer's address"),
+        ]),
+        (lambda: bool(heard), [
+            Cause("another protocol", 90, f"it speaks unasked: {heard[:16].hex(' ')}", "a Modbus server waits to be asked"),
+        ]),
+    ]  # fmt: skip
+    for holds, causes in table:
+        if holds():
+            return ranked(causes)
+    return []

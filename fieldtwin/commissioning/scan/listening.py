@@ -1,0 +1,114 @@
+"""Find the settings of a serial line by listening at one setting after another. Nothing is sent. Pure.
+
+A line that carries traffic yields bytes at every setting, so one attempt is enough to detect silence. The setting at
+which the bytes form whole frames is the right one. The parity is known where the port counts its errors; an additional
+stop bit cannot be detected, because a receiver checks only one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from fieldtwin.commissioning.scan.settings import name_of
+from fieldtwin.commissioning.scan.traffic import Heard
+from fieldtwin.gateway.connections.line_counters import LineCounters
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.endpoint import SerialSettings
+
+SHORTEST_S, LONGEST_S = 1.5, 6.0
+"""Time limits for one setting: longer where the line is silent for long between bursts."""
+
+ENOUGH_BYTES = 400
+"""Number of bytes without a good frame after which a setting is rejected."""
+
+
+@dataclass(frozen=True, slots=True)
+class Audition:
+    """The bytes received at `settings`, and the port's error counts meanwhile (None: it has no counters)."""
+
+    settings: SerialSettings
+    heard: Heard
+    errors: LineCounters | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class LineVerdict:
+    """The settings of the line. `sure`: they can be relied upon; `why` is a sentence; `others` fit as well."""
+
+    settings: SerialSettings
+    framing: str
+    sure: bool
+    why: str
+    others: tuple[SerialSettings, ...] = ()
+    heard: Heard | None = None
+
+    @property
+    def fits(self) -> tuple[SerialSettings, ...]:
+        """All settings at which the bytes make sense."""
+        return (self.settings, *self.others)
+
+
+def dwell_over(heard: Heard, elapsed_s: float) -> bool:
+    """Return whether this setting has been observed for long enough."""
+    if heard.sure or elapsed_s >= LONGEST_S:
+        return True
+    if heard.bytes >= ENOUGH_BYTES and not heard.good_bytes:
+        return True
+    wanted_s = max(SHORTEST_S, min(LONGEST_S, 2.5 * heard.longest_gap_ns / NS_PER_S))
+    return elapsed_s >= wanted_s and not (heard.frames > 0 and not heard.sure)
+
+
+def judge(auditions: Iterable[Audition]) -> LineVerdict | None:
+    """Return the best setting; None if the bytes make sense at none."""
+    good = [a for a in auditions if a.heard.frames and a.heard.share > 0.2]
+    if not good:
+        return None
+    good.sort(key=_rank)
+    best = good[0]
+    heard, errors = best.heard, best.errors
+    evidence = f"{heard.frames} whole frames, {heard.share:.0%} of {heard.bytes} bytes"
+    if not heard.sure:
+        why = f"only {evidence}: listen longer"
+        return LineVerdict(best.settings, heard.framing, False, why, (), heard)
+    if errors is None:
+        others = _same_bits(best.settings, [a.settings for a in good if a is not best and a.heard.sure])
+        why = f"{evidence}; this port counts no parity errors, so the parity is not proved"
+        return LineVerdict(best.settings, heard.framing, False, why, others, heard)
+    if errors.parity + errors.frame:
+        why = f"{evidence}, yet {errors.parity} parity and {errors.frame} framing errors: another parity, or a bad line"
+        return LineVerdict(best.settings, heard.framing, False, why, (), heard)
+    if best.settings.parity == "N":
+        two = SerialSettings(best.settings.baudrate, best.settings.frame[:2] + "2")
+        why = f"{evidence}, no framing error (a receiver cannot tell one stop bit from two)"
+        return LineVerdict(best.settings, heard.framing, True, why, (two,), heard)
+    return LineVerdict(best.settings, heard.framing, True, f"{evidence}, no parity error", (), heard)
+
+
+def worth_hearing(first: SerialSettings, candidates: Sequence[SerialSettings]) -> list[SerialSettings]:
+    """Return `first`, then the others, each once."""
+    return list(dict.fromkeys([first, *candidates]))
+
+
+def siblings(settings: SerialSettings) -> list[SerialSettings]:
+    """Return the same baud rate with the other parities, which may fit as well as a plausible setting."""
+    bits = settings.frame[0]
+    return [SerialSettings(settings.baudrate, bits + p + "1") for p in "NEO" if p != settings.parity]
+
+
+def _rank(audition: Audition) -> tuple[int, int, float, int]:
+    errors = audition.errors
+    wrong = errors.parity + errors.frame if errors is not None else 0
+    return (not audition.heard.sure, wrong > 0, -audition.heard.share, wrong)
+
+
+def _same_bits(settings: SerialSettings, others: list[SerialSettings]) -> tuple[SerialSettings, ...]:
+    found = [o for o in others if o.baudrate == settings.baudrate]
+    two = SerialSettings(settings.baudrate, settings.frame[:2] + "2")
+    return tuple(dict.fromkeys([*found, *([two] if settings.parity == "N" else [])]))
+
+
+def describe(verdict: LineVerdict) -> str:
+    """Return one line for the user."""
+    also = f" (or {', '.join(name_of(o) for o in verdict.others)})" if verdict.others else ""
+    return f"{name_of(verdict.settings)}{also}: {verdict.why}"

@@ -1,0 +1,56 @@
+"""Detect one device behind many unit IDs: a device on TCP often answers any unit ID. Pure.
+
+Units are alike if they answer the same question with the same bytes. For a few units that proves little (new meters all
+read 0), for all of them it is conclusive: no installation has 32 devices at 32 IDs spread over the whole range.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from fieldtwin.commissioning.scan.sweep import UnitAnswer
+
+SPREAD = 32
+"""Number of IDs, spread over the whole range, that must answer alike before they are taken for one device."""
+
+
+@dataclass(frozen=True, slots=True)
+class Alike:
+    """Units that answer alike: `units`. `one_device`: they are one device; otherwise that is only possible."""
+
+    units: tuple[int, ...]
+    one_device: bool
+    why: str
+
+
+def likeness(answers: Sequence[UnitAnswer], asked: int, again: Sequence[UnitAnswer] = ()) -> Alike | None:
+    """Return how likely the units that answered, of `asked`, are one device.
+
+    `again` are their answers to a second round. None if they are several devices, or fewer than three units.
+    """
+    if len(answers) < 3 or len(answers) < asked:
+        return None
+    units = tuple(sorted(a.unit for a in answers))
+    contents = {a.reply for a in answers}
+    if len(contents) == 1:
+        text = next(iter(contents)).hex(" ")
+        if asked >= SPREAD:
+            return Alike(units, True, f"all {asked} unit ids that were asked answered with the same bytes ({text})")
+        return Alike(units, False, f"{asked} units answer with the same bytes ({text}): one device, or new ones alike")
+    before = {a.unit: a.reply for a in answers}
+    changed = sum(1 for a in again if before.get(a.unit) not in (None, a.reply))
+    if asked >= SPREAD and changed > len(answers) // 2:
+        return Alike(units, False, f"all {asked} unit ids answer, and each with something else a moment later")
+    return None
+
+
+def spread_over(units: Sequence[int]) -> tuple[int, ...]:
+    """Return `SPREAD` of `units` over their whole range, with likely ones among them; all if there are no more."""
+    if len(units) <= SPREAD:
+        return tuple(units)
+    ordered = sorted(units)
+    likely = [u for u in (1, 255, 0, 2, 247, 3) if u in units]
+    steps = SPREAD - len(likely)
+    others = [u for u in ordered if u not in likely]
+    return (*likely, *(others[i * len(others) // steps] for i in range(steps)))

@@ -1,0 +1,153 @@
+"""Observe a serial line passively: frames, requests and replies. Pure: chunks of bytes and their times in.
+
+Both directions share one pair of wires, so requests and replies are distinguished by their shape and order. A frame
+counts if its check sum is right. This module does not know the baud rate at which it listens: `baud` compares the
+results at several.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from fieldtwin.capture.decoding.modbus_frames import Frame, splitter
+from fieldtwin.gateway.core.clock import NS_PER_MS
+from fieldtwin.gateway.protocols.modbus.framings import Framing
+
+SETTLE_NS = 40 * NS_PER_MS
+"""A silence after which no bytes belong to earlier ones, even with a USB adapter."""
+
+SURE_FRAMES = 3
+"""Number of good frames that cannot be chance: one of 65,536 random four-byte sequences has a right check sum."""
+
+
+@dataclass(slots=True)
+class UnitHeard:
+    """One unit ID on the line. It is live when it answered."""
+
+    requests: int = 0
+    replies: int = 0
+    exceptions: int = 0
+    functions: set[int] = field(default_factory=set)
+
+    @property
+    def live(self) -> bool:
+        return self.replies + self.exceptions > 0
+
+
+@dataclass(slots=True)
+class Heard:
+    """The totals. `good_bytes` are those of good frames; `longest_gap_ns` is the longest silence between chunks."""
+
+    framing: Framing
+    bytes: int = 0
+    good_bytes: int = 0
+    frames: int = 0
+    bad_frames: int = 0
+    units: dict[int, UnitHeard] = field(default_factory=dict)
+    repeated: int = 0
+    """Number of requests that were immediately repeated, as with an adapter that returns sent bytes."""
+    glitches: int = 0
+    """Number of pieces of one or two bytes next to frames, caused by a transceiver that switches too early or late."""
+    longest_gap_ns: int = 0
+    values: dict[int, int] = field(default_factory=dict)
+    """The count of each byte value."""
+
+    @property
+    def share(self) -> float:
+        """The share of good bytes."""
+        return self.good_bytes / self.bytes if self.bytes else 0.0
+
+    @property
+    def live(self) -> list[int]:
+        """The units that answered."""
+        return sorted(u for u, h in self.units.items() if h.live)
+
+    @property
+    def silent(self) -> list[int]:
+        """The units that were asked and did not answer."""
+        return sorted(u for u, h in self.units.items() if h.requests and not h.live and u)
+
+    @property
+    def sure(self) -> bool:
+        """Return whether this is Modbus at these settings, beyond chance."""
+        return self.frames >= SURE_FRAMES and self.share > 0.5
+
+
+class LineEar:
+    """A listener for `framing` (rtu or ascii). `feed` received bytes; call `settle` from time to time, or during silence."""
+
+    def __init__(self, framing: Framing) -> None:
+        self.heard = Heard(framing)
+        self._splitter = splitter(framing)
+        self._last_ns: int | None = None
+        self._open: Frame | None = None
+
+    def feed(self, data: bytes, t_ns: int) -> None:
+        """Add a chunk received at `t_ns`."""
+        if not data:
+            return
+        self.settle(t_ns)
+        heard = self.heard
+        if self._last_ns is not None:
+            heard.longest_gap_ns = max(heard.longest_gap_ns, t_ns - self._last_ns)
+        self._last_ns = t_ns
+        heard.bytes += len(data)
+        for byte in data:
+            heard.values[byte] = heard.values.get(byte, 0) + 1
+        for frame in self._splitter.feed(data, t_ns):
+            self._take(frame)
+
+    def settle(self, now_ns: int) -> None:
+        """End an incomplete frame, which counts as damaged, if the line has been silent for `SETTLE_NS` at `now_ns`."""
+        if self._last_ns is not None and now_ns - self._last_ns > SETTLE_NS:
+            for frame in self._splitter.flush():
+                self._take(frame)
+
+    def _take(self, frame: Frame) -> None:
+        heard = self.heard
+        if frame.bad:
+            heard.bad_frames += 1
+            heard.glitches += len(frame.raw) <= 2
+            return
+        heard.frames += 1
+        heard.good_bytes += len(frame.raw)
+        unit = heard.units.setdefault(frame.unit, UnitHeard())
+        function = frame.pdu[0]
+        unit.functions.add(function & 0x7F)
+        asked, self._open = self._open, None
+        if asked is not None and asked.raw == frame.raw and _request_shape(frame.pdu) == "request":
+            heard.repeated += 1  # a write is answered by itself: that is its reply
+            self._open = asked
+        elif function & 0x80:
+            unit.exceptions += 1
+        elif is_reply(frame, asked):
+            unit.replies += 1
+        else:
+            unit.requests += 1
+            self._open = frame
+
+
+def is_reply(frame: Frame, asked: Frame | None) -> bool:
+    """Return whether a good frame is a reply, by its shape, or else by the request `asked` before it."""
+    if frame.pdu[0] & 0x80:
+        return True
+    shape = _request_shape(frame.pdu)
+    if shape == "either":
+        return asked is not None and (asked.unit, asked.pdu[0]) == (frame.unit, frame.pdu[0])
+    return shape == "reply"
+
+
+def _request_shape(pdu: bytes) -> str:
+    """Return whether a PDU can only be a request, only a reply, or either."""
+    function, size = pdu[0], len(pdu)
+    if function in (0x01, 0x02):
+        return "either" if size == 5 and pdu[1] == 3 else "request" if size == 5 else "reply"
+    if function in (0x03, 0x04):
+        return "request" if size == 5 else "reply"
+    if function in (0x0F, 0x10):
+        return "reply" if size == 5 else "request"
+    if function == 0x17:
+        return "request" if size >= 12 and size == 10 + pdu[9] else "reply"
+    if function in (0x07, 0x0B, 0x0C, 0x11):
+        return "request" if size == 1 else "reply"
+    return "either"

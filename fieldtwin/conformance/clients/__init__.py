@@ -1,0 +1,1 @@
+"""Conformance tests of Modbus clients and CANopen masters, against hostile devices."""

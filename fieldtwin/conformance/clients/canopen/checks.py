@@ -1,0 +1,155 @@
+"""Checks that are specific to CANopen: aborts, NMT, SYNC. Pure functions of an `Observation`."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+from fieldtwin.conformance.clients.checks import accepts, owes, publishes_nothing_bad
+from fieldtwin.conformance.core.case import Finding, Judge, failed, inconclusive, passed, skipped
+from fieldtwin.conformance.core.observation import Asked, Observation, Sent, Shown, Told, Word
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.results.model import Verdict
+
+ABORT, NMT, SYNC, SDO_REQUEST = 0x80, 0x000, 0x080, 0x600
+BLOCK_UPLOAD = 5
+"""Client command specifier of a block upload."""
+
+
+def aborts_with(code: int, *others: int) -> Judge:
+    """Check that the master ends the transfer by the abort code `code` or one of `others`, which informs the node."""
+
+    def aborted(seen: Observation) -> Finding | None:
+        codes = [
+            int.from_bytes(s.data[6:10], "little")
+            for s in seen.of(Sent, seen.begun_ns)
+            if SDO_REQUEST < _id(s) < SDO_REQUEST + 0x80 and s.data[2:3] == bytes((ABORT,))
+        ]
+        if {code, *others} & set(codes):
+            return None
+        if codes:
+            return failed(f"aborted with {codes[0]:08X}h; expected {code:08X}h")
+        return failed(f"sent no abort; expected {code:08X}h")
+
+    return owes(aborted)
+
+
+BLOCK_ENDED = 0xA1
+
+
+def _block_ended(seen: Observation) -> Finding | None:
+    for told in seen.of(Told, seen.begun_ns):
+        if told.data[:1] == bytes((BLOCK_ENDED,)):
+            return None
+    return failed("the block download was never brought to its end")
+
+
+completes = owes(_block_ended)
+
+
+def _noticed(seen: Observation) -> Finding | None:
+    """Check that a missing heartbeat has an effect on the published value or causes a command."""
+    if any(shown.word is Word.NONE for shown in seen.of(Shown, seen.begun_ns, seen.over_ns)):
+        return passed("its value was none meanwhile")
+    if any(_id(sent) == NMT for sent in seen.of(Sent, seen.begun_ns)):
+        return passed("it commanded the node")
+    return inconclusive("nothing shows that it noticed: right only for a master that watches no heartbeat")
+
+
+notices = owes(_noticed)
+
+
+def _unmoved(seen: Observation) -> Finding | None:
+    """Check that a heartbeat that is slightly late has no effect: no command is sent and no value disappears."""
+    moved = any(_id(sent) == NMT for sent in seen.of(Sent, seen.begun_ns))
+    if moved or any(shown.word is Word.NONE for shown in seen.of(Shown, seen.begun_ns)):
+        return inconclusive("it took the node for lost: right only where its consumer time is shorter than that")
+    return None
+
+
+is_unmoved = owes(_unmoved)
+
+
+def _waits_for_each(seen: Observation) -> Finding | None:
+    """Check that no request was repeated before its answer came. Every answer came within the timeout of its own request."""
+    asked = list(seen.of(Asked, seen.begun_ns, seen.over_ns))
+    for one, following in pairwise(asked):
+        told = next(seen.of(Told, one.t_ns, seen.over_ns), None)
+        if told is None or told.good or following.t_ns >= told.t_ns:
+            continue
+        after_s, due_s = (following.t_ns - one.t_ns) / NS_PER_S, (told.t_ns - one.t_ns) / NS_PER_S
+        said = f"asked again {after_s:.2f} s after a request that was answered after {due_s:.2f} s"
+        return (
+            failed(said)
+            if seen.timeout_s
+            else inconclusive(f"{said}: a failure if its timeout is longer: say --timeout")
+        )
+    return None
+
+
+waits_for_each = owes(_waits_for_each)
+
+
+def takes_the_switch(seen: Observation) -> Finding:
+    """Check as `accepts`, if the client allows the change from a block upload to an ordinary one.
+
+    A client that sends a protocol switch threshold of 0 forbids it (7.2.4.3.13). It may refuse each such reply; only a
+    wrong value would be a failure.
+    """
+    found = accepts(seen)
+    first = next(seen.of(Asked, seen.begun_ns), None)
+    forbidden = first is not None and first.target[1] >> 5 == BLOCK_UPLOAD and first.target[6:7] == b"\0"
+    if not forbidden or found.verdict is not Verdict.FAILED:
+        return found
+    return publishes_nothing_bad(seen) or skipped("its requests forbid the switch: the protocol switch threshold is 0")
+
+
+def _one_a_block(seen: Observation) -> Finding | None:
+    """Check that a sub-block is acknowledged once, and a segment never."""
+    acknowledged = [s for s in seen.of(Sent, seen.begun_ns, seen.over_ns) if s.data[2] & 0xE3 == BLOCK_ACKNOWLEDGED]
+    segments = sum(
+        1 for t in seen.of(Told, seen.begun_ns, seen.over_ns) if t.data[0] & 0x7F and t.data[0] not in _OTHERS
+    )
+    if not acknowledged:
+        return inconclusive("no acknowledgement of a sub-block was seen")
+    if len(acknowledged) * 4 > max(segments, 4):
+        return failed(f"{len(acknowledged)} acknowledgements of {segments} segments")
+    return None
+
+
+BLOCK_ACKNOWLEDGED = 0xA2
+_OTHERS = frozenset((*range(0xC0, 0xE0), ABORT))
+"""First bytes of frames that are not segments of a block upload."""
+one_a_block = owes(_one_a_block)
+
+
+def _restarted(seen: Observation) -> Finding | None:
+    for sent in seen.of(Sent, seen.over_ns):
+        if _id(sent) == NMT:
+            return passed("it commanded the node anew")
+    for asked in seen.of(Asked, seen.over_ns):
+        if asked.target[1] >> 5 == 1:
+            return passed("it wrote to the node anew")
+    return inconclusive("it neither commanded nor wrote to the node: right only for a master that configures nothing")
+
+
+reconfigures = owes(_restarted)
+
+
+def legal_nmt(seen: Observation) -> Finding:
+    frames = [s for s in seen.of(Sent) if _id(s) == NMT]
+    for sent in frames:
+        if len(sent.data) != 4 or sent.data[3] > 127:
+            return failed(f"sent the NMT frame {sent.data[2:].hex(' ')}")
+    return passed(f"{len(frames)} NMT frames") if frames else skipped("it sent no NMT")
+
+
+def legal_sync(seen: Observation) -> Finding:
+    frames = [s for s in seen.of(Sent) if _id(s) == SYNC]
+    for sent in frames:
+        if len(sent.data) > 3:
+            return failed(f"sent a SYNC of {len(sent.data) - 2} bytes")
+    return passed(f"{len(frames)} SYNC") if frames else skipped("it sent no SYNC")
+
+
+def _id(sent: Sent) -> int:
+    return int.from_bytes(sent.data[:2], "big")

@@ -1,0 +1,87 @@
+"""The inputs of a CANopen reply function, and the CANopen test case. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+from fieldtwin.conformance.core.case import TRAIL_S, Case
+from fieldtwin.gateway.core.canframe import CanFrame
+
+SDO_REPLY = 0x580
+
+
+@dataclass(frozen=True, slots=True)
+class SayFrame:
+    """Send `frame`, `after_s` seconds after the request."""
+
+    frame: CanFrame
+    after_s: float = 0.0
+    good: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class CanScene:
+    """One SDO request that receives a wrong reply: eight bytes to `node`.
+
+    `true` are the correct replies, `false` is an expedited one with the poisoned word. `nth` counts the transfers of
+    the case from 0; `opens` is whether the request begins one. `memory` belongs to the transfer, for replies that
+    depend on earlier segments.
+    """
+
+    node: int
+    request: bytes
+    true: tuple[bytes, ...]
+    false: bytes
+    poison: bytes
+    opens: bool
+    nth: int = 0
+    timeout_s: float = 1.0
+    memory: dict[str, int] = field(default_factory=dict)
+
+    def reply(self, data: bytes, after_s: float = 0.0, *, good: bool = False) -> SayFrame:
+        """Return an SDO reply of this node."""
+        return SayFrame(CanFrame(SDO_REPLY + self.node, data), after_s, good)
+
+    def honest(self, after_s: float = 0.0) -> list[SayFrame]:
+        """Return the correct replies, in plain frames."""
+        return [self.reply(data, after_s, good=True) for data in self.true]
+
+    def frame(self, base: int, data: bytes) -> SayFrame:
+        """Return a frame with an identifier of the predefined connection set."""
+        return SayFrame(CanFrame(base + self.node, data))
+
+
+CanPlay = Callable[[CanScene], list[SayFrame]]
+CanWants = Literal["upload", "download", "block upload", "block download", "guard request", "nothing"]
+
+
+@dataclass(frozen=True, slots=True)
+class CanopenCase:
+    """A `scene.ModbusCase` for SDO transfers.
+
+    `misses`: the segment of a block download that the node ignores, 0 for none; `early`: the segment after which it
+    acknowledges the sub-block although more follow; `mutes`: the messages that the node omits for `mute_s` from the
+    first strike on: ``heartbeat``, ``all``, or ``sdo``, as if STOPPED; `boots`: it boots afterwards; `beat_late_s`: the
+    delay of its next heartbeat.
+    """
+
+    about: Case
+    play: CanPlay
+    wants: CanWants = "upload"
+    strikes: int = 2
+    holds_good: bool = False
+    framings: tuple[str, ...] = ("can",)
+    needs: str = ""
+    misses: int = 0
+    early: int = 0
+    mutes: Literal["", "heartbeat", "all", "sdo"] = ""
+    mute_s: float = 4.0
+    boots: bool = False
+    beat_late_s: float = 0.0
+    trail_s: float = TRAIL_S
+    least: int = 1
+
+    def on(self, **changes: object) -> CanopenCase:
+        return replace(self, **changes)  # type: ignore[arg-type]

@@ -1,0 +1,31 @@
+"""Log the frames of a master under test and its hostile device.
+
+The JSON lines are like those of `fieldtwin.commissioning.access.frame_log`. The directions are the master's: the frames that it
+sent, and those that it received.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from fieldtwin.commissioning.access.frame_log import WireLog
+from fieldtwin.conformance.core.evidence import line_of
+from fieldtwin.conformance.core.observation import Asked, Event, Garbled, Sent, Told
+
+
+class MasterLog(WireLog):
+    """Appends to `path`; `where` is the endpoint on which the master is served, `words` the command line."""
+
+    def __init__(self, path: Path, where: str, words: str) -> None:
+        super().__init__(path, words)
+        self._where = where
+
+    def on_event(self, event: Event) -> None:
+        """Write a line for a frame; connections, published values and the program's end are not written."""
+        if not isinstance(event, Asked | Told | Sent | Garbled):
+            return
+        _, frame, _ = line_of(event)
+        head, _, data = frame.rpartition("#")
+        line: dict[str, object] = {"t_ns": event.t_ns, "endpoint": self._where}
+        line |= {"direction": "received" if isinstance(event, Told) else "sent", "hex": data.replace(" ", "").lower()}
+        self._write(line | ({"frame": frame} if head else {}))

@@ -1,0 +1,129 @@
+"""The inputs of a reply function: the request, true and false answers to it, and moves. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from fieldtwin.conformance.clients.modbus.device import ModbusWire
+from fieldtwin.conformance.core.case import TRAIL_S, Basis, Case, Elsewhere
+
+
+@dataclass(frozen=True, slots=True)
+class Say:
+    """Send `data`, `after_s` seconds after the request."""
+
+    data: bytes
+    after_s: float = 0.0
+    good: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Hang:
+    """Close the connection, by a reset if the transport has one."""
+
+    after_s: float = 0.0
+    reset: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Deaf:
+    """Leave the connection open and never say anything on it again."""
+
+    after_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Unplug:
+    """Remove the port for `out_s` seconds and restore it under its name; then another process holds it for `held_s`."""
+
+    out_s: float
+    held_s: float = 0.0
+    after_s: float = 0.0
+
+
+Move = Say | Hang | Deaf | Unplug
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """One request that is to be misanswered.
+
+    `request` is unit id and PDU, `tag` its transaction id. `true` is the honest response PDU, `false` one of the same shape with
+    the poisoned word. `nth` counts the requests of the case from 0. `timeout_s` is the master's response timeout, or the best
+    guess. `first` is the case's first scene, None in it.
+    """
+
+    wire: ModbusWire
+    request: bytes
+    tag: int
+    true: bytes
+    false: bytes
+    nth: int = 0
+    timeout_s: float = 1.0
+    first: Scene | None = None
+
+    @property
+    def unit(self) -> int:
+        return self.request[0]
+
+    @property
+    def function(self) -> int:
+        return self.request[1]
+
+    def good(self, after_s: float = 0.0) -> Say:
+        """Return the correct answer in a plain frame."""
+        return Say(self.frame(self.true), after_s, good=True)
+
+    def frame(self, pdu: bytes) -> bytes:
+        """Return a plain frame around any PDU."""
+        return self.wire.frame(self.request, self.tag, pdu)
+
+    def from_unit(self, unit: int, pdu: bytes) -> bytes:
+        """Return a frame that another unit sent."""
+        return self.wire.frame(bytes((unit,)), self.tag, pdu)
+
+    @property
+    def neighbour(self) -> int:
+        """The ID of another unit."""
+        return self.unit % 247 + 1
+
+    def refuse(self, code: int, function: int | None = None) -> bytes:
+        """Return an exception response in a plain frame."""
+        return self.frame(bytes(((function or self.function) | 0x80, code)))
+
+
+Play = Callable[[Scene], list[Move]]
+Wants = Literal["register read", "read", "write", "read of several", "request to unit 0", "nothing"]
+
+
+@dataclass(frozen=True, slots=True)
+class ModbusCase:
+    """A case with its reply function.
+
+    `strikes` requests receive a wrong reply; `holds_good`: the faulty frames hold the correct word, and continue until
+    it was seen. `framings` lists the endpoints on which the case is possible (``rtu``, ``ascii``, ``tcp``; ``stream``
+    for those that can be closed, ``port`` for those that can be unplugged, ``lock`` for those that can be held).
+    `needs` names an option without which the case makes no sense; `trail_s` is the time that the case continues after
+    the recovery.
+    """
+
+    about: Case
+    play: Play
+    wants: Wants = "register read"
+    strikes: int = 2
+    holds_good: bool = False
+    framings: tuple[str, ...] = ("rtu", "ascii", "tcp")
+    needs: str = ""
+    trail_s: float = TRAIL_S
+    least: int = 1
+    """Minimum number of requests that receive a wrong reply, even if the correct word was seen before."""
+
+    def on(self, **changes: object) -> ModbusCase:
+        return replace(self, **changes)  # type: ignore[arg-type]
+
+    def on_tcp(self, basis: Basis, clause: str) -> ModbusCase:
+        """Return the case with another basis and source on Modbus TCP."""
+        there = Elsewhere("tcp", "TCP", basis, clause)
+        return replace(self, about=replace(self.about, elsewhere=(there,)))

@@ -1,0 +1,59 @@
+"""The replies of the hostile device on TCP only. Pure: a request in, moves out."""
+
+from __future__ import annotations
+
+from fieldtwin.conformance.clients.modbus.device import mbap
+from fieldtwin.conformance.clients.modbus.setup import Deaf, Hang, Move, Play, Say, Scene
+
+BYTE_S = 0.002
+
+
+def bytewise(scene: Scene) -> list[Move]:
+    frame = scene.frame(scene.true)
+    return [Say(frame[i : i + 1], i * BYTE_S) for i in range(len(frame))]
+
+
+def with_stranger(scene: Scene) -> list[Move]:
+    return [Say(mbap(scene.tag ^ 0x4000, scene.unit, scene.false) + scene.frame(scene.true))]
+
+
+def other_protocol(scene: Scene) -> list[Move]:
+    return [Say(mbap(scene.tag, scene.unit, scene.false, protocol=1))]
+
+
+def other_protocol_first(scene: Scene) -> list[Move]:
+    return [Say(mbap(scene.tag, scene.unit, scene.false, protocol=1)), Say(scene.frame(scene.true), 0.020)]
+
+
+def length(counted: int) -> Play:
+    return lambda scene: [Say(mbap(scene.tag, scene.unit, scene.false, length=counted))]
+
+
+def other_tag(change: int) -> Play:
+    return lambda scene: [Say(mbap(scene.tag ^ change, scene.unit, scene.false))]
+
+
+def zero_tag(scene: Scene) -> list[Move]:
+    return [Say(mbap(0, scene.unit, scene.false))]
+
+
+def other_tag_first(scene: Scene) -> list[Move]:
+    return [Say(mbap(scene.tag ^ 0x4000, scene.unit, scene.false)), Say(scene.frame(scene.true), 0.020)]
+
+
+def reset(scene: Scene) -> list[Move]:
+    frame = scene.frame(scene.false)
+    return [Say(frame[: len(frame) // 2]), Hang(0.005, reset=True)]
+
+
+def hang_up(scene: Scene) -> list[Move]:
+    return [Hang()]
+
+
+def half_open(scene: Scene) -> list[Move]:
+    return [Deaf()]
+
+
+def closed_while_unused(scene: Scene) -> list[Move]:
+    """Answer, and then close the connection while the master is idle."""
+    return [scene.good(), Hang(0.050)]

@@ -1,0 +1,143 @@
+"""Results of a judgement: waived or not, counted, as JSON and for the reports."""
+
+from __future__ import annotations
+
+import shlex
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from datetime import date
+from typing import Any
+
+from fieldtwin.conformance.core.case import About, Basis, Finding, failed
+from fieldtwin.conformance.core.evidence import Line, reproduce
+from fieldtwin.conformance.core.waivers import Waivers
+from fieldtwin.results.model import CheckResult, Report, ScenarioResult, Verdict
+
+
+@dataclass(frozen=True, slots=True)
+class CaseResult:
+    """A case and its finding. `waived`: the waiver's reason, if a failure is accepted."""
+
+    case: About
+    finding: Finding
+    took_s: float = 0.0
+    waived: str = ""
+    wire: tuple[Line, ...] = ()
+    """The frames and events that the verdict rests on."""
+
+    @property
+    def verdict(self) -> Verdict:
+        """A waived failure counts as skipped: it neither failed nor passed."""
+        return Verdict.SKIPPED if self.waived else self.finding.verdict
+
+    @property
+    def deviates(self) -> bool:
+        """Return whether a case failed that the standard requires."""
+        return self.verdict.bad and self.case.basis is Basis.STANDARD
+
+    @property
+    def reason(self) -> str:
+        return f"waived: {self.waived} (failed: {self.finding.reason})" if self.waived else self.finding.reason
+
+
+def waive(result: CaseResult, waivers: Waivers, today: date) -> CaseResult:
+    """Apply the waiver of the result, if there is one. An expired waiver is a failure, whatever the finding."""
+    waiver = waivers.of(result.case.id, result.case.row)
+    if waiver is None:
+        return result
+    if waiver.expired(today):
+        found = f"; {result.finding.verdict.value}: {result.finding.reason}" if result.finding.reason else ""
+        return replace(result, finding=failed(f"its waiver expired on {waiver.expires} ({waiver.reason}){found}"))
+    if result.finding.verdict is Verdict.FAILED:
+        return replace(result, waived=f"{waiver.reason}, until {waiver.expires}")
+    return result
+
+
+ONLY_REQUIRED = frozenset({Basis.STANDARD})
+FOUND = {Basis.STANDARD: "failed", Basis.ROBUSTNESS: "robustness", Basis.FIELD: "field problem"}
+"""The name of a failed case in tables and counts, by the basis of the case."""
+
+
+def counts_as_failed(result: CaseResult, fail_on: frozenset[Basis] = ONLY_REQUIRED) -> bool:
+    """Return whether the result affects the exit code: it failed, and its case's basis is one of `fail_on`."""
+    return result.verdict is Verdict.ERROR or (result.verdict.bad and result.case.basis in fail_on)
+
+
+def exit_code(results: Sequence[CaseResult], fail_on: frozenset[Basis] = ONLY_REQUIRED) -> int:
+    """Return 1 when a case failed whose basis is one of `fail_on`, or when no case passed; else 0."""
+    passed = any(result.verdict is Verdict.PASSED for result in results)
+    return 1 if not passed or any(counts_as_failed(result, fail_on) for result in results) else 0
+
+
+def called(result: CaseResult) -> str:
+    """Return ``passed``, ``failed``, ``robustness``, ``field problem``, ``inconclusive`` or ``skipped``.
+
+    ``robustness`` and ``field problem`` are failures that do not deviate from a standard.
+    """
+    return FOUND[result.case.basis] if result.verdict is Verdict.FAILED else result.verdict.value
+
+
+def summary(results: Sequence[CaseResult]) -> str:
+    """Return a text such as ``31 passed, 1 failed, 2 robustness, 1 field problem, 2 inconclusive, 4 skipped``."""
+    counts = Counter(called(result) for result in results)
+    order = ("passed", *FOUND.values(), "error", "inconclusive", "skipped")
+    return ", ".join(f"{counts[word]} {word}" for word in order if counts[word]) or "no case was chosen"
+
+
+def as_json(results: Sequence[CaseResult], argv: Sequence[str]) -> list[dict[str, Any]]:
+    """Return one object per case. `argv` is the command line, for `reproduce`."""
+    return [
+        {
+            "id": r.case.id,
+            "title": r.case.title,
+            "clause": r.case.clause,
+            "basis": r.case.basis.value,
+            "role": r.case.role,
+            "danger": r.case.danger.value,
+            "device": r.case.does,
+            "expected": r.case.must,
+            "verdict": r.verdict.value,
+            "reason": r.reason,
+            "waived": bool(r.waived),
+            "took_s": round(r.took_s, 3),
+            "reproduce": reproduce(argv, r.case.id),
+            "wire": [line.as_json() for line in r.wire],
+        }
+        for r in results
+    ]
+
+
+def for_build(result: CaseResult, fail_on: frozenset[Basis]) -> tuple[Verdict, str]:
+    """Return the verdict and the reason that a build's test report shows.
+
+    A failure that does not decide the exit code is SKIPPED there, with its kind in front of the reason. So a build and its test
+    report agree.
+    """
+    if not result.verdict.bad or counts_as_failed(result, fail_on):
+        return result.verdict, result.reason
+    return Verdict.SKIPPED, f"{called(result)} finding: {result.reason}"
+
+
+def as_report(
+    results: Sequence[CaseResult],
+    title: str,
+    argv: Sequence[str],
+    started: str,
+    fail_on: frozenset[Basis] = ONLY_REQUIRED,
+) -> Report:
+    """Return the results as a JUnit report: a scenario for each case, with its frames."""
+    again = shlex.join(["fieldtwin", *argv])
+    scenarios = [_scenario(r, title, argv, fail_on) for r in results]
+    return Report(f"{title}: {summary(results)}", scenarios, started=started, reproduce=again, target=title)
+
+
+def _scenario(result: CaseResult, target: str, argv: Sequence[str], fail_on: frozenset[Basis]) -> ScenarioResult:
+    case = result.case
+    verdict, reason = for_build(result, fail_on)
+    check = CheckResult("1", f"{case.does}: {case.must}", verdict, expected=case.must, got=reason)
+    return ScenarioResult(
+        f"{case.id} {case.title}", verdict, [check], requirements=(case.row,), target=target, reason=reason,
+        reproduce=reproduce(argv, case.id), took_s=result.took_s, case=case.id, role=case.role, danger=case.danger.value,
+        basis=case.basis.value, clause=case.clause, evidence=tuple(map(str, result.wire)),
+    )  # fmt: skip

@@ -1,0 +1,1 @@
+"""Conformance tests of Modbus and CANopen devices, from outside."""

@@ -1,0 +1,310 @@
+"""Cases of SDO downloads: to objects that must refuse, and to those that the user gave, whose values are restored.
+
+Clauses are CiA 301's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+from fieldtwin.conformance.core.case import Danger, Finding
+from fieldtwin.conformance.devices.canopen.checks import aborted, must_abort, present, verdict
+from fieldtwin.conformance.devices.canopen.connection import ERROR_CONTROL, CanopenWire, Key, Reply, mux, shown
+from fieldtwin.conformance.devices.device_case import NotHere, Unsaid
+from fieldtwin.gateway.protocols.canopen.datatypes import DataType
+from fieldtwin.gateway.protocols.canopen.sdo_block import crc16
+
+UNKNOWN, CRC, READ_ONLY = 0x0504_0001, 0x0504_0004, 0x0601_0002
+TOO_LONG, TOO_SHORT, TOO_HIGH, TOO_LOW = 0x0607_0012, 0x0607_0013, 0x0609_0031, 0x0609_0032
+SIGNED = frozenset({DataType.INTEGER8, DataType.INTEGER16, DataType.INTEGER32})
+ANY_LENGTH = frozenset({DataType.VISIBLE_STRING, DataType.OCTET_STRING, DataType.UNICODE_STRING, DataType.DOMAIN})
+
+
+@asynccontextmanager
+async def _borrowed(wire: CanopenWire, key: Key) -> AsyncIterator[bytes]:
+    """Yield the object's value, and restore it. Raises `Unsaid` where that failed."""
+    before = await present(wire, key)
+    try:
+        yield before
+    finally:
+        if await wire.upload(key) != before:
+            wire.danger = max(wire.danger, Danger.WRITE, key=lambda danger: danger.rank)
+            await wire.download(key, before)
+            now = await wire.upload(key)
+            if now != before:
+                said = now.hex() if isinstance(now, bytes) else now
+                raise Unsaid(f"{shown(key)} could not be put back: {said} instead of {before.hex()}")
+
+
+async def _unchanged(wire: CanopenWire, key: Key, before: bytes, wrong: str) -> Finding:
+    if wrong:
+        await wire.abandon(key)  # ends any transfer in progress
+    now = await wire.upload(key)
+    if now != before:
+        said = now.hex(" ").upper() if isinstance(now, bytes) else str(now)
+        wrong = f"{shown(key)} is {said} instead of {before.hex(' ').upper()}" + (f"; {wrong}" if wrong else "")
+    return await verdict(wire, wrong)
+
+
+async def _number(wire: CanopenWire) -> tuple[Key, bytes]:
+    """Return the first given object that is a number of 1, 2 or 4 bytes; 1017h only if there is no other.
+
+    Raises `NotHere` with the reason for each given object.
+    """
+    why_not = []
+    for key in sorted(wire.may_write, key=lambda key: key == (0x1017, 0)):
+        entry = wire.dictionary.get(*key) if wire.dictionary is not None else None
+        if entry is not None and entry.type_code in ANY_LENGTH:
+            why_not.append(f"{shown(key)} is text or a domain in the EDS")
+            continue
+        value = await wire.upload(key)
+        if isinstance(value, bytes) and len(value) in (1, 2, 4):
+            return key, value
+        why_not.append(_instead(key, value))
+    raise NotHere(f"needs an object of 1, 2 or 4 bytes by --write: {', '.join(why_not)}")
+
+
+async def _text(wire: CanopenWire) -> tuple[Key, bytes]:
+    """Return the first given object of more than 14 bytes: three segments. Raises `NotHere`, as `_number`."""
+    why_not = []
+    for key in wire.may_write:
+        value = await wire.upload(key)
+        if isinstance(value, bytes) and len(value) > 14:
+            return key, value
+        why_not.append(_instead(key, value))
+    raise NotHere(f"needs an object of more than 14 bytes by --write: {', '.join(why_not)}")
+
+
+def _instead(key: Key, value: bytes | Reply) -> str:
+    """Describe a given object that a case cannot use."""
+    if isinstance(value, Reply):
+        return f"{shown(key)} could not be read ({value})"
+    return f"{shown(key)} holds {len(value)} byte{'s' * (len(value) != 1)}"
+
+
+# -- refusals ---------------------------------------------------------------------------------------------------------
+
+
+async def read_only_expedited(wire: CanopenWire) -> Finding:
+    """CO-006: 1000h, written with its own value."""
+    return await must_abort(wire, b"\x23" + mux(0x1000) + wire.device_type.ljust(4, b"\0"), READ_ONLY)
+
+
+async def read_only_segmented(wire: CanopenWire) -> Finding:
+    """CO-006: a download in segments to 1000h: refused at initiate, before any data."""
+    return await must_abort(wire, b"\x21" + mux(0x1000) + b"\x14\0\0\0", READ_ONLY)
+
+
+async def segment_alone(wire: CanopenWire) -> Finding:
+    """CO-003: a download segment without an initiate."""
+    return await must_abort(wire, b"\x00abcdefg", UNKNOWN)
+
+
+async def history_set(wire: CanopenWire) -> Finding:
+    """CO-011: 1003h:00 can only be cleared."""
+    if isinstance(there := await wire.upload((0x1003, 0)), Reply):
+        raise NotHere(f"it has no error history, 1003h: {there}")
+    return await must_abort(wire, b"\x2f" + mux(0x1003) + b"\x01", 0x0609_0030, 0x0800_0000)
+
+
+async def store_signature(wire: CanopenWire) -> Finding:
+    """CO-031: write an invalid signature to 1010h."""
+    if isinstance(there := await wire.upload((0x1010, 1)), Reply):
+        raise NotHere(f"it stores no parameters, 1010h: {there}")
+    return await must_abort(wire, b"\x23" + mux(0x1010, 1) + b"none", 0x0800_0020, 0x0800_0022)
+
+
+# -- lengths and limits -----------------------------------------------------------------------------------------------
+
+
+async def too_long(wire: CanopenWire) -> Finding:
+    """CO-009: one byte more than the object has, announced."""
+    key, before = await _number(wire)
+    async with _borrowed(wire, key):
+        reply = await wire.ask(b"\x21" + mux(*key) + (len(before) + 1).to_bytes(4, "little"))
+        if reply.data and not reply.abort:
+            await wire.abandon(key)
+        return await _unchanged(wire, key, before, aborted(reply, TOO_LONG))
+
+
+async def too_short(wire: CanopenWire) -> Finding:
+    """CO-009: one byte less, expedited."""
+    key, before = await _number(wire)
+    if len(before) < 2:
+        raise NotHere(f"{shown(key)} has one byte")
+    async with _borrowed(wire, key):
+        return await _unchanged(wire, key, before, aborted(await wire.download(key, before[:-1]), TOO_SHORT))
+
+
+async def _limit(wire: CanopenWire, *, above: bool) -> Finding:
+    for key in wire.may_write:
+        entry = wire.dictionary.get(*key) if wire.dictionary is not None else None
+        bound = None if entry is None else entry.high if above else entry.low
+        if not isinstance(bound, int):
+            continue  # no limit, or one of a real type, where the next value depends on the precision
+        async with _borrowed(wire, key) as before:
+            value, bits = (bound + 1 if above else bound - 1), 8 * len(before)
+            least = -(1 << bits - 1) if entry is not None and entry.type_code in SIGNED else 0
+            if not least <= value < least + (1 << bits):  # no value exists beyond it
+                continue
+            reply = await wire.download(key, (value % (1 << bits)).to_bytes(len(before), "little"))
+            return await _unchanged(wire, key, before, aborted(reply, TOO_HIGH if above else TOO_LOW))
+    raise NotHere("no object given by --write has such a limit in the EDS, with values of its type beyond it")
+
+
+async def above_limit(wire: CanopenWire) -> Finding:
+    """CO-010: one more than the EDS allows."""
+    return await _limit(wire, above=True)
+
+
+async def below_limit(wire: CanopenWire) -> Finding:
+    """CO-010: one less than the EDS allows."""
+    return await _limit(wire, above=False)
+
+
+async def _announced(wire: CanopenWire, more: int, code: int) -> Finding:
+    key, before = await _number(wire)
+    sent = len(before) + more
+    if not sent:
+        raise NotHere(f"{shown(key)} has one byte")
+    async with _borrowed(wire, key):
+        reply = await wire.ask(b"\x21" + mux(*key) + len(before).to_bytes(4, "little"))
+        if reply.specifier != 3:
+            raise NotHere(f"{shown(key)} takes no download in segments: {reply}")
+        reply = await wire.ask(bytes(((7 - sent) << 1 | 1,)) + before[:sent].ljust(sent, b"\0"))
+        return await _unchanged(wire, key, before, aborted(reply, code))
+
+
+async def more_than_announced(wire: CanopenWire) -> Finding:
+    """CO-013: a byte more than was announced."""
+    return await _announced(wire, 1, TOO_LONG)
+
+
+async def less_than_announced(wire: CanopenWire) -> Finding:
+    """CO-013: a byte less than was announced."""
+    return await _announced(wire, -1, TOO_SHORT)
+
+
+async def without_size(wire: CanopenWire) -> Finding:
+    """CO-029: expedited, without the size bit: the object's own length counts."""
+    key, before = await _number(wire)
+    async with _borrowed(wire, key):
+        reply = await wire.ask(b"\x22" + mux(*key) + before)
+        return await _unchanged(wire, key, before, "" if reply.specifier == 3 else f"{reply} instead of taking it")
+
+
+async def toggle_repeated(wire: CanopenWire) -> Finding:
+    """CO-001: the toggle bit stays the same in the second segment of a download."""
+    key, before = await _text(wire)
+    async with _borrowed(wire, key):
+        reply = await wire.ask(b"\x21" + mux(*key) + len(before).to_bytes(4, "little"))
+        if reply.specifier != 3:
+            raise NotHere(f"{shown(key)} takes no download in segments: {reply}")
+        await wire.ask(b"\x00" + before[:7])
+        return await _unchanged(wire, key, before, aborted(await wire.ask(b"\x00" + before[7:14]), 0x0503_0000))
+
+
+# -- block download (7.2.4.3.9 to 11) ----------------------------------------------------------------------------------
+
+
+async def _begin_block(wire: CanopenWire, key: Key, size: int) -> Reply:
+    reply = await wire.ask(b"\xc6" + mux(*key) + size.to_bytes(4, "little"))
+    if reply.specifier != 5 or not 1 <= reply.data[4] <= 127:
+        raise NotHere(f"it has no block download: {reply}")
+    return reply
+
+
+def _segments(value: bytes) -> list[bytes]:
+    """Return all segments of a value that fits into one sub-block."""
+    pieces = [value[at : at + 7] for at in range(0, len(value), 7)]
+    last = len(pieces)
+    return [bytes((n | (0x80 if n == last else 0),)) + piece.ljust(7, b"\0") for n, piece in enumerate(pieces, 1)]
+
+
+def _end(value: bytes, crc: int) -> bytes:
+    unused = -len(value) % 7
+    return (bytes((0xC1 | unused << 2,)) + crc.to_bytes(2, "little")).ljust(8, b"\0")
+
+
+async def crc_mismatch(wire: CanopenWire) -> Finding:
+    """CO-015: end a block download with a wrong CRC."""
+    key, before = await _number(wire)
+    async with _borrowed(wire, key):
+        begun = await _begin_block(wire, key, len(before))
+        if not begun.data[0] & 4:
+            await wire.abandon(key)
+            raise NotHere("its block download has no CRC")
+        reply = await wire.ask(_segments(before)[0])
+        if reply.data[:2] != b"\xa2\x01":
+            return await _unchanged(wire, key, before, f"{reply} instead of an acknowledgement")
+        return await _unchanged(wire, key, before, aborted(await wire.ask(_end(before, crc16(before) ^ 0xFFFF)), CRC))
+
+
+async def _whole_block(wire: CanopenWire, *, lose: bool) -> Finding:
+    """Download the object's own value by blocks; if `lose`, the second segment is lost at first."""
+    key, before = await _text(wire)
+    async with _borrowed(wire, key):
+        begun = await _begin_block(wire, key, len(before))
+        segments = _segments(before)
+        if len(segments) > begun.data[4]:
+            await wire.abandon(key)
+            raise NotHere(f"its sub-blocks are of {begun.data[4]} segments: shorter than {shown(key)}")
+        wire.forget()
+        for n, segment in enumerate(segments):
+            if not (lose and n == 1):
+                await wire.tell(segment)
+        reply = await wire.reply()
+        if lose:
+            if reply.data[:2] != b"\xa2\x01":
+                return await _unchanged(
+                    wire, key, before, f"{reply} instead of an acknowledgement of the first segment"
+                )
+            wire.forget()
+            for n, segment in enumerate(_segments(before[7:])):
+                await wire.tell(bytes((segment[0],)) + segment[1:] if n else segment)
+            reply = await wire.reply()
+            segments = segments[1:]
+        if reply.data[:2] != bytes((0xA2, len(segments))):
+            return await _unchanged(
+                wire, key, before, f"{reply} instead of an acknowledgement of {len(segments)} segments"
+            )
+        if more := (await wire.reply(min(0.1, wire.timeout_s))).data:
+            return await _unchanged(wire, key, before, f"a second reply to a sub-block: {more.hex(' ').upper()}")
+        end = await wire.ask(_end(before, crc16(before)))
+        return await _unchanged(wire, key, before, "" if end.specifier == 5 else f"{end} instead of the end")
+
+
+async def one_reply_a_block(wire: CanopenWire) -> Finding:
+    """CO-020: a sub-block is acknowledged exactly once."""
+    return await _whole_block(wire, lose=False)
+
+
+async def segment_lost(wire: CanopenWire) -> Finding:
+    """CO-017: lose a segment of the last sub-block; repeat it and the following ones, numbered from 1."""
+    return await _whole_block(wire, lose=True)
+
+
+# -- heartbeat ----------------------------------------------------------------------------------------------------------
+
+PERIOD_MS = 200
+BEATS = 4
+
+
+async def heartbeat_changed(wire: CanopenWire) -> Finding:
+    """CO-041: change 1017h: the new period applies at once."""
+    key = (0x1017, 0)
+    if key not in wire.may_write:
+        raise NotHere("changes the heartbeat: --write 1017:00")
+    async with _borrowed(wire, key):
+        reply = await wire.download(key, PERIOD_MS.to_bytes(2, "little"))
+        if reply.specifier != 3:
+            raise NotHere(f"1017h cannot be written: {reply}")
+        frames = await wire.listen(PERIOD_MS * (BEATS + 0.5) / 1000)
+        beats = sum(frame.can_id == ERROR_CONTROL + wire.node and len(frame.data) == 1 for frame in frames)
+        wrong = (
+            ""
+            if BEATS - 1 <= beats <= BEATS + 1
+            else f"{beats} heartbeats in {BEATS + 0.5:g} periods of {PERIOD_MS} ms"
+        )
+    return await verdict(wire, wrong)

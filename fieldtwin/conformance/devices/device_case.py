@@ -1,0 +1,59 @@
+"""A case for a device, the frames exchanged in it, and its finding. It depends on no protocol.
+
+A device is tested from outside, through its replies and its silence, as its client or master sees it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+from fieldtwin.conformance.core.case import About, Finding
+from fieldtwin.conformance.core.results import CaseResult
+from fieldtwin.gateway.core.connection import Direction
+
+W = TypeVar("W")
+Play = Callable[[W], Awaitable[Finding]]
+"""Runs a case on a connection and returns the finding."""
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceCase(About, Generic[W]):
+    """A case for devices.
+
+    `wires`: the transports on which it makes sense, all if empty. `needs`: inputs that the user has to give for it
+    (``holding``, ``coil``, ``object``: by ``--write``; ``eds``; ``i-know``).
+    """
+
+    play: Play[W]
+    wires: tuple[str, ...] = ()
+    needs: tuple[str, ...] = ()
+
+    @property
+    def role(self) -> str:
+        return "device"
+
+
+@dataclass(frozen=True, slots=True)
+class Spoken:
+    """A chunk or a frame. `t_ns` counts from the case's beginning, `text` is hex, or a frame as candump writes it."""
+
+    t_ns: int
+    direction: Direction
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceResult(CaseResult):
+    """The finding, and all frames of the case."""
+
+    spoken: tuple[Spoken, ...] = ()
+
+
+class NotHere(Exception):
+    """Raised inside a case if the device lacks the tested feature. The case is skipped with this reason."""
+
+
+class Unsaid(Exception):
+    """Raised inside a case that cannot be decided from outside. The case is inconclusive for this reason."""

@@ -1,0 +1,70 @@
+"""Checks that many Modbus cases share: the right refusal, silence, and the recovery afterwards."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from fieldtwin.conformance.core.case import Finding, failed, passed
+from fieldtwin.conformance.devices.device_case import NotHere
+from fieldtwin.conformance.devices.modbus.connection import Heard, ModbusWire
+from fieldtwin.conformance.devices.modbus.frames import Answer
+
+NAMES = {1: "illegal function", 2: "illegal data address", 3: "illegal data value", 4: "device failure", 6: "busy"}
+
+
+def named(code: int) -> str:
+    """Return a text such as ``exception 03``, with its name if it has one."""
+    return f"exception {code:02X}" + (f" ({NAMES[code]})" if code in NAMES else "")
+
+
+def refused(pdu: bytes, answer: Answer, *codes: int) -> str:
+    """Return an empty string if `answer` refuses the request `pdu` with one of `codes`, else a description."""
+    wanted = " or ".join(f"{code:02X}" for code in codes)
+    if answer.refusal and answer.pdu[0] != pdu[0] | 0x80:
+        return f"refuses function {answer.pdu[0] & 0x7F:02X} instead of {pdu[0]:02X}: {answer.pdu.hex(' ').upper()}"
+    if answer.refusal in codes:
+        return ""
+    if answer.refusal:
+        return f"{named(answer.refusal)} instead of {wanted}"
+    return f"answers {answer} instead of exception {wanted}"
+
+
+async def must_refuse(wire: ModbusWire, pdu: bytes, *codes: int, may_lack: bool = True) -> Finding:
+    """Send a request that the device has to refuse with one of `codes`; then it must continue to answer.
+
+    `may_lack`: exception 01 means that the device lacks the function, and the case is skipped.
+    """
+    heard = await wire.ask(pdu)
+    answer = heard.first
+    if answer is None or answer.unit != wire.unit:
+        after = await wire.still_good()
+        return failed(f"{heard} instead of {named(codes[0])}" + (f"; the request afterwards: {after}" if after else ""))
+    if may_lack and answer.pdu == bytes((pdu[0] | 0x80, 0x01)) and 0x01 not in codes:
+        raise NotHere(f"it has no function {pdu[0]:02X}")
+    wrong = refused(pdu, answer, *codes)
+    return failed(wrong) if wrong else passed(named(answer.refusal))
+
+
+async def silent_then_good(wire: ModbusWire, heard: Heard) -> Finding:
+    """Require that `heard` is silence, and that a request afterwards is answered."""
+    if not heard.nothing:
+        return failed(f"{heard} instead of silence")
+    after = await wire.still_good()
+    return (
+        failed(f"the request afterwards: {after}") if after else passed("silence; the request afterwards is answered")
+    )
+
+
+def answers_good(wire: ModbusWire, heard: Heard, times: int) -> bool:
+    """Return whether `heard` is the usual answer `times` times, without any other bytes."""
+    return len(heard.answers) == times and all(wire.is_good(a) for a in heard.answers) and not heard.rest
+
+
+def first_table(wire: ModbusWire, functions: Sequence[int]) -> tuple[int, int, int]:
+    """Return (function, address, count) of a read that is answered. Raises `NotHere` if none of `functions` has one."""
+    for function in functions:
+        if function in wire.readable:
+            return function, *wire.readable[function]
+    raise NotHere(
+        "nothing was found that can be read" if len(functions) > 2 else "it has no such table, as far as seen"
+    )

@@ -1,0 +1,187 @@
+"""Cases of Modbus TCP and of streams: invalid headers, several ADUs in one segment, connections that end.
+
+TG is the Messaging on TCP/IP Implementation Guide V1.0b. All PDUs in it are reads.
+"""
+
+from __future__ import annotations
+
+from fieldtwin.conformance.core.case import Finding, failed, passed
+from fieldtwin.conformance.devices.device_case import NotHere
+from fieldtwin.conformance.devices.modbus.checks import answers_good, named
+from fieldtwin.conformance.devices.modbus.connection import GATEWAY_SAYS_NO, ModbusWire
+from fieldtwin.conformance.devices.modbus.frames import Answer, mbap
+from fieldtwin.gateway.core.errors import Unreachable
+
+
+def _adu(wire: ModbusWire, transaction: int, protocol: int = 0, length: int | None = None) -> bytes:
+    return mbap(bytes((wire.unit,)) + wire.good, transaction, protocol, length)
+
+
+async def byte_by_byte(wire: ModbusWire) -> Finding:
+    """MB-051: a segment a byte."""
+    frame = wire.frame(wire.good)
+    for at in range(len(frame)):
+        await wire.say(frame[at : at + 1], wire.good, at_once=at > 0)
+        await wire.pause(0.002)
+    heard = await wire.hear()
+    return passed() if answers_good(wire, heard, 1) else failed(f"{heard} instead of an answer")
+
+
+async def several_at_once(wire: ModbusWire) -> Finding:
+    """MB-052: three ADUs in one segment: each is answered or refused with 06, in order."""
+    numbers = [wire.next_transaction() for _ in range(3)]
+    await wire.say(b"".join(_adu(wire, n) for n in numbers), wire.good)
+    heard = await wire.hear(3)
+    got = [a.transaction for a in heard.answers]
+    served = all(wire.is_good(a) or a.refusal == 0x06 for a in heard.answers)
+    if got == numbers and served and not heard.rest:
+        busy = sum(a.refusal == 0x06 for a in heard.answers)
+        return passed(f"{3 - busy} answered, {busy} refused with 06" if busy else "")
+    if sorted(got) == numbers:
+        return failed(f"answers {got} to {numbers}: out of order")
+    return failed(f"{len(got)} answers to 3 requests")
+
+
+async def more_than_allowed(wire: ModbusWire) -> Finding:
+    """MB-053: send 40 requests at once: each is answered, or refused with 06."""
+    numbers = [wire.next_transaction() for _ in range(40)]
+    await wire.say(b"".join(_adu(wire, n) for n in numbers), wire.good)
+    heard = await wire.hear(40)
+    busy = [a for a in heard.answers if a.refusal == 0x06]
+    if not busy and wire.good_reply[0] & 0x80:
+        raise NotHere("it refuses every read anyway")
+    odd = [a for a in heard.answers if a.refusal != 0x06 and not wire.is_good(a)]
+    if odd:
+        return failed(f"{odd[0]} instead of an answer or exception 06")
+    if len(heard.answers) != 40:
+        return failed(f"{len(heard.answers)} answers to 40 requests" + (", and hangs up" if heard.closed else ""))
+    return passed(f"{40 - len(busy)} answered, {len(busy)} refused with 06")
+
+
+async def other_protocol(wire: ModbusWire) -> Finding:
+    """MB-054: an ADU with protocol id 1, then a good one."""
+    odd, ours = wire.next_transaction(), wire.next_transaction()
+    await wire.say(_adu(wire, odd, protocol=1), wire.good)
+    await wire.say(_adu(wire, ours), wire.good)
+    heard = await wire.hear()
+    if any(a.transaction == odd for a in heard.answers):
+        return failed(f"answers the ADU of another protocol: {heard}")
+    return passed() if answers_good(wire, heard, 1) else failed(f"{heard} instead of an answer to the good one")
+
+
+async def _wrong_length(wire: ModbusWire, adu: bytes) -> Finding:
+    """Send an invalid ADU: it is discarded, or the connection is closed. A new connection has to be served in any case."""
+    await wire.say(adu, wire.good)
+    heard = await wire.hear()
+    if heard.answers or heard.rest:
+        return failed(f"{heard} instead of nothing, or an end of the connection")
+    if heard.closed:
+        return await _served_anew(wire, "hangs up")
+    after = await wire.still_good()
+    if not after:
+        return passed("discards it")
+    if after == "hangs up":
+        return await _served_anew(wire, after)
+    return failed(f"keeps the connection, but the request afterwards: {after}")
+
+
+async def _served_anew(wire: ModbusWire, why: str) -> Finding:
+    try:
+        await wire.reopen()
+        after = await wire.still_good()
+    except Unreachable as e:
+        return failed(f"{why}, and takes no new connection: {e.message}")
+    return failed(f"{why}; on a new connection: {after}") if after else passed(f"{why}, and serves the next connection")
+
+
+async def length_zero(wire: ModbusWire) -> Finding:
+    """MB-055: send length 0 and no further bytes."""
+    return await _wrong_length(wire, wire.next_transaction().to_bytes(2) + b"\0\0\0\0")
+
+
+async def length_one(wire: ModbusWire) -> Finding:
+    """MB-055: length 1, the unit id alone."""
+    return await _wrong_length(wire, wire.next_transaction().to_bytes(2) + b"\0\0\0\x01" + bytes((wire.unit,)))
+
+
+async def length_ffff(wire: ModbusWire) -> Finding:
+    """MB-055: send length FFFFh, followed by an ordinary request."""
+    return await _wrong_length(wire, _adu(wire, wire.next_transaction(), length=0xFFFF))
+
+
+async def transaction_zero(wire: ModbusWire) -> Finding:
+    """MB-056: transaction id 0 is echoed."""
+    await wire.say(_adu(wire, 0), wire.good)
+    heard = await wire.hear()
+    good = answers_good(wire, heard, 1) and heard.answers[0].transaction == 0
+    return passed() if good else failed(f"{_told(heard.first)} instead of an answer with id 0")
+
+
+async def transaction_twice(wire: ModbusWire) -> Finding:
+    """MB-056: two requests with one id, one after the other's answer."""
+    number = wire.next_transaction()
+    for _ in range(2):
+        await wire.say(_adu(wire, number), wire.good)
+        heard = await wire.hear()
+        if not answers_good(wire, heard, 1) or heard.answers[0].transaction != number:
+            return failed(f"{_told(heard.first)} instead of an answer with id {number}")
+    return passed()
+
+
+def _told(answer: Answer | None) -> str:
+    return "silence" if answer is None else f"{answer} with id {answer.transaction}"
+
+
+async def _as_itself(wire: ModbusWire, unit: int) -> Finding:
+    """A direct device answers to `unit`, and echoes it (TG 4.4.1.2)."""
+    if wire.unit == unit:
+        raise NotHere(f"all the rest is asked of unit {unit}")
+    heard = await wire.ask(wire.good, unit)
+    answer = heard.first
+    if answer is None:
+        return failed(f"{heard} instead of an answer")
+    if answer.unit != unit:
+        return failed(f"answers as unit {answer.unit} to a request for unit {unit}")
+    if answer.refusal in GATEWAY_SAYS_NO:
+        raise NotHere(f"a gateway, not a direct device: {named(answer.refusal)}")
+    same = answer.pdu[:2] == wire.good_reply[:2] and len(answer.pdu) == len(wire.good_reply)
+    return passed() if same else failed(f"{answer} instead of what unit {wire.unit} answers")
+
+
+async def unit_255(wire: ModbusWire) -> Finding:
+    """MB-057: unit 255."""
+    return await _as_itself(wire, 255)
+
+
+async def unit_0(wire: ModbusWire) -> Finding:
+    """MB-057: unit 0."""
+    return await _as_itself(wire, 0)
+
+
+async def half_and_gone(wire: ModbusWire) -> Finding:
+    """MB-064: send half a request and disconnect; the next client is served."""
+    frame = wire.frame(wire.good)
+    await wire.say(frame[: len(frame) // 2], wire.good)
+    await wire.pause(0.05)
+    return await _served_anew(wire, "left in the middle of a request")
+
+
+async def many_connections(wire: ModbusWire) -> Finding:
+    """MB-065: open 20 idle connections: one more is still served."""
+    held = []
+    try:
+        for _ in range(20):
+            try:
+                held.append(await wire.open_another())
+            except Unreachable:
+                break
+        made = len(held)
+        try:
+            await wire.reopen()
+            after = await wire.still_good()
+        except Unreachable as e:
+            after = e.message
+    finally:
+        for connection in held:
+            await connection.aclose()
+    return failed(f"with {made} connections open, one more: {after}") if after else passed(f"with {made} others open")

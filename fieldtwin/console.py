@@ -1,0 +1,35 @@
+"""The two consoles: data on stdout, talk on stderr. rich honours NO_COLOR and leaves colour out where there is no terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import NoReturn
+
+from rich.console import Console, ConsoleOptions, RenderableType
+from rich.segment import Segment
+
+from fieldtwin.gateway.core.escaping import visible
+
+
+class _Console(Console):
+    def on_broken_pipe(self) -> NoReturn:
+        """rich ends the program with exit code 1. Who reads with `head` has what it wanted: see `LazyGroup.invoke`."""
+        self.quiet = True
+        raise BrokenPipeError
+
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterator[Segment]:
+        """As rich does, but control characters in a text are shown and never sent: a name in a stranger's file could otherwise
+        clear the screen or retitle the terminal."""
+        for segment in super().render(renderable, options):
+            yield segment if segment.control is not None else Segment(visible(segment.text), segment.style)
+
+
+# emoji=False: `model.py:Boom:` in a text is a user's class, and no picture of an explosion.
+talk = _Console(stderr=True, highlight=False, emoji=False)
+data = _Console(highlight=False, emoji=False)
+
+
+def show_warnings(warnings: Iterable[str]) -> None:
+    """What the author of a file should know, one line each on stderr."""
+    for warning in warnings:
+        talk.print(f"warning: {warning}", style="yellow", soft_wrap=True, markup=False)

@@ -1,1 +1,0 @@
-"""Drawings of systems: who hangs on which wire, as text and as SVG."""

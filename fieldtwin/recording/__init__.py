@@ -1,1 +1,0 @@
-"""Record foreign traffic, and compare two recordings."""

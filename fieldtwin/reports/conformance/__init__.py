@@ -1,0 +1,1 @@
+"""Reports of conformance tests as HTML."""

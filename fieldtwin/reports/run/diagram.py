@@ -1,0 +1,240 @@
+"""A timing diagram of a window as inline SVG: faults, buses, program states and values under one time axis.
+
+Each lane is a block of a fixed height. Text that does not fit is in the title of its mark (shown when the mouse points
+at it) and in the table of frames below. Colours are variables of the page, so that light, dark and print each have
+their own.
+"""
+
+from __future__ import annotations
+
+import math
+
+from fieldtwin.capture.decoding.exchange import Exchange
+from fieldtwin.capture.decoding.tags import show_value
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.files.profile import Tag
+from fieldtwin.reports.markup import Markup, el
+from fieldtwin.reports.run.axis import CHAR, LEFT, RIGHT, WIDTH, Axis, fitted, label, seconds
+from fieldtwin.reports.run.value_lanes import value_lane
+from fieldtwin.reports.run.window import FaultBar, Step, Window
+from fieldtwin.twin.site.system import System
+
+MOST_TAGS = 10
+MOST_STATES = 6
+MOST_BUSES = 6
+MOST_FAULTS = 8
+MOST_MARKS = 250
+"""Largest number of marks in a lane; more would make it solid black."""
+
+
+def timing_diagram(window: Window, system: System | None, title: str) -> Markup:
+    """Return the drawing."""
+    axis = Axis(window.start_ns, window.span_ns)
+    lanes: list[tuple[float, list[Markup]]] = []
+    lanes += [_fault_lane(axis, bar) for bar in window.faults[:MOST_FAULTS]]
+    lanes += [_wire_lane(axis, window, bus, system) for bus in _buses(window)]
+    lanes += _scan_lane(axis, window, system)
+    for names, steps in ((_chosen(window, window.states), window.states), (_chosen(window, window.tags), window.tags)):
+        for name in names:
+            tag = _tag(system, name) if steps is window.tags else None
+            words = dict(tag.values) if tag else {}
+            lanes.append(value_lane(axis, window, name, steps[name], tag.unit if tag else "", words))
+    unseen = [n for n in window.check.names if "." in n and n not in window.tags and n not in window.states]
+    lanes += [(22.0, [*label(n), el("text", "never published", cls="sub", x=LEFT + 5, y=15.0)]) for n in unseen]
+    top, parts = 30.0, []
+    for number, (height, marks) in enumerate(lanes):
+        stripe = el("rect", cls=f"stripe{number % 2}", x=0.0, y=0.0, width=WIDTH, height=height)
+        parts.append(el("g", stripe, marks, transform=f"translate(0 {top:.0f})"))
+        top += height + 2
+    height = top + 6
+    return el(
+        "svg",
+        el("title", title),
+        parts,
+        _time_axis(axis, window, height),
+        _failure(axis, window, height),
+        cls="timing", viewBox=f"0 0 {WIDTH:.0f} {height:.0f}", role="img", xmlns="http://www.w3.org/2000/svg",
+    )  # fmt: skip
+
+
+# -- which lanes ------------------------------------------------------------------------------------------------------
+
+
+def _buses(window: Window) -> list[str]:
+    named = {name.rpartition(".")[0] for name in window.check.names}
+    buses = dict.fromkeys(e.bus for e in window.exchanges)
+    about = {e.bus for e in window.exchanges if e.device in named or e.bus in named}
+    return sorted(buses, key=lambda b: b not in about)[:MOST_BUSES]
+
+
+def _chosen(window: Window, lanes: dict[str, list[Step]]) -> list[str]:
+    """Return the lanes to draw: the named ones, then those of the same devices, then others; words before numbers, and
+    those that changed most first. A lane that is not named and never changes is left out, except for a state in words.
+    """
+    names = window.check.names
+    devices = {name.rpartition(".")[0] for name in names}
+
+    def rank(name: str) -> tuple[int, bool, int]:
+        steps = lanes[name]
+        about = 0 if name in names else 1 if name.rpartition(".")[0] in devices else 2
+        return about, not _in_words(steps), -len({(str(s.value), s.quality) for s in steps})
+
+    def tells(name: str) -> bool:
+        steps = lanes[name]
+        moved = len({(str(s.value), s.quality) for s in steps}) > 1 or steps[0].quality not in ("", "good")
+        return name in names or moved or (_in_words(steps) and not steps[0].quality)
+
+    most = MOST_STATES if lanes is window.states else MOST_TAGS
+    return sorted(filter(tells, lanes), key=rank)[:most]
+
+
+def _in_words(steps: list[Step]) -> bool:
+    return any(isinstance(s.value, str) for s in steps)
+
+
+def _tag(system: System | None, name: str) -> Tag | None:
+    device, _, tag = name.rpartition(".")
+    config = system.devices.get(device) if system else None
+    return config.profile.tags.get(tag) if config else None
+
+
+# -- lanes --------------------------------------------------------------------------------------------------------------
+
+
+def _fault_lane(axis: Axis, bar: FaultBar) -> tuple[float, list[Markup]]:
+    x1, x2 = axis.x(bar.on_ns), axis.x(bar.off_ns) if bar.off_ns is not None else WIDTH - RIGHT
+    said = f"{bar.name} {bar.target}".strip()
+    off = f"to {seconds(bar.off_ns)}" if bar.off_ns is not None else "and not taken away"
+    box = el(
+        "rect", el("title", f"fault {bar.id}: {said}, from {seconds(bar.on_ns)} {off}"), cls="fault",
+        x=x1, y=3.0, width=max(2.0, x2 - x1), height=16.0, rx=2,
+    )  # fmt: skip
+    return 22.0, [*label(f"fault {bar.id}"), box, *fitted(said, x1, x2, 15.0, "faulttext")]
+
+
+def _wire_lane(axis: Axis, window: Window, bus: str, system: System | None) -> tuple[float, list[Markup]]:
+    """Return the lane of a bus.
+
+    A request is a box as long as the wait for its answer, a message is a tick; text is added where there is room.
+    """
+    config = system.buses.get(bus) if system else None
+    timeout_ns = round((config.timeout_s if config else 1.0) * NS_PER_S)
+    exchanges = sorted((e for e in window.exchanges if e.bus == bus), key=lambda e: e.t_ns)
+    marks = label(bus, config.endpoint.scheme.upper() if config else "")
+    rows = sorted({_row(e) for e in exchanges})
+    words: list[tuple[int, float, float, str, str]] = []
+    step = {ok: max(1, math.ceil(sum(e.ok is ok for e in exchanges) / MOST_MARKS)) for ok in (True, False)}
+    for number, exchange in enumerate(exchanges):
+        if number % step[exchange.ok]:
+            continue
+        kind, top = _kind(exchange), 18.0 + 32 * rows.index(_row(exchange))
+        x1, waited = axis.x(exchange.t_ns), exchange.latency_ns
+        if kind == "lost":
+            following = exchanges[number + 1].t_ns if number + 1 < len(exchanges) else exchange.t_ns + timeout_ns
+            waited = min(timeout_ns, max(0, following - exchange.t_ns))
+        x2 = max(x1 + 2.2, axis.x(exchange.t_ns + (waited or 0)))
+        size = {"x": x1, "y": top, "width": x2 - x1, "height": 12.0, "rx": 1}
+        marks.append(el("rect", el("title", _tooltip(exchange)), cls=f"x {kind}", **size))
+        words.append((_RANK.get(kind, 0), top - 4, x1, _short(exchange), kind))
+    thinned = max(step.values()) > 1 or bus in window.thinned
+    if thinned:
+        marks.append(el("text", "thinned: too many", cls="sub", x=8.0, y=41.0))
+    return max(36.0, 4.0 + 32 * len(rows)) + (10 if thinned else 0), marks + _words(words)
+
+
+_RANK = {"message": 3, "asked": 2, "wrote": 1}
+"""Priority of the labels where there is not room for all; errors come first."""
+
+
+def _words(words: list[tuple[int, float, float, str, str]]) -> list[Markup]:
+    """Return as many labels as fit without overlap. Each of `words` is rank, y, x, text, kind."""
+    placed: dict[float, list[tuple[float, float]]] = {}
+    marks = []
+    for _, y, x1, said, kind in sorted(words):
+        x2 = x1 + len(said) * CHAR + 8
+        taken = placed.setdefault(y, [])
+        if x2 < WIDTH and all(x2 <= a or x1 >= b for a, b in taken):
+            taken.append((x1, x2))
+            marks.append(el("text", said, cls=f"words {kind}", x=x1, y=y))
+    return marks
+
+
+def _row(exchange: Exchange) -> int:
+    """Return the row of an exchange: requests above, messages below."""
+    return 0 if exchange.latency_ns is not None or exchange.problem == "no reply" else 1
+
+
+def _scan_lane(axis: Axis, window: Window, system: System | None) -> list[tuple[float, list[Markup]]]:
+    """Return the lane of the scans that changed something, each with its changes; other scans are not drawn."""
+    changed: dict[int, list[str]] = {}
+    for name, steps in window.states.items():
+        for step in steps:
+            if step.t_ns >= window.start_ns:
+                changed.setdefault(step.t_ns, []).append(f"{name} = {show_value(step.value)}")
+    if not changed:
+        return []
+    every = f"every {system.plc.cycle_ms:g} ms" if system else ""
+    marks = label("scans with changes", every)
+    for t_ns in sorted(changed)[-MOST_MARKS:]:
+        said = "\n".join([seconds(t_ns), *changed[t_ns][:8]])
+        marks.append(el("rect", el("title", said), cls="x scan", x=axis.x(t_ns), y=6.0, width=2.2, height=16.0))
+    return [(34.0, marks)]
+
+
+def _kind(exchange: Exchange) -> str:
+    if exchange.ok:
+        return "message" if exchange.latency_ns is None else "asked" if not exchange.writes() else "wrote"
+    return {"no reply": "lost", "exception": "refused", "abort": "refused"}.get(exchange.problem, "broken")
+
+
+def _short(exchange: Exchange) -> str:
+    """Return a short description: the service and its place, or the problem."""
+    if exchange.problem == "exception" and exchange.exception is not None:
+        return f"exception {exchange.exception:02X}"
+    if exchange.problem == "abort" and exchange.abort is not None:
+        return f"abort {exchange.abort:08X}h"
+    if exchange.problem:
+        return f"{exchange.device or f'unit {exchange.unit}'}: {exchange.problem}"
+    name = exchange.device or (f"unit {exchange.unit}" if exchange.unit else "")
+    text = exchange.text.removeprefix(f"{name}: ")
+    verb = {"read holding registers": "read", "read input registers": "read", "write registers": "write"}
+    for long, short in verb.items():
+        if text.startswith(long):
+            where = exchange.spans[0] if exchange.spans else ""
+            text = f"{short} {str(where).partition(' ')[0]}"
+    said = f"{name} {text}".strip()
+    return said if len(said) <= 46 else said[:45] + "…"
+
+
+def _tooltip(exchange: Exchange) -> str:
+    took = f", {exchange.latency_ns / 1e6:.3g} ms" if exchange.latency_ns is not None else ""
+    answer = f"\n{exchange.reply_text}{took}" if exchange.reply_text else ""
+    return f"{seconds(exchange.t_ns)}  {exchange.text}{answer}"[:240]
+
+
+# -- axis and failure -----------------------------------------------------------------------------------------------
+
+
+def _time_axis(axis: Axis, window: Window, height: float) -> list[Markup]:
+    wanted = window.span_ns / 8
+    magnitude = 10 ** math.floor(math.log10(wanted))
+    step = int(next(m * magnitude for m in (1, 2, 5, 10) if m * magnitude >= wanted))
+    first = -(-window.start_ns // step) * step
+    digits = max(0, 9 - int(math.log10(step) + 1e-9))
+    marks = []
+    for t_ns in range(first, window.end_ns + 1, max(1, step)):
+        x = axis.x(t_ns)
+        marks.append(el("line", cls="grid", x1=x, x2=x, y1=26.0, y2=height - 4))
+        marks.append(el("text", f"{t_ns / NS_PER_S:.{digits}f} s", cls="tick", x=x, y=16.0))
+    return marks
+
+
+def _failure(axis: Axis, window: Window, height: float) -> list[Markup]:
+    x, check = axis.x(window.at_ns), window.check
+    marks = []
+    if check.since_ns is not None and check.since_ns < window.at_ns:
+        x0 = axis.x(check.since_ns)
+        marks.append(el("rect", cls="watched", x=x0, y=22.0, width=max(1.0, x - x0), height=height - 26))
+    marks.append(el("line", cls="failed", x1=x, x2=x, y1=20.0, y2=height - 4))
+    marks.append(el("path", cls="failedtip", d=f"M{x - 5:.1f} 18h10l-5 8z"))
+    return marks

@@ -1,0 +1,276 @@
+"""Files into pieces: whose file is this, and what does it say. Every kind of file is read in a function of its own.
+
+Whatever a file holds ends as text in a document: nothing in it is trusted to be what it should be.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections import Counter
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from fieldtwin.conformance.core.case import Basis
+from fieldtwin.gateway.core.errors import FileInvalid, UsageError
+from fieldtwin.reports.site.document import Deviation, Device, Document, Kind, Piece, Source, Table, Weight
+from fieldtwin.reports.site.reading_dump import dump_piece
+
+MOST_BYTES = 1 << 28
+"""Of one JSON file; dumps are read line by line."""
+MOST_ROWS = 200
+"""Of a table: more are for a file, not for paper."""
+SUFFIXES = (".json", ".jsonl")
+
+
+class NotTaken(FileInvalid):
+    """A file of another kind: nothing that goes into a document."""
+
+
+def read_site(
+    paths: Iterable[Path], *, site: str, by: str, prepared: str, customer: str = "", remarks: str = ""
+) -> tuple[Document, list[str]]:
+    """The document of all files, and of folders those of the kinds that it takes; and what was left out of these, and why.
+
+    Raises `FileInvalid` for a file that was named and is none of them, and for one that is damaged wherever it is; `UsageError`
+    where there is nothing.
+    """
+    pieces: list[tuple[Path, Piece]] = []
+    left_out: list[str] = []
+    for path in paths:
+        if not path.is_dir():
+            pieces.append((path, read_piece(path)))
+            continue
+        for file in sorted(p for p in path.rglob("*") if p.suffix in SUFFIXES and p.is_file()):
+            try:
+                pieces.append((file, read_piece(file)))
+            except NotTaken as e:
+                left_out.append(str(e))
+    if not pieces:
+        raise UsageError(
+            "nothing to report", expected="dumps, and the JSON of check, diff or compare", got="none of them"
+        )
+    devices: dict[tuple[str, str, int], Device] = {}
+    for _, piece in sorted(pieces, key=lambda each: (each[1].protocol, each[1].endpoint, each[1].address)):
+        key = (piece.protocol, piece.endpoint, piece.address)
+        devices.setdefault(key, Device(len(devices) + 1, *_key(piece))).pieces.append(piece)
+    for device in devices.values():
+        device.pieces.sort(key=lambda piece: piece.when)
+    sources = [_source(path, piece) for path, piece in pieces]
+    return Document(site, by, prepared, list(devices.values()), sources, remarks, customer), left_out
+
+
+def _key(piece: Piece) -> tuple[str, int, str]:
+    return piece.protocol, piece.address, piece.endpoint
+
+
+def _source(path: Path, piece: Piece) -> Source:
+    digest = hashlib.sha256()
+    try:
+        with path.open("rb") as file:
+            while chunk := file.read(1 << 20):
+                digest.update(chunk)
+        size = path.stat().st_size
+    except OSError as e:
+        raise FileInvalid(f"cannot be read: {e.strerror or e}", path=str(path)) from e
+    return Source(path.name, size, digest.hexdigest(), piece.kind, piece.when, piece.by, piece.command)
+
+
+def read_piece(path: Path) -> Piece:
+    """One file. Raises `FileInvalid` where it is none that belongs into a document."""
+    try:
+        with path.open("rb") as file:
+            head = file.readline(1 << 20)
+            if b'"fieldtwin_dump"' in head:
+                return dump_piece(path)
+            if head.startswith(b'{"started"'):
+                raise NotTaken("a log of what was sent", path=str(path))
+            raw = head + file.read(MOST_BYTES)
+    except OSError as e:
+        raise FileInvalid(f"cannot be read: {e.strerror or e}", path=str(path)) from e
+    try:
+        data = json.loads(raw)
+    except (ValueError, RecursionError) as e:
+        raise NotTaken("not JSON", path=str(path), got=str(e)[:60]) from e
+    kind = data.get("kind") if isinstance(data, dict) else None
+    if kind not in READERS:
+        known = ", ".join(f"the JSON of `{name}`" for name in READERS)
+        raise NotTaken("not for a document", path=str(path), expected=f"a dump, {known}", got=repr(kind)[:60])
+    try:
+        return READERS[kind](data)
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError) as e:
+        raise FileInvalid(f"not what `{kind}` writes", path=str(path), got=f"{type(e).__name__} {e}"[:80]) from e
+
+
+# -- checks --------------------------------------------------------------------------------------------------------------
+
+
+def check_piece(data: dict[str, Any]) -> Piece:
+    """The JSON of `fieldtwin check modbus|canopen`."""
+    about, cases, counts = data["about"], data["cases"], data["counts"]
+    weights: dict[str, Weight] = {"failed": "deviation", "error": "deviation", "inconclusive": "open"}
+    deviations = []
+    noted: Counter[str] = Counter()
+    for case in cases:
+        weight: Weight | None = "waived" if case["waived"] else weights.get(case["verdict"])
+        if weight == "deviation" and case["verdict"] == "failed":
+            weight = _weight(case)
+            noted[weight] += weight != "deviation"
+        if weight is not None:
+            deviations.append(_case(case, weight))
+    words = ("passed", "failed", "robustness", "field problem", "inconclusive", "skipped")
+    shown = Counter(counts)
+    shown["failed"] -= noted.total()
+    shown += noted
+    skipped = [c for c in cases if c["verdict"] == "skipped" and not c["waived"]]
+    here = [c for c in skipped if c["reason"] != "not on this wire"]
+    shown["skipped"] -= len(skipped) - len(here)
+    bad = any(d.weight == "deviation" for d in deviations)
+    facts = [
+        ("played", f"cases up to danger {about['at_most']}"),
+        ("wrote to", ", ".join(map(str, about["wrote"])) or "nothing"),
+        ("reply timeout", f"{about['timeout_s']} s"),
+        ("took", f"{about['took_s']} s"),
+        ("with", f"fieldtwin {about['fieldtwin']} on {about['host']}"),
+    ]
+    passed = [c for c in cases if c["verdict"] == "passed"]
+    tables = (
+        _table(
+            "Passed",
+            ("case", "what", "source", "seen"),
+            [(c["id"], c["title"], c["clause"], c["reason"]) for c in passed],
+        ),
+        _table("Not checked", ("case", "what", "why"), [(c["id"], c["title"], c["reason"]) for c in here]),
+    )
+    return Piece(
+        "check", str(about["protocol"]), int(about["address"]), str(about["endpoint"]), str(about["started"]),
+        str(about["by"]), "failed" if bad else "passed" if counts.get("passed") else "inconclusive",
+        ", ".join(f"{shown[w]} {w}" for w in words if shown[w]),
+        {str(k): str(v) for k, v in about["identity"].items()}, tuple(facts), tuple(deviations), tables, str(about["command"]),
+    )  # fmt: skip
+
+
+def _weight(case: dict[str, Any]) -> Weight:
+    """How much a failed case weighs: as its file says, or as its case says where the file is older than that (version 1)."""
+    said = case.get("basis") or bases().get(str(case["id"]), Basis.STANDARD.value)
+    weights: dict[str, Weight] = {Basis.ROBUSTNESS.value: "robustness", Basis.FIELD.value: "field problem"}
+    return weights.get(said, "deviation")
+
+
+@cache
+def bases() -> dict[str, str]:
+    """Case id -> the value of its basis, for all cases for devices."""
+    from fieldtwin.conformance.devices.canopen import cases as canopen_cases
+    from fieldtwin.conformance.devices.modbus import cases as modbus_cases
+
+    found = {case.id: case.basis.value for case in modbus_cases.CASES}
+    return found | {case.id: case.basis.value for case in canopen_cases.CASES}
+
+
+def _case(case: dict[str, Any], weight: Weight) -> Deviation:
+    what, expected, found, where, source = (str(case[key]) for key in ("title", "expected", "reason", "id", "clause"))
+    return Deviation(weight, what, expected, found, where, source)
+
+
+# -- comparisons and differences -------------------------------------------------------------------------------------------
+
+
+def compare_piece(data: dict[str, Any]) -> Piece:
+    """The JSON of `fieldtwin compare`: a device against a recording."""
+    about, found = data["about"], data["differences"]
+    alike_ones: dict[tuple[str, ...], list[dict[str, Any]]] = {}
+    for each in found:
+        alike_ones.setdefault((each["what"], each["where"], each["request"]), []).append(each)
+    deviations = [_difference(same) for same in list(alike_ones.values())[:MOST_ROWS]]
+    if len(alike_ones) > MOST_ROWS:
+        more = f"{len(alike_ones) - MOST_ROWS} more kinds, in the file"
+        deviations.append(Deviation("deviation", "further differences", "none", more))
+    slow = [row for row in data["latency"] if not row["alike"]]
+    deviations += [
+        Deviation("deviation", "latency differs", _ms(row["recorded_s"]), _ms(row["other_s"]), str(row["service"]))
+        for row in slow
+    ]
+    unjudged = int(data.get("not_compared", 0))
+    if unjudged:
+        where = "the recording has no values at the position at which the dialogue continued it"
+        deviations.append(
+            Deviation("open", "not everything was compared", "all exchanges", f"{unjudged} not compared", source=where)
+        )
+    alike, timing = f"{100 * data['values']:.2f} %", data["timing"]
+    facts = [
+        ("against", str(about["against"])),
+        ("compared", f"{data['compared']} exchanges, {data['left_out']} left out, {unjudged} not compared"),
+        ("values", f"{alike} alike, {100 * data['least']:g} % asked for"),
+        ("timing", "not judged" if timing is None else f"{100 * timing:.1f} %"),
+    ]
+    latency = [(r["service"], r["count"], _ms(r["recorded_s"]), _ms(r["other_s"])) for r in data["latency"]]
+    tables = (_table("Latency: median, 90 %, 99 %", ("function", "exchanges", "recorded", "this one"), latency),)
+    summary = f"{data['compared']} exchanges, {alike} alike"
+    if data["met"]:  # what is allowed by the share that was asked for is no deviation
+        deviations = [
+            replace(d, weight="waived", found=f"{d.found}; within the share that was asked for") for d in deviations
+        ]
+    verdict = "met" if data["met"] else "inconclusive" if data.get("inconclusive") else "not met"
+    return _headed("comparison", about, verdict, summary, facts, deviations, tables)
+
+
+def _difference(same: list[dict[str, Any]]) -> Deviation:
+    """What differed in one place, however often: the first time as an example."""
+    first = same[0]
+    what, request, recorded, other, where = (str(first[k]) for k in ("what", "request", "recorded", "other", "where"))
+    often = f", {len(same)} times, first" if len(same) > 1 else ","
+    source = f"{request}{often} at {first['t_s']:.1f} s"
+    return Deviation("deviation", f"{what} differs", recorded, other, where, source)
+
+
+def _ms(quantiles: list[float]) -> str:
+    return ", ".join(f"{1000 * s:.1f}" for s in quantiles) + " ms"
+
+
+def diff_piece(data: dict[str, Any]) -> Piece:
+    """The JSON of `fieldtwin diff`: a dump against another one, or against a profile or an EDS."""
+    about, found = data["about"], data["found"]
+    deviations = [
+        Deviation("deviation", f"{d['name']}: {d['kind']}", str(d["right"]), str(d["left"]), str(d["at"]))
+        for d in found[:MOST_ROWS]
+    ]
+    if len(found) > MOST_ROWS:
+        deviations.append(
+            Deviation("deviation", "further differences", "none", f"{len(found) - MOST_ROWS} more, in the file")
+        )
+    facts = [("against", str(about["against"])), ("compared", f"{data['compared']} values")]
+    tables = (_table("Notes", ("note",), [(note,) for note in data["notes"]]),)
+    summary = f"{data['compared']} compared, {len(found)} different"
+    return _headed("difference", about, "different" if found else "same", summary, facts, deviations, tables)
+
+
+def _headed(
+    kind: Kind,
+    about: dict[str, Any],
+    verdict: str,
+    summary: str,
+    facts: list[tuple[str, str]],
+    deviations: list[Deviation],
+    tables: tuple[Table, ...],
+) -> Piece:
+    """A piece of what `about.headed` stands above."""
+    where = str(about["endpoint"]) or str(about["device"])
+    return Piece(
+        kind, str(about["protocol"]), int(about["address"]), where, str(about["started"]), str(about["by"]), verdict, summary,
+        {}, tuple(facts), tuple(deviations), tables, str(about["command"]),
+    )  # fmt: skip
+
+
+def _table(title: str, columns: tuple[str, ...], rows: list[tuple[Any, ...]]) -> Table:
+    shown = tuple(tuple(str(text) for text in row) for row in rows[:MOST_ROWS])
+    return Table(title, columns, shown, max(0, len(rows) - MOST_ROWS))
+
+
+READERS: dict[str, Callable[[dict[str, Any]], Piece]] = {
+    "fieldtwin check": check_piece,
+    "fieldtwin compare": compare_piece,
+    "fieldtwin diff": diff_piece,
+}

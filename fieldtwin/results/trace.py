@@ -1,0 +1,180 @@
+"""The events of a run, in order: frames, values, states, faults, steps. Checks listen to the trace, and reports draw
+it.
+
+Times are ns since the run's start, so that two runs can be compared. Events are plain data; their readers do not depend
+on their sources.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections import deque
+from collections.abc import Callable, Mapping
+from enum import Enum
+from pathlib import Path
+from typing import Any, BinaryIO, NamedTuple
+
+import msgspec
+
+from fieldtwin.gateway.core.errors import FileInvalid
+
+CAPACITY = 200_000
+_AT_ONCE = 256
+"""Events that are encoded and hashed together: one at a time takes three times as long."""
+FAR_END = "far end"
+
+
+class Kind(Enum):
+    """The kind of an event, with the meaning of its `where` and `data`.
+
+    FRAME   a bus           ``dir`` sent | received (as the gateway sees it), ``bytes`` hex; on CAN also ``id``, and ``rtr``,
+                            ``ext``, ``err`` where they are set. Bytes of a stream are divided as the medium delivered them
+    TAG     a tag           ``value``, ``quality``, ``reason``: what the gateway publishes
+    STATE   PROGRAM.VARIABLE  ``value``: an output or local of a program that changed
+    FAULT   a fault's id    ``name``, ``on`` true | false, ``target``; ``said``, as in a fault file, while on
+    STEP    a step's number ``text``, ``verdict`` once it has one
+    REFUSED  DEVICE.TAG     a write that did not reach its device: ``value``, ``cause``, ``reason``, ``by``, ``program``,
+                            ``place`` (FILE:LINE of the program), ``fault`` program | device | "" (by design, or tried again)
+    NOTE    its author      ``text``; of the remote client (`FAR_END`) ``period_s``, when it commands one
+    """
+
+    FRAME = "frame"
+    TAG = "tag"
+    STATE = "state"
+    FAULT = "fault"
+    STEP = "step"
+    REFUSED = "refused"
+    NOTE = "note"
+
+
+class Event(NamedTuple):
+    """One event, `t_ns` after the run's start."""
+
+    t_ns: int
+    kind: Kind
+    where: str
+    data: dict[str, Any]
+
+
+_Noted = tuple[int, Kind, str, dict[str, Any]]
+"""An event's fields."""
+
+
+class Trace:
+    """The latest `capacity` events, the hash of all, and the listeners. `sink`: a file that takes every event as a JSON
+    line.
+
+    Hash and sink get events in blocks: `hexdigest` covers all events, the sink has all after `flush` or `close`.
+    """
+
+    def __init__(self, capacity: int = CAPACITY, sink: BinaryIO | None = None) -> None:
+        self._kept: deque[_Noted] = deque(maxlen=capacity)
+        self._told: dict[str, list[Callable[[Event], None]]] = {kind.value: [] for kind in Kind}
+        self._hash = hashlib.sha256()
+        self._hashed = 0
+        self._pending: list[_Noted] = []
+        """Events that are neither hashed nor in the sink yet."""
+        self._sink = sink
+        self._encode_lines = msgspec.json.Encoder(order="sorted").encode_lines
+
+    @property
+    def events(self) -> list[Event]:
+        """The latest events, oldest first."""
+        return [Event(*noted) for noted in self._kept]
+
+    @property
+    def count(self) -> int:
+        """Number of events so far."""
+        return self._hashed + len(self._pending)
+
+    @property
+    def dropped(self) -> int:
+        """Number of events that are no longer in memory; the hash and the sink have them."""
+        return self.count - len(self._kept)
+
+    def listen(self, listener: Callable[[Event], None], *kinds: Kind) -> None:
+        """Call `listener` from now on with each event, or with each event of these kinds, after the listeners that
+        registered before. It must not raise."""
+        for kind in kinds or Kind:
+            self._told[kind.value].append(listener)
+
+    def note(self, t_ns: int, kind: Kind, where: str, data: dict[str, Any]) -> None:
+        """Add an event. `data` must be JSON data that is not changed afterwards."""
+        noted = t_ns, kind, where, data  # a tuple: an `Event` is made only for listeners, as there are millions
+        self._kept.append(noted)
+        self._pending.append(noted)
+        if len(self._pending) >= _AT_ONCE:
+            self.flush()
+        if self._told[kind._value_]:  # `value` goes through a descriptor, a Kind's hash through Python: slow
+            self.tell(t_ns, kind, where, data)
+
+    def tell(self, t_ns: int, kind: Kind, where: str, data: dict[str, Any]) -> None:
+        """Call the listeners with an event, in the order of their registration."""
+        event = Event(t_ns, kind, where, data)
+        for listener in self._told[kind._value_]:
+            listener(event)
+
+    def hexdigest(self) -> str:
+        """Return the SHA-256 of every event so far."""
+        self.flush()
+        return self._hash.hexdigest()
+
+    def flush(self) -> None:
+        """Hash pending events, and write them to the sink."""
+        pending, self._pending = self._pending, []
+        lines = self._encode_lines(pending)
+        self._hashed += len(pending)
+        self._hash.update(lines)
+        if self._sink is not None:
+            self._sink.write(lines)
+
+    def close(self) -> None:
+        """Write pending events to the sink and close it. Closing twice does nothing."""
+        if self._sink is None:
+            return
+        try:
+            self.flush()
+        finally:
+            self._sink.close()
+            self._sink = None
+
+
+REFUSAL_KEYS = ("value", "cause", "reason", "by", "program", "place", "fault")
+"""The keys in the data of a REFUSED event, from an entry of the gateway's journal
+(`fieldtwin.gateway.runtime.outputs.refusals.Refusal`)."""
+
+
+def refusal_data(described: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the data of a REFUSED event from a journal entry as plain data.
+
+    Its value is that of the entry's first refusal.
+    """
+    return {key: described["first" if key == "value" else key] for key in REFUSAL_KEYS}
+
+
+def refusal_text(where: str, data: Mapping[str, Any]) -> str:
+    """Return a REFUSED event, or a journal entry, in one line: tag, value, requester, reason, line of the program."""
+    by = "" if data.get("by") == "plc" else f" (asked by {data.get('by')})"
+    at = ", ".join(part for part in (data.get("program"), data.get("place")) if part)
+    said = (
+        f"{where} = {_shown(data.get('first', data.get('value')))} did not reach the device{by}: {data.get('reason')}"
+    )
+    times = f"; {data['count']} times" if data.get("count", 1) > 1 else ""
+    return f"{said}{times}" + (f" ({at})" if at else "")
+
+
+def _shown(value: Any) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def read_trace(lines: list[bytes]) -> list[Event]:
+    """Return the events that were written to a sink."""
+    return [Event(t, Kind(kind), where, data) for t, kind, where, data in map(msgspec.json.decode, lines)]
+
+
+def open_sink(path: Path) -> BinaryIO:
+    """Open the file for a trace; an older one is overwritten. Raises `FileInvalid` if it cannot be written."""
+    try:
+        return path.open("wb")
+    except OSError as e:
+        raise FileInvalid(f"cannot write the trace: {e.strerror or e}", path=str(path)) from e

@@ -1,0 +1,1 @@
+"""Everything that runs a system: processes, live runs, virtual time, scenario targets, campaigns, shadows and what-if."""

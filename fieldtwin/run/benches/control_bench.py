@@ -1,0 +1,473 @@
+"""The bench of a scenario for a system that runs in processes, reached by control channels, process image and capture file.
+
+This is a `fieldtwin.scenarios.bench.Bench` for the targets `local`, `compose` and `real`. Its abilities depend on the
+parts that it can reach: without field simulator it has no faults, without capture it cannot see frames. It starts and
+ends only its own connections. Where no fieldtwin gateway runs, a scenario that uses only probes tests a third-party
+controller with the field simulator alone.
+
+Everything that a scenario puts into the simulated devices is under a lease (`FieldLease`): it is removed when the bench
+is left, and also when this process is killed.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from collections import deque
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from fieldtwin.conformance.core.case import Danger
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.concurrency.async_resource import Started
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
+from fieldtwin.gateway.core.control import ControlClient, RemoteError
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import FieldtwinError, Unreachable, UsageError
+from fieldtwin.gateway.core.image.image import OUTPUTS
+from fieldtwin.gateway.core.image.region import RegionReader
+from fieldtwin.gateway.wallclock import WallClock
+from fieldtwin.results.fault_counts import struck_of
+from fieldtwin.results.model import Struck
+from fieldtwin.results.trace import FAR_END, Event, Kind, Trace, refusal_data
+from fieldtwin.run.benches.capture_tail import CaptureTail
+from fieldtwin.run.benches.field_lease import FieldLease
+from fieldtwin.run.benches.fresh_start import make_fresh, programs_scan
+from fieldtwin.run.benches.host_lateness import HostLateness
+from fieldtwin.run.benches.probes import Probes
+from fieldtwin.run.processes.field_contact import check_same, connect_control, reachable
+from fieldtwin.run.processes.states import state_words
+from fieldtwin.run.processes.topside import Shore
+from fieldtwin.run.processes.with_program import environment_from
+from fieldtwin.scenarios.bench import Can, Reading, Stopped, variable
+from fieldtwin.scenarios.language.probe_form import Probe
+from fieldtwin.twin.plant.physical import attached, gateway_lost_ms, image_layout
+from fieldtwin.twin.site.system import System
+
+PLC_EVERY_S = 0.25
+STARTING_S = 5.0
+"""Time in seconds in which a PLC may start and receive the gateway's first heartbeat."""
+HELD_KEPT = 20_000
+SERVED_WITHIN_S = 5.0
+SERVED_LOOK_S = 0.005
+
+
+@dataclass(frozen=True)
+class Where:
+    """The access to a running system.
+
+    `run_dir` is its run directory on this host. `field_host` is its field simulator, ``HOST[:PORT]`` with a token, or
+    empty for the one in the run directory. `far` is its remote end, if no field simulator reports it. `capture` is the
+    capture file of its buses.
+    """
+
+    run_dir: Path
+    field_host: str = ""
+    token: str = field(default="", repr=False)
+    field_socket: Path | None = None
+    """The Unix socket of a field simulator on this host, if it is not in the run directory."""
+    far: str = ""
+    capture: Path | None = None
+    plant: bool = False
+    """No device is emulated: no faults and no values are put in, whatever else is reachable."""
+    own: bool = False
+    """The system was started for this scenario alone, so it is fresh."""
+    foreign: bool = False
+    """The controller is a user's program: there is no fieldtwin gateway to query."""
+    env: Mapping[str, str] = field(default_factory=dict)
+    """The environment variables that tell that program the endpoints; endpoints of probes may refer to them."""
+    allowed: Danger = Danger.DISRUPT
+
+
+class ControlBench(Started):
+    """A bench: ``async with ControlBench(system, where, trace, target="local", names=[...]) as bench``.
+
+    `names` are the tags and variables to read. `fresh` is called with the bench's abilities and returns whether the
+    system is to be reset before the scenario begins. `gone` returns the reason why the system has ended, or None.
+    """
+
+    def __init__(
+        self,
+        system: System,
+        where: Where,
+        trace: Trace,
+        *,
+        target: str,
+        names: Collection[str],
+        probes: Sequence[Probe] = (),
+        fresh: Callable[[frozenset[Can]], bool] = lambda can: False,
+        gone: Callable[[], FieldtwinError | None] = lambda: None,
+    ) -> None:
+        super().__init__()
+        self.system = system
+        self.trace = trace
+        self.target = target
+        self.allowed = where.allowed
+        self.can: frozenset[Can] = frozenset()
+        self._where = where
+        self._names = list(names)
+        self._fresh = fresh
+        self._gone = gone
+        self._env: dict[str, str] = {}
+        """The endpoints of the simulated devices, to which endpoints of probes may refer."""
+        self.lease: FieldLease | None = None
+        self._clock = WallClock()
+        self._start_ns = self._clock.monotonic_ns()
+        self._gateway: ControlClient | None = None
+        self._plc: ControlClient | None = None
+        self._field: ControlClient | None = None
+        self._shore: Shore | None = None
+        self._outputs: RegionReader | None = None
+        self._tail: CaptureTail | None = None
+        self._probe = probes
+        self._probes: Probes | None = None
+        self._tags: dict[str, list[Any]] = {}
+        self._asked: list[str] = []
+        self._seen_ns = 0
+        self._since = 0
+        self._refused = 0
+        """The newest refusal that was seen, by its number in the gateway's journal."""
+        self._updates: dict[str, int] = {}
+        self._states: dict[str, Any] = {}
+        self._words: dict[str, dict[int, str]] = {}
+        self._plc_due_s = 0.0
+        self._stopped: Stopped | None = None
+        self._fault_numbers: set[int] = set()
+        """The field simulator's numbers of the faults that this bench put in."""
+        self._not_started = ""
+        self._gateway_seen = False
+        self._worst_us = -1.0
+        self._overruns = -1
+        self._late_ms = 0.0
+        self._lateness = HostLateness()
+        self._held: dict[str, deque[tuple[float, bytes]]] = {}
+        self._held_since: dict[str, int] = {}
+
+    async def _start(self) -> None:
+        where = self._where
+        if not self._foreign():
+            await self._open_controller()
+        can = {Can.FRESH_START} if where.own else set()
+        if not where.plant:
+            await self._open_field()
+        if self._field is not None:
+            can |= {Can.INJECT_FAULT, Can.SET_VALUE, Can.SEE_HELD} | (
+                {Can.FRESH_START} if self._plc is not None else set()
+            )
+        far = Endpoint.parse(where.far) if where.far else await self._far_of_field()
+        device = next((d.name for d in self.system.devices.values() if d.profile.inbox is not None), None)
+        if far is not None and device is not None and where.allowed.rank >= Danger.WRITE.rank:
+            can.add(Can.SEND_COMMAND)
+        can |= {Can.SEE_WIRE} if where.capture is not None else set()
+        can |= {Can.PROBE} if self._probe else set()
+        self.can = frozenset(can)
+        nursery = await self._stack.enter_async_context(Nursery())
+        await self._open_lease(nursery)
+        if not where.own and self._fresh(self.can):
+            assert self._gateway is not None
+            assert self._plc is not None
+            assert self.lease is not None
+            await make_fresh(self.lease, self._gateway, self._plc)
+        if far is not None and device is not None and Can.SEND_COMMAND in self.can:
+            self._shore = Shore(self.system, device, far, self._clock)
+            self._shore.on_send = self._commanded
+            nursery.start(self._shore.run([]), "far end")
+        if where.capture is not None:
+            self._tail = CaptureTail(where.capture, self.system)
+            self._stack.callback(self._tail.close)
+        if self._probe:
+            served = {probe.serve: await self._served(probe.serve) for probe in self._probe if probe.serve}
+            probes = [probe.at({**os.environ, **self._env}) for probe in self._probe]
+            self._probes = Probes(probes, self._clock, served.__getitem__)
+            nursery.start(self._probes.run(), "probes")
+        if where.own and self._plc is not None:  # a short scenario would end before the programs had their first inputs
+            await programs_scan(self._plc)
+        self._start_ns = self._clock.monotonic_ns()
+        await self._refresh()
+        self._updates.clear()
+
+    async def _open_lease(self, nursery: Nursery) -> None:
+        """Open the lease, which limits the lifetime of everything that the bench puts into the simulated devices."""
+        if self._field is None:
+            return
+        self.lease = FieldLease(await self._connect_field())
+        await self.lease.open()
+        self._stack.push_async_callback(self.lease.release)
+        nursery.start(self.lease.run(), "lease")
+
+    def _foreign(self) -> bool:
+        """True where no fieldtwin gateway runs on this instance and the scenario queries none."""
+        if self._where.foreign:
+            return True
+        probed = {name for probe in self._probe for name in probe.names}
+        asked = any(probe.serve for probe in self._probe) or not probed.issuperset(self._names)
+        return (
+            bool(probed) and not asked and not self._where.plant and not (self._where.run_dir / "gateway.sock").exists()
+        )
+
+    async def _open_controller(self) -> None:
+        where, layout = self._where, image_layout(self.system)
+        self._gateway = await self._connect("gateway")
+        self._plc = await self._connect("plc")
+        known = set((await self._gateway.call("get"))["tags"])
+        self._asked = [name for name in self._names if name in known]
+        image = self._stack.enter_context(attached(layout, where.run_dir / "image"))
+        self._outputs = image.reader(OUTPUTS)
+        self._words = {f"{p}.state": w for p, w in state_words(layout, self.system.plc.programs).items()}
+
+    async def _connect_field(self) -> ControlClient:
+        """Open another connection to the field simulator."""
+        if not self._where.field_host:
+            return await self._connect_unix(self._field_socket)
+        client, _ = await connect_control(self._where.field_host, self._where.token)
+        self._stack.push_async_callback(client.aclose)
+        return client
+
+    async def _connect(self, name: str) -> ControlClient:
+        return await self._connect_unix(self._where.run_dir / f"{name}.sock")
+
+    async def _connect_unix(self, path: Path) -> ControlClient:
+        client = await ControlClient.connect_unix(path)
+        self._stack.push_async_callback(client.aclose)
+        return client
+
+    @property
+    def _field_socket(self) -> Path:
+        return self._where.field_socket or self._where.run_dir / "field.sock"
+
+    async def _open_field(self) -> None:
+        if self._where.field_host or self._where.field_socket or self._field_socket.exists():
+            self._field = await self._connect_field()
+            status = await self._field.call("get")
+            check_same(self.system, status)
+            self._env = {**environment_from(status, self.system, self._field_at, self._field_socket), **self._where.env}
+
+    async def _served(self, name: str) -> Endpoint:
+        """Return the endpoint at which the gateway serves `name` of the system file; wait until it does."""
+        assert self._gateway is not None
+        until_s = self.now_s() + SERVED_WITHIN_S
+        while not (listening := (await self._gateway.call("get"))["serve"][name]["listening"]):
+            if self.now_s() > until_s:
+                raise Unreachable(f"the gateway does not serve {name!r}")
+            await asyncio.sleep(SERVED_LOOK_S)
+        return Endpoint.parse(listening)
+
+    async def _far_of_field(self) -> Endpoint | None:
+        if self._field is None:
+            return None
+        far = (await self._field.call("get"))["far"]
+        return next((reachable(Endpoint.parse(url), self._field_at) for url in far.values()), None)
+
+    @property
+    def _field_at(self) -> str:
+        """The host of the field simulator."""
+        return self._where.field_host.rpartition(":")[0] or self._where.field_host or "localhost"
+
+    # -- Bench ----------------------------------------------------------------------------------------------------------
+
+    def now_s(self) -> float:
+        return (self._clock.monotonic_ns() - self._start_ns) / NS_PER_S
+
+    async def sleep_until_s(self, t_s: float) -> None:
+        """Sleep until `t_s`. Raises the reason if the system has ended."""
+        before_s = self.now_s()
+        await asyncio.sleep(max(0.0, t_s - before_s))
+        asked_s, slept_s = max(t_s, before_s), self.now_s()
+        self._lateness.slept(slept_s, slept_s - asked_s)
+        await self._refresh()
+        now_s = self.now_s()
+        self._lateness.waited(now_s, now_s - asked_s)
+
+    def names(self) -> list[str]:
+        return list(self._names)
+
+    def reading(self, name: str) -> Reading | None:
+        if self._probes is not None and name in self._probes.names:
+            return self._probes.reading(name)
+        if name in self._asked:
+            value, quality, reason, t_ns = self._tags[name]
+            if value is None and not self._updates.get(name):
+                return None
+            age_s = (self._seen_ns - t_ns) / NS_PER_S if t_ns else float("inf")
+            return Reading(value, quality, reason.replace(" ", "_"), age_s, self._updates.get(name, 0))
+        if name not in self._names:
+            raise UsageError(f"no tag or variable {name!r}", expected="DEVICE.TAG or PROGRAM.VARIABLE")
+        value = self._states.get(name)
+        return None if value is None else variable(value, runs=self._stopped is None)
+
+    def why_unknown(self, name: str) -> str:
+        return self._probes.why_unknown(name) if self._probes is not None else ""
+
+    def stopped(self) -> Stopped | None:
+        return self._stopped
+
+    def not_started(self) -> str:
+        return self._not_started
+
+    def late_ms(self) -> float:
+        if self._plc is None:
+            raise UsageError("nobody can tell how late the scans of somebody else's controller are", where="plc.late")
+        return self._late_ms
+
+    def host_late_s(self, since_s: float) -> float:
+        return self._lateness.longest_s(since_s)
+
+    def host_late_total_s(self, since_s: float) -> tuple[float, float]:
+        return self._lateness.own_s(since_s), self._lateness.any_s(since_s)
+
+    async def send(self, period_s: int) -> None:
+        if self._shore is None:
+            raise UsageError("nobody can command this system", expected="a transmitter with a far end")
+        self._shore.send(period_s)
+
+    async def set_value(self, device: str, tag: str, value: float | str | bool | None) -> None:
+        answer = await self._put("set", device=device, tag=tag, value=value)
+        if value is not None:
+            self._fault_numbers.add(answer["number"])
+
+    async def inject(self, fault: dict[str, Any]) -> None:
+        answer = await self._put("fault", fault=fault, start_ns=self._start_ns)
+        self._fault_numbers.add(answer["number"])
+        target = fault.get("device") or fault.get("bus") or ""
+        self._note(Kind.FAULT, answer["id"], {"name": fault["name"], "on": True, "target": target, "said": fault})
+
+    async def struck(self) -> list[Struck]:
+        if not self._fault_numbers:
+            return []
+        told = (await self._to_field("get"))["struck"]
+        return [struck_of(one) for one in told if one["number"] in self._fault_numbers]
+
+    async def clear(self, id: str) -> None:
+        await self._to_field("clear", id=id)
+        self._note(Kind.FAULT, id, {"name": "", "on": False, "target": ""})
+
+    async def held(self, name: str) -> list[tuple[float, bytes]]:
+        """Return the values that a device held.
+
+        All processes share the host's clock: `compose` is tested on the host of its containers.
+        """
+        device = name.partition(".")[0]
+        while True:
+            answer = await self._to_field("held", since={device: self._held_since.get(device, 0)})
+            entries = answer.get(device, [])
+            for number, tag, raw, t_ns in entries:
+                kept = self._held.setdefault(f"{device}.{tag}", deque(maxlen=HELD_KEPT))
+                kept.append(((t_ns - self._start_ns) / NS_PER_S, bytes.fromhex(raw)))
+                self._held_since[device] = number
+            if not entries:
+                return list(self._held.get(name, ()))
+
+    async def _put(self, verb: str, **args: Any) -> Any:
+        """Put something into the simulated devices, under the lease."""
+        if self.lease is None:
+            raise UsageError("there are no simulated field devices", expected="a prototype")
+        return await self.lease.call(verb, **args)
+
+    async def _to_field(self, verb: str, **args: Any) -> Any:
+        if self._field is None:
+            raise UsageError("there is no emulated field", expected="a prototype")
+        try:
+            return await self._field.call(verb, **args)
+        except RemoteError as e:
+            if e.remote_exit_code == UsageError.exit_code:
+                raise UsageError(str(e)) from e
+            raise
+
+    # -- events -------------------------------------------------------------------------------------------------------
+
+    def _note(self, kind: Kind, where: str, data: dict[str, Any]) -> None:
+        self.trace.note(round(self.now_s() * NS_PER_S), kind, where, data)
+
+    def _commanded(self, period_s: int) -> None:
+        self._note(Kind.NOTE, FAR_END, {"text": f"commands {period_s} s", "period_s": period_s})
+
+    async def _refresh(self) -> None:
+        gone = self._gone() or (self.lease.lost if self.lease is not None else None)
+        if gone is not None:
+            raise gone
+        events = await self._changed_tags() + self._changed_states()
+        if self._probes is not None:
+            events += self._probes.changes(self._start_ns)
+        if self._tail is not None:
+            events += self._tail.read(self._start_ns)
+        for event in sorted(events, key=lambda e: e.t_ns):
+            if event.t_ns >= 0:
+                self.trace.note(*event)
+        if self._plc is not None and self.now_s() >= self._plc_due_s:
+            await self._ask_plc()
+
+    async def _changed_tags(self) -> list[Event]:
+        if self._gateway is None:
+            return []
+        answer = await self._gateway.call("watch", since=self._since, names=self._asked, refused=self._refused)
+        self._tags, self._seen_ns = answer["tags"], answer["now_ns"]
+        events = []
+        for entry in answer["refusals"]:
+            self._refused = entry["number"]
+            t_ns = entry["t_ns"] - self._start_ns
+            if t_ns >= 0 or self.target == "local" or entry["standing"]:  # before: of this run, or refused now as well
+                events.append(Event(max(0, t_ns), Kind.REFUSED, entry["tag"], refusal_data(entry)))
+        for number, t_ns, tag, value, quality, reason in answer["changes"]:
+            self._since = number
+            self._updates[tag] = self._updates.get(tag, 0) + 1
+            data = {"value": value, "quality": quality, "reason": reason.replace(" ", "_")}
+            events.append(Event(t_ns - self._start_ns, Kind.TAG, tag, data))
+        return events
+
+    def _changed_states(self) -> list[Event]:
+        """Return the changes of programs' states since the last call; a value between two calls may be missed."""
+        if self._outputs is None:
+            return []
+        snapshot = self._outputs.snapshot()
+        if snapshot.stopped and self._stopped is None:
+            self._plc_due_s = 0.0  # query the reason of the stop at once
+        if not snapshot.counter:
+            return []
+        events = []
+        for name, value in snapshot.all().items():
+            shown: Any = value.value.hex() if isinstance(value.value, bytes) else value.value
+            shown = self._words[name].get(shown, shown) if name in self._words else shown
+            if name not in self._states or self._states[name] != shown:
+                self._states[name] = shown
+                events.append(Event(snapshot.t_ns - self._start_ns, Kind.STATE, name, {"value": shown}))
+        return events
+
+    async def _ask_plc(self) -> None:
+        """Query the lateness of scans since the last query: a new maximum, or an overrun of the limit."""
+        assert self._plc is not None
+        told = await self._plc.call("get", brief=True)
+        self._stopped = self._what_stopped(told)
+        waiting = told.get("waiting", {})  # an older PLC has none
+        self._not_started = "; ".join(f"program {name} waits for {start['reason']}" for name, start in waiting.items())
+        tasks = told["tasks"].values()
+        worst_us = max(task["lateness_us"]["max"] for task in tasks)
+        overruns = sum(task["overruns"] for task in tasks)
+        if self._overruns >= 0:
+            limit_ms = float(self.system.plc.watchdog.late_ms) if overruns > self._overruns else 0.0
+            self._late_ms = max(worst_us / 1000 if worst_us > self._worst_us else 0.0, limit_ms)
+            if overruns > self._overruns:
+                self._lateness.waited(self.now_s(), max(self._late_ms, limit_ms) / 1000)
+        self._worst_us, self._overruns = worst_us, overruns
+        self._plc_due_s = self.now_s() + PLC_EVERY_S
+        if self._field is not None:
+            await self._field.call("ready")  # raises if the field simulator is gone
+
+    def _what_stopped(self, told: dict[str, Any]) -> Stopped | None:
+        """Return the stopped part according to the PLC's status: the PLC itself, or the gateway, whose heartbeat it monitors."""
+        starting = self.now_s() < STARTING_S
+        state, late_s = told["state"], float(self.system.plc.watchdog.late_ms) / 1000
+        if state == "stopped":
+            watchdog = told["stop_reason"] == "watchdog"
+            what = f"the PLC stopped ({told['stop_reason']}): {told['error'] or 'on request'}"
+            return Stopped("plc", what, told.get("error_at", ""), late_s if watchdog else 0.0)
+        if state == "paused" or (state == "ready" and not starting):
+            return Stopped("plc", "the PLC is paused" if state == "paused" else "the PLC was not started")
+        if state == "waiting" and told["error"]:  # its time is over
+            return Stopped("plc", told["error"])
+        self._gateway_seen |= told["gateway_alive"]
+        if told["gateway_alive"] or (starting and not self._gateway_seen):
+            return None
+        what = "the PLC does not see the gateway's heartbeat"
+        return Stopped("gateway", what, bound_s=gateway_lost_ms(self.system) / 1000)

@@ -1,0 +1,174 @@
+"""A scenario's bench for several running systems and the acoustic channel between them. Names are ``SYSTEM.DEVICE.TAG``.
+
+Each system has its own bench, which does not know the other systems; this bench passes each query on by name and merges
+their events into one trace. It starts and ends nothing: its creator does that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+from fieldtwin.conformance.core.case import Danger
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.results.fault_counts import struck_of
+from fieldtwin.results.model import Struck
+from fieldtwin.results.trace import Kind, Trace
+from fieldtwin.run.processes.topside import Shore
+from fieldtwin.scenarios.bench import Bench, Can, Reading, Stopped
+from fieldtwin.twin.network.faults import placed
+from fieldtwin.twin.network.network import WATER, Network
+from fieldtwin.twin.network.water_faults import WaterFaults
+
+
+class MemberTrace(Trace):
+    """The events of one system's bench, under its name in the common trace.
+
+    `later_ns`: its start after that of the first system.
+    """
+
+    def __init__(self, whole: Trace, member: str, later_ns: Callable[[], int]) -> None:
+        super().__init__(0)
+        self._later_ns = later_ns
+        self._whole = whole
+        self._prefix = f"{member}."
+
+    @property
+    def offset_ns(self) -> int:
+        return self._later_ns()
+
+    def note(self, t_ns: int, kind: Kind, where: str, data: dict[str, Any]) -> None:
+        if kind is Kind.FAULT:
+            if data.get("target"):
+                data = {**data, "target": self._prefix + data["target"]}
+        else:
+            self.tell(t_ns, kind, where, data)
+            where = self._prefix + where
+        self._whole.note(t_ns + self.offset_ns, kind, where, data)
+
+
+@dataclass
+class Part:
+    """One system of the network: its bench, and where that notes."""
+
+    bench: Bench
+    trace: MemberTrace
+
+
+class NetworkBench:
+    """A `fieldtwin.scenarios.bench.Bench`.
+
+    `parts` by the names of the network's members; `shore` sends from the topside modem.
+    """
+
+    def __init__(self, network: Network, trace: Trace, target: str, faults: WaterFaults) -> None:
+        self.network = network
+        self.trace = trace
+        self.target = target
+        self.allowed = Danger.DISRUPT
+        self.parts: dict[str, Part] = {}
+        self.shore: Shore | None = None
+        self.faults = faults
+        self._where: dict[str, str] = {}
+        """For each fault: its system, or the acoustic channel."""
+
+    @property
+    def can(self) -> frozenset[Can]:
+        """The abilities that all parts have; commands come from the topside modem."""
+        can = frozenset.intersection(*(part.bench.can for part in self.parts.values())) - {Can.SEND_COMMAND, Can.PROBE}
+        return can | ({Can.SEND_COMMAND} if self.shore is not None else frozenset())
+
+    def _part(self, name: str) -> tuple[Part, str]:
+        member, local = self.network.split(name)
+        return self.parts[member], local
+
+    def now_ns(self) -> int:
+        """Return the time since the start."""
+        return round(self.now_s() * NS_PER_S)
+
+    # -- Bench ----------------------------------------------------------------------------------------------------------
+
+    def now_s(self) -> float:
+        """Return the time of the first system, which began first."""
+        return next(iter(self.parts.values())).bench.now_s()
+
+    async def sleep_until_s(self, t_s: float) -> None:
+        for part in self.parts.values():  # after the first, the others no longer wait but read at once
+            await part.bench.sleep_until_s(t_s - part.trace.offset_ns / NS_PER_S)
+
+    def names(self) -> list[str]:
+        return [f"{member}.{name}" for member, part in self.parts.items() for name in part.bench.names()]
+
+    def reading(self, name: str) -> Reading | None:
+        part, local = self._part(name)
+        return part.bench.reading(local)
+
+    def why_unknown(self, name: str) -> str:
+        part, local = self._part(name)
+        return part.bench.why_unknown(local)
+
+    def stopped(self) -> Stopped | None:
+        for member, part in self.parts.items():
+            if (stopped := part.bench.stopped()) is not None:
+                return replace(stopped, what=f"{member}: {stopped.what}")
+        return None
+
+    def not_started(self) -> str:
+        told = {member: part.bench.not_started() for member, part in self.parts.items()}
+        return "; ".join(f"{member}: {text}" for member, text in told.items() if text)
+
+    def late_ms(self) -> float:
+        return max(part.bench.late_ms() for part in self.parts.values())
+
+    def host_late_s(self, since_s: float) -> float:
+        return max(part.bench.host_late_s(since_s - part.trace.offset_ns / NS_PER_S) for part in self.parts.values())
+
+    def host_late_total_s(self, since_s: float) -> tuple[float, float]:
+        """Return the first part's lateness: only its bench sleeps, for all systems."""
+        told = [p.bench.host_late_total_s(since_s - p.trace.offset_ns / NS_PER_S) for p in self.parts.values()]
+        return told[0][0], max(any_s for _, any_s in told)
+
+    async def send(self, period_s: int) -> None:
+        if self.shore is None:
+            raise UsageError("nobody can command this network", expected="`ship:` in its file")
+        self.shore.send(period_s)
+
+    async def set_value(self, device: str, tag: str, value: float | str | bool | None) -> None:
+        part, local = self._part(device)
+        await part.bench.set_value(local, tag, value)
+
+    async def inject(self, fault: dict[str, Any]) -> None:
+        where, local = placed(self.network, fault)
+        if where == WATER:
+            id = self.faults.inject(fault)
+            self._where[id] = WATER
+            target = f"{WATER} {fault.get('device', '')}".strip()
+            self.trace.note(
+                self.now_ns(), Kind.FAULT, id, {"name": fault["name"], "on": True, "target": target, "said": fault}
+            )
+            return
+        await self.parts[where].bench.inject(local)
+        self._where[str(fault["id"])] = where
+
+    async def struck(self) -> list[Struck]:
+        found = [struck_of(one) for one in self.faults.history.describe()]
+        for member, part in self.parts.items():
+            found += [replace(one, on=f"{member}.{one.on}") for one in await part.bench.struck()]
+        return found
+
+    async def clear(self, id: str) -> None:
+        where = self._where.pop(id, None)
+        if where is None:
+            raise UsageError(f"no fault {id!r} is in", expected=", ".join(self._where) or "one; there is none")
+        if where == WATER:
+            self.faults.clear(id)
+            self.trace.note(self.now_ns(), Kind.FAULT, id, {"name": "", "on": False, "target": ""})
+        else:
+            await self.parts[where].bench.clear(id)
+
+    async def held(self, name: str) -> list[tuple[float, bytes]]:
+        part, local = self._part(name)
+        offset_s = part.trace.offset_ns / NS_PER_S
+        return [(t_s + offset_s, raw) for t_s, raw in await part.bench.held(local)]

@@ -1,0 +1,95 @@
+"""The ledger of virtual hours: one line per finished run, so that nights add up and no run is repeated.
+
+A line belongs to a fingerprint of system and prototype file, version, virtual time and faults. Only lines with the same
+fingerprint mark a seed as done.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import msgspec
+
+from fieldtwin.__about__ import __version__
+from fieldtwin.gateway.core.errors import FileInvalid, Unreachable
+from fieldtwin.gateway.core.files.input_file import read_input
+from fieldtwin.run.campaigns.many_seeds import SeedResult
+
+
+class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One run. `what` is its `many_seeds.what_runs`; `wrong` of the `checked` values were never held by their device."""
+
+    what: str
+    version: str
+    seed: int
+    hours: float
+    ok: bool
+    checked: int
+    wrong: int
+    sha256: str
+    errors: tuple[str, ...] = ()
+
+
+MAX_BYTES = 256 * 1024 * 1024
+
+
+class Ledger:
+    """A file of entries, appended to. A last line that a kill truncated is removed. Raises `FileInvalid`, `Unreachable`."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.entries: list[Entry] = []
+        data = read_input(path, MAX_BYTES) if path.exists() else b""
+        *lines, rest = data.split(b"\n")
+        for number, line in enumerate(lines, 1):
+            try:
+                self.entries.append(msgspec.json.decode(line, type=Entry))
+            except msgspec.DecodeError as e:
+                raise FileInvalid(f"no line of a ledger: {e}", path=str(path), line=number) from e
+        if rest:
+            os.truncate(path, len(data) - len(rest))
+
+    def done(self, what: str) -> set[int]:
+        """Return the seeds that this version has run of `what`."""
+        return {e.seed for e in self.entries if e.what == what and e.version == __version__}
+
+    def add(self, what: str, hours: float, result: SeedResult) -> None:
+        """Add a result, which is on disk when the call returns."""
+        entry = Entry(
+            what,
+            __version__,
+            result.seed,
+            hours,
+            result.ok,
+            result.checked,
+            result.wrong,
+            result.sha256,
+            result.errors,
+        )
+        try:
+            with self.path.open("ab") as file:
+                file.write(msgspec.json.encode(entry) + b"\n")
+                file.flush()
+                os.fsync(file.fileno())
+        except OSError as e:
+            raise Unreachable(f"cannot write the ledger: {e.strerror}", where=str(self.path)) from e
+        self.entries.append(entry)
+
+    def failed_of(self, what: str, seeds: range) -> set[int]:
+        """Return which of these seeds failed when they were run of this, by this version."""
+        return {e.seed for e in self.failed if e.what == what and e.version == __version__ and e.seed in seeds}
+
+    @property
+    def hours(self) -> float:
+        """The sum of all virtual hours in the ledger."""
+        return sum(e.hours for e in self.entries)
+
+    @property
+    def wrong(self) -> int:
+        return sum(e.wrong for e in self.entries)
+
+    @property
+    def failed(self) -> list[Entry]:
+        """The runs that did not end well."""
+        return [e for e in self.entries if not e.ok]

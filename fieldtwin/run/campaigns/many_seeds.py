@@ -1,0 +1,113 @@
+"""One run in virtual time after the other, a seed each, in several processes: which seeds fail, and why."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from fieldtwin.run.campaigns.shrink import same_failure, shrunk_run
+from fieldtwin.run.processes.workers import each
+from fieldtwin.run.virtual.network_run import VirtualNetworkOptions
+from fieldtwin.run.virtual.run import VirtualOptions
+
+MAX_SEEDS = 100_000
+_ERRORS_SHOWN = 5
+Options = VirtualOptions | VirtualNetworkOptions
+"""The options of a run with a seed: of a system, or of a network."""
+
+
+@dataclass(frozen=True, slots=True)
+class SeedResult:
+    """The result of one seed's run. `checked` values were compared with devices' values, `wrong` of them were never held."""
+
+    seed: int
+    ok: bool
+    errors: tuple[str, ...]
+    checked: int
+    wrong: int
+    events: int
+    sha256: str
+    faults: tuple[tuple[str, int, int], ...] = ()
+    """By fault name: how many were injected, and how often they took effect."""
+
+
+def fingerprint(*parts: str) -> str:
+    """Return a fingerprint of a run: the same texts (files, options) give the same fingerprint."""
+    digest = hashlib.sha256()
+    for part in parts:
+        digest.update(len(part).to_bytes(8, "big") + part.encode())
+    return digest.hexdigest()[:16]
+
+
+def what_runs(options: Options) -> str:
+    """Return a fingerprint of these options without the seed, from the contents of the files and the command-line options."""
+    anyhow = replace(options, seed=None, trace=None, profiles=())
+    if isinstance(anyhow, VirtualOptions):
+        anyhow = replace(anyhow, prototype_file=None)
+    return fingerprint(*options.make().files, repr(anyhow))
+
+
+def run_seed(options: Options) -> SeedResult:
+    """Make one complete run."""
+    run = options.make()
+    run.run()
+    summary = run.summary()
+    systems: dict[str, dict[str, Any]] = summary.get("systems", {})
+    errors = summary["errors"] + [f"{name}: {error}" for name, one in systems.items() for error in one["errors"]]
+    published = [one["published"] for one in systems.values() or [summary]]
+    return SeedResult(
+        run.seed,
+        summary["ok"],
+        tuple(errors[:_ERRORS_SHOWN]),
+        sum(one["checked"] for one in published),
+        sum(one["wrong"] for one in published),
+        summary["trace"]["events"],
+        summary["trace"]["sha256"],
+        _by_name([one for part in [summary, *systems.values()] for one in part.get("faults", ())]),
+    )
+
+
+def _by_name(faults: Sequence[dict[str, Any]]) -> tuple[tuple[str, int, int], ...]:
+    names = sorted({fault["name"] for fault in faults})
+    of = {name: [fault["struck"] for fault in faults if fault["name"] == name] for name in names}
+    return tuple((name, len(struck), sum(struck)) for name, struck in of.items())
+
+
+@dataclass(frozen=True, slots=True)
+class Shrunk:
+    """The fewest faults with which a run still fails in the same way: `faults`.
+
+    `minimal`: all of them are necessary. `result`: the result with them. `without`: the result without any fault; the
+    same as `result` if none is necessary. `scripted`: the times (s) and periods of the remote client's commands.
+    """
+
+    faults: list[dict[str, Any]]
+    minimal: bool
+    result: SeedResult
+    without: SeedResult
+    scripted: list[tuple[float, int]]
+
+
+def shrunk(options: Options, found: SeedResult) -> Shrunk:
+    """Return the fewest faults with which the run of `found`'s seed still fails in the same way."""
+    options = replace(options, seed=found.seed)
+    run = options.make()
+    base = replace(options, random_faults=None, faults=())
+
+    def ended(part: Sequence[dict[str, Any]]) -> SeedResult:
+        return run_seed(replace(base, faults=tuple(part)))
+
+    small = shrunk_run(run.faults, ended, lambda result: same_failure(found.errors, result.errors))
+    return Shrunk(*small, run.scripted)
+
+
+def run_seeds(
+    options: Options, seeds: Sequence[int], jobs: int, on_result: Callable[[SeedResult], None] | None = None
+) -> list[SeedResult]:
+    """Run each seed, `jobs` at a time, and return the results in the order of the seeds.
+
+    `on_result` is called with each result as its run ends.
+    """
+    return each(jobs, run_seed, [replace(options, seed=seed) for seed in seeds], on_result)

@@ -1,0 +1,106 @@
+"""The failing seed of a campaign, shrunk: the fewest random faults that break the same rule, as a scenario that is confirmed."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from fieldtwin.results.model import ScenarioResult, Verdict
+from fieldtwin.run.campaigns.campaign import Campaign, broken_by, run_seed, schedule
+from fieldtwin.run.campaigns.shrink import as_scenario, same_failure, shrunk_run
+from fieldtwin.run.targets.virtual_scenario import run_virtual
+from fieldtwin.scenarios.judging.runner import fault_id
+from fieldtwin.scenarios.language.form import Scenario, load_scenario
+
+_KEPT = ("requirements", "start", "needs", "stopped", "refused", "probes")
+"""Keys of a scenario that one that was shrunk from it has as they stand."""
+
+
+@dataclass(frozen=True)
+class ShrunkSeed:
+    """The fewest faults with which a seed still breaks the same rule.
+
+    `minimal`: all of them are necessary. `result`: the run with them, with its events. `without`: the run without
+    random faults.
+    """
+
+    seed: int
+    faults: list[dict[str, Any]]
+    minimal: bool
+    result: ScenarioResult
+    without: ScenarioResult
+
+
+def shrink_seed(campaign: Campaign, found: ScenarioResult) -> ShrunkSeed:
+    """Return the fewest random faults with which the seed of `found` still breaks the same rules."""
+    assert found.seed is not None
+    seed, wanted = found.seed, broken_by(found)
+    faults = schedule(campaign, campaign.check(), seed)
+
+    def run(part: Sequence[dict[str, Any]]) -> ScenarioResult:
+        return run_seed(campaign, seed, part)
+
+    return ShrunkSeed(seed, *shrunk_run(faults, run, lambda result: same_failure(wanted, broken_by(result))))
+
+
+def scenario_of(campaign: Campaign, small: ShrunkSeed, folder: Path) -> str:
+    """Return a scenario file for `folder`: the faults, the effects of the steps at their times, and the broken rule."""
+    scenario = campaign.check()
+    form, raw = scenario.form, scenario.file.data
+    keys: dict[str, Any] = {key: raw[key] for key in _KEPT if key in raw}
+    if form.prototype is not None:
+        keys["prototype"] = _from(folder, scenario.path.parent / form.prototype)
+    keys |= _rule(scenario, small.result)
+    beside = scenario.path.parent / form.system
+    system = _from(folder, beside) if beside.exists() else form.system
+    return as_scenario(
+        f"{form.scenario}: seed {small.seed}",
+        system,
+        small.seed,
+        campaign.length_s(scenario),
+        small.faults,
+        [small.result.reason],
+        _acts(scenario, small.result),
+        keys,
+    )
+
+
+def _from(folder: Path, path: Path) -> str:
+    try:
+        return Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix()
+    except ValueError:  # on a different drive of Windows
+        return str(path.resolve())
+
+
+def _rule(scenario: Scenario, result: ScenarioResult) -> dict[str, Any]:
+    """Return the broken rule as a key of a scenario file. An invariant needs no key: the system file already states it."""
+    number = next((check.number for check in result.checks if check.verdict.bad), "")
+    word, _, which = number.rpartition(" ")
+    if word in ("always", "never", "within"):
+        return {word: [scenario.file.data[word][int(which) - 1]]}
+    return {} if "invariant" in number else {"judge": "run"}
+
+
+def _acts(scenario: Scenario, result: ScenarioResult) -> list[tuple[float, dict[str, Any]]]:
+    """Return the effects of the steps until the rule broke, with the time of each, in seconds of the run."""
+    acts: list[tuple[float, dict[str, Any]]] = []
+    for check in result.checks:
+        if not check.number.isdigit():
+            continue
+        n, at_s = int(check.number) - 1, (check.since_ns or 0) / 1e9
+        step, raw = scenario.form.steps[n], scenario.file.data["steps"][n]
+        if step.fault is not None:
+            acts.append((at_s, {"fault": {"id": fault_id(n, step), **step.fault}}))
+        elif step.send is not None or step.set is not None or step.clear is not None:
+            acts.append((at_s, dict(raw)))
+    return acts
+
+
+def confirm(path: Path, campaign: Campaign, small: ShrunkSeed) -> ScenarioResult | None:
+    """Run the scenario in `path`; return its result if it breaks the rule that the seed broke, else None."""
+    result = run_virtual(load_scenario(path, campaign.profiles))
+    confirmed = result.verdict is not Verdict.PASSED and same_failure(broken_by(small.result), broken_by(result))
+    return result if confirmed else None

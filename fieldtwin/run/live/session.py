@@ -1,0 +1,486 @@
+"""A run: the field simulator (of a prototype), PLC, gateway and remote client, and all their results.
+
+Start order: process image, field simulator, PLC, gateway, remote client. Stop order is the reverse, with safe outputs
+in between; the counters of both sides are read when the buses are idle. The death of a process does not end the run:
+the other processes show its consequences, and the run fails. The thread's process, which only observes, is restarted.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from fieldtwin.conformance.core.case import Danger
+from fieldtwin.console import talk
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.concurrency.async_resource import Started
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
+from fieldtwin.gateway.core.control import ControlClient
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import FieldtwinError, ReplyTimeout, Unreachable, UsageError
+from fieldtwin.gateway.wallclock import WallClock
+from fieldtwin.results.trace import Trace
+from fieldtwin.run.live.options import RunOptions
+from fieldtwin.run.live.oracle import Oracle
+from fieldtwin.run.processes.children import Child
+from fieldtwin.run.processes.field_contact import FieldContact, contact_elsewhere, contact_here
+from fieldtwin.run.processes.field_return import FieldReturn, is_loss
+from fieldtwin.run.processes.reloading import Reloaded, reload
+from fieldtwin.run.processes.states import StateWatch, expected_states
+from fieldtwin.run.processes.thread_return import ThreadReturn
+from fieldtwin.run.processes.topside import Shore, script
+from fieldtwin.twin.plant.controller import ControllerConfig
+from fieldtwin.twin.plant.instance import Instance
+from fieldtwin.twin.plant.mapping import mapping_to_json
+from fieldtwin.twin.plant.physical import PhysicalTwin
+from fieldtwin.twin.site.schema import NONE_STATED
+from fieldtwin.twin.site.system import System, load_system
+from fieldtwin.twin.thread.place import MODEM, lent_transmitter
+from fieldtwin.twin.thread.plant_thread import PlantThreadConfig
+
+if TYPE_CHECKING:
+    from fieldtwin.run.benches.invariant_watch import InvariantWatch
+    from fieldtwin.run.live.bridge_cable import BridgeCable
+    from fieldtwin.twin.prototype.field_process import FieldConfig
+
+MODEM_EVERY_S = 1.0
+"""Minimum seconds between two values of a tag over a modem, which carries some thirty events a second."""
+WATCH_S = 0.02
+ANSWERS_WITHIN_S = 5.0
+"""Time in seconds after which a process without a status counts as stopped, or without processor time."""
+STILL_S = 3.0
+"""Time in seconds between two checks after which this process counts as stopped itself."""
+ORACLE_S = 1.0
+INVARIANTS_S = 0.1
+"""Period in seconds of the checks of the system file's invariants."""
+MAX_ERRORS = 100
+SETTLE_S = 4.0
+FIELD_LINGER_S = 1.5
+"""Time in seconds that the emulators remain after this process was killed, in which the gateway makes its outputs safe."""
+
+
+class RunSession(Started):
+    """One run. ``async with RunSession(options) as run: await run.wait()``, then `summary`.
+
+    `gateway_status`, `plc_status` and `field_status` hold the latest of each, `None` while a process does not answer.
+    """
+
+    def __init__(self, options: RunOptions) -> None:
+        super().__init__()
+        self.options = options
+        self.clock = WallClock()
+        self.system: System = load_system(options.system, options.profiles)
+        self.twin = PhysicalTwin(self.system)
+        self.lent = self._lent_to_the_thread()
+        if options.prototype and not options.field_host:
+            from fieldtwin.twin.prototype.field_process import (
+                resolve,  # here and below: a plant has no emulators installed
+            )
+
+            resolve(self._field_config(Path()))  # report errors in the files before anything starts
+        self.instance = Instance(options.instance or self.system.name)
+        self.mapping: dict[Endpoint, Endpoint] = {}
+        self.far: dict[str, Endpoint] = {}
+        self.cables: dict[str, BridgeCable] = {}
+        self.counted_before: dict[str, dict[str, int]] = {}
+        self.clients_before: dict[str, dict[str, dict[str, int]]] = {}
+        self.children: dict[str, Child] = {}
+        self.errors: deque[str] = deque(maxlen=MAX_ERRORS)
+        self.oracle = Oracle()
+        self.invariants: InvariantWatch | None = None
+        if self.system.invariants != NONE_STATED:
+            # Imported late because it loads emulators, which a plant does not need.
+            from fieldtwin.run.benches.invariant_watch import InvariantWatch
+
+            self.invariants = InvariantWatch(self.system)
+        self._judging: asyncio.Task[None] | None = None
+        self.states = StateWatch(self.system)
+        self.shore: Shore | None = None
+        self.gateway_status: dict[str, Any] | None = None
+        self.plc_status: dict[str, Any] | None = None
+        self.field_status: dict[str, Any] | None = None
+        self.outputs_confirmed_safe: bool | None = None
+        self.thread_place = ""
+        self.thread_status: dict[str, Any] | None = None
+        self.thread_return: ThreadReturn | None = None
+        self.started_ns = 0
+        self.answered_ns: dict[str, int] = {}  # when gateway and PLC last did
+        self._looked_ns = 0
+        """The time of this process's last check of the others."""
+        self._still_ns = -(1 << 62)
+        """The time when this process last noticed that it had been stopped."""
+        self.stopped = asyncio.Event()
+        self._nursery = Nursery()
+        self._clients: dict[str, ControlClient] = {}
+        self._field: FieldContact | None = None
+        self.made_anew = 0
+        """How often a scenario reset the simulated devices."""
+        self.field_return: FieldReturn | None = None
+        """The reconnection to a remote field simulator."""
+
+    def _lent_to_the_thread(self) -> str:
+        """Return the transmitter whose mailboxes the thread uses, if any. Raises `UsageError` if that is not possible."""
+        o = self.options
+        lent = lent_transmitter(o.thread, self.system)
+        if lent and not o.prototype and not o.allow_writes:
+            raise UsageError(
+                f"a thread over {lent!r} writes into its mailbox", expected="--allow-writes", got=f"--thread {o.thread}"
+            )
+        if lent and o.commands:
+            raise UsageError(
+                f"the far end of {lent!r} is the digital twin's", expected="--commands none",
+                hint="`fieldtwin twin ... --command 1` commands over the thread",
+            )  # fmt: skip
+        return lent
+
+    @property
+    def disturbed(self) -> bool:
+        """Return whether faults were injected, or the field simulator was away: then the counts of both sides may differ."""
+        lost = self.field_return is not None and self.field_return.losses > 0
+        return bool(self.options.faults) or lost or self.made_anew > 0
+
+    @property
+    def calm(self) -> bool:
+        """Return whether the run had no faults. How long recovery takes is for a scenario to check."""
+        return not self.options.faults and not self.made_anew
+
+    # -- starting -------------------------------------------------------------------------------------------------------
+
+    async def _start(self) -> None:
+        self._stack.enter_context(self.instance)
+        run_dir = self.instance.dir
+        ecs = self.twin.ecs
+        plc = ecs.prepare(run_dir, cold=self.options.cold)
+        if self.options.prototype:
+            await self._start_field(run_dir)
+            await self._lay_cables(run_dir)
+        config = run_dir / "plc.json"
+        config.write_bytes(plc.to_json())
+        await self._start_child("plc", "fieldtwin.plc", config)
+        gateway = ControllerConfig(
+            system=str(self.system.path.resolve()),
+            run_dir=str(run_dir),
+            allow_writes=self.options.prototype or self.options.allow_writes,
+            mapping=mapping_to_json(self.mapping) if self.options.prototype else None,
+            profiles=tuple(str(p.resolve()) for p in self.options.profiles),
+            capture=str(self.options.capture.resolve()) if self.options.capture else "",
+            lent=(self.lent,) if self.lent else (),
+        )
+        await self._start_child("gateway", "fieldtwin.twin.plant.controller", self._write("gateway.json", gateway))
+        self._stack.enter_context(self.states.attached(ecs.layout, run_dir / "image"))
+        if self.options.thread:
+            await self._start_thread(run_dir)
+        self.started_ns = self.clock.monotonic_ns()
+        await self._put_faults_in()
+        self._start_watching()
+
+    async def _put_faults_in(self) -> None:
+        if self._field is not None:
+            for fault in self.options.faults:  # each has its own start time
+                await self._field.client.call("fault", fault=fault, start_ns=self.started_ns)
+
+    async def _start_thread(self, run_dir: Path) -> None:
+        """Start the plant's side of the digital thread, which observes the process image."""
+        o = self.options
+        config = PlantThreadConfig(
+            system=str(self.system.path.resolve()),
+            run_dir=str(run_dir),
+            place=o.thread,
+            store=o.thread_store or str(run_dir / "knowledge.sqlite"),
+            prototype=o.prototype,
+            profiles=tuple(str(p.resolve()) for p in o.profiles),
+            mapping=mapping_to_json(self.mapping) if o.prototype else None,
+            every_ms=round(
+                1000 * (o.thread_every_s if o.thread_every_s is not None else MODEM_EVERY_S if self.lent else 0)
+            ),
+        )
+        client = await self._start_child(
+            "thread", "fieldtwin.twin.thread.plant_thread", self._write("thread.json", config)
+        )
+        self.thread_place = str((await client.call("get"))["place"])
+        if not self.lent:  # the address for a restart, even if the port was chosen freely
+            config = msgspec.structs.replace(config, place=self.thread_place)
+        self._keep_thread(config)
+        if self.lent in self.far:
+            self.thread_place = f"{MODEM}{self.far[self.lent]}"
+
+    def _keep_thread(self, config: PlantThreadConfig) -> None:
+        def another() -> Child:
+            path = self._write("thread.json", config)
+            self.children["thread"] = Child("thread", "fieldtwin.twin.thread.plant_thread", path, self.instance.dir)
+            return self.children["thread"]
+
+        def came(client: ControlClient) -> None:
+            self._clients["thread"] = client
+
+        self.thread_return = ThreadReturn(
+            self.children["thread"], another, came, lambda error: self.note_error(str(error))
+        )
+        self._stack.push_async_callback(self.thread_return.end)
+        self._nursery.start(self.thread_return.run(), "thread's process")
+
+    def _field_config(self, run_dir: Path) -> FieldConfig:
+        from fieldtwin.twin.prototype.field_process import FieldConfig
+
+        o = self.options
+        listen = dict(o.listen)
+        if o.can:
+            listen |= {name: f"can:{o.can}" for name, bus in self.system.buses.items() if bus.endpoint.is_can}
+        return FieldConfig(
+            system=str(self.system.path.resolve()),
+            run_dir=str(run_dir),
+            prototype=str(o.prototype_file.resolve()) if o.prototype_file else "",
+            profiles=tuple(str(p.resolve()) for p in o.profiles),
+            recordings={d: str(Path(p).resolve()) for d, p in o.recordings.items()},
+            speed=o.speed,
+            listen=listen,
+            seed=o.seed,
+            water=o.water,
+        )
+
+    def _write(self, name: str, config: msgspec.Struct) -> Path:
+        path = self.instance.path(name)
+        path.write_bytes(msgspec.json.format(msgspec.json.encode(config), indent=2))
+        path.chmod(0o600)
+        return path
+
+    async def _start_child(self, name: str, module: str, config: Path, linger_s: float = 0.0) -> ControlClient:
+        child = Child(name, module, config, self.instance.dir, linger_s)
+        self.children[name] = child
+        self._stack.push_async_callback(child.end)
+        client = await child.connect()
+        self._clients[name] = client
+        self._stack.push_async_callback(client.aclose)
+        return client
+
+    async def _start_field(self, run_dir: Path) -> None:
+        if self.options.field_host:
+            at, token = self.options.field_host, self.options.token
+            self._field = await contact_elsewhere(at, token, self.system, run_dir)
+            self.field_return = FieldReturn(self._field, self.system, at, token, self._field_returned)
+        else:
+            config = self._write("field.json", self._field_config(run_dir))
+            client = await self._start_child("field", "fieldtwin.twin.prototype.field_process", config, FIELD_LINGER_S)
+            self._field = await contact_here(client, self.system, run_dir)
+        self._stack.push_async_callback(self._field.aclose)
+        self.mapping, self.far = self._field.mapping, self._field.far
+        self.counted_before, self.clients_before = self._field.counted_before, self._field.clients_before
+        for remark in self._field.remarks:
+            talk.print(remark, soft_wrap=True, markup=False)
+
+    async def _lay_cables(self, run_dir: Path) -> None:
+        """Make a cable for each bridge that listens on a serial line. The plant's own ports are not opened."""
+        for bridge in self.system.serving.bridges:
+            if bridge.listen.is_serial:
+                from fieldtwin.run.live.bridge_cable import BridgeCable  # of a prototype: a plant has no emulators
+
+                cable = await BridgeCable.open(bridge.listen, run_dir, bridge.name)
+                self._stack.push_async_callback(cable.aclose)
+                self._nursery.start(cable.run(), f"cable of bridge {bridge.name}")
+                self.cables[bridge.name] = cable
+                self.mapping[cable.plant] = cable.gateway
+
+    async def _field_returned(self, another: bool) -> None:
+        if another:
+            self.oracle.begin_again()
+            self.counted_before, self.clients_before = {}, {}
+            await self._put_faults_in()
+
+    @property
+    def _field_client(self) -> ControlClient | None:
+        """Return the control client of the field simulator while it is connected."""
+        if self.field_return is not None:
+            return self.field_return.client
+        return self._field.client if self._field is not None else None
+
+    def _start_watching(self) -> None:
+        if self.field_return is not None:
+            self._nursery.start(self.field_return.run(), "field side's return")
+        self._nursery.start(self._watch(), "states")
+        if self.invariants is not None:
+            self._judging = self._nursery.start(self._judge_invariants(self.invariants), "invariants")
+        self._nursery.start(self._ask(), "status")
+        device = next(iter(self.far), None)
+        if device is not None and self.options.prototype and self.options.commands:
+            # Without commands another client uses the remote end (`fieldtwin shore`): two clients would divide the
+            # responses.
+            self.shore = Shore(self.system, device, self.far[device], self.clock)
+            commands = script(self.options.commands, self.options.duration_s or 20.0)
+            self._nursery.start(self.shore.run(commands), "far end")
+
+    # -- while it runs --------------------------------------------------------------------------------------------------
+
+    async def wait(self) -> None:
+        """Wait until the duration is over, `stopped` is set, or a task in this process fails."""
+        waiting = self._nursery.start(self.stopped.wait(), "until stopped")
+        done = asyncio.ensure_future(self._nursery.wait())
+        try:
+            timeout = self.options.duration_s or None
+            await asyncio.wait([waiting, done], timeout=timeout, return_when=asyncio.FIRST_COMPLETED)
+            if done.done():
+                done.result()
+            elif not waiting.done():
+                await self._settle()
+        finally:
+            done.cancel()
+
+    async def _judge_invariants(self, invariants: InvariantWatch) -> None:
+        """Check the invariants of the system file until the gateway or the PLC ends, or the run is stopped."""
+        from fieldtwin.run.benches.control_bench import ControlBench, Where
+
+        where = Where(self.instance.dir, plant=True, allowed=Danger.OBSERVE)
+        try:
+            async with ControlBench(self.system, where, Trace(1), target="real", names=invariants.names) as bench:
+                await invariants.run(bench, INVARIANTS_S)
+        except FieldtwinError as e:  # the monitoring of the processes reports the one that ended
+            invariants.end(str(e))
+            self.note_error(f"the invariants were not judged to the end: {e}")
+
+    async def _settle(self) -> None:
+        """Wait at the end for a command in progress, for `SETTLE_S` seconds at most."""
+        deadline_s = self.elapsed_s + SETTLE_S
+        while self.shore is not None and self.elapsed_s < deadline_s and not self.stopped.is_set():
+            expected = expected_states(self.shore.commands_sent)
+            if all(self.states.sequence(p) == expected for p in self.states.relays):
+                return
+            await asyncio.sleep(WATCH_S)
+
+    @property
+    def elapsed_s(self) -> float:
+        return (self.clock.monotonic_ns() - self.started_ns) / 1e9
+
+    async def _watch(self) -> None:
+        while True:
+            self._stood_still()
+            self._looked_ns = self.clock.monotonic_ns()
+            self.states.look(self._looked_ns)
+            self._notice_deaths()
+            await asyncio.sleep(WATCH_S)
+
+    def _notice_deaths(self) -> None:
+        for name, child in self.children.items():
+            failed = child.failure()
+            if failed is not None and name in self._clients:
+                del self._clients[name]
+                self.note_error(str(failed))
+
+    def note_error(self, text: str) -> None:
+        """Record an error; each text once."""
+        if text not in self.errors:
+            self.errors.append(text)
+
+    async def _ask(self) -> None:
+        """Refresh the three statuses twice a second and run the check of values once a second."""
+        next_oracle = 0.0
+        while True:
+            await self.refresh()
+            if self.elapsed_s >= next_oracle:
+                next_oracle = self.elapsed_s + ORACLE_S
+                await self._judge()
+            await asyncio.sleep(0.4)
+
+    async def refresh(self) -> None:
+        """Ask every process for its status."""
+        self.gateway_status = await self._get(self._clients.get("gateway"), "gateway")
+        self.plc_status = await self._get(self._clients.get("plc"), "plc", brief=True)
+        await self._refresh_field()
+        for name, status in (("gateway", self.gateway_status), ("plc", self.plc_status)):
+            if status is not None:
+                self.answered_ns[name] = self.clock.monotonic_ns()
+        if (thread := await self._get(self._clients.get("thread"), "thread")) is not None:
+            self.thread_status = thread
+            if thread["dropped"]:
+                self.note_error(f"the thread's log lost events: {thread['store_trouble'] or 'they came too fast'}")
+
+    async def _refresh_field(self) -> None:
+        """Refresh the field simulator's status; after `start: fresh` its journals and counters begin again."""
+        self.field_status = await self._get(self._field_client, "" if self.field_return is not None else "field")
+        if self._field is None or self.field_status is None or self.field_status["life"] == self._field.life:
+            return
+        self._field.life = self.field_status["life"]
+        self.made_anew += 1
+        self.oracle.begin_again()
+        self.counted_before, self.clients_before = {}, {}
+
+    async def _get(self, client: ControlClient | None, name: str, **args: Any) -> dict[str, Any] | None:
+        """Return the status of a process, and record an error without an answer; `name` is empty if monitored elsewhere."""
+        if client is None:
+            return None
+        try:
+            answer: dict[str, Any] = await client.call("get", timeout_s=ANSWERS_WITHIN_S, **args)
+        except FieldtwinError as e:
+            self._maybe_lost(client, e)
+            if isinstance(e, ReplyTimeout) and name and not self._stood_still():
+                self.note_error(f"{name}: the process did not answer within {ANSWERS_WITHIN_S:g} s")
+            return None  # it is ending or gone: _notice_deaths reports it with its reason
+        return answer
+
+    def _stood_still(self) -> bool:
+        """Return whether this process itself was stopped, or got no processor time: then it cannot tell if others answered."""
+        gap_s = (self.clock.monotonic_ns() - self._looked_ns) / NS_PER_S
+        if self._looked_ns and gap_s > STILL_S:
+            self._still_ns = self.clock.monotonic_ns()
+            self.note_error(f"run: the run's own process stood still for {gap_s:.1f} s")
+        return self.clock.monotonic_ns() - self._still_ns < (STILL_S + ANSWERS_WITHIN_S) * NS_PER_S
+
+    def _maybe_lost(self, client: ControlClient, error: FieldtwinError) -> None:
+        if self.field_return is not None and client is self.field_return.client and is_loss(error):
+            self.field_return.lost()
+
+    async def _judge(self) -> None:
+        await self._refresh_field()
+        gateway = self._clients.get("gateway")
+        field = self._field_client
+        if gateway is None or field is None:
+            return
+        try:
+            await self.oracle.update(gateway, field)
+        except FieldtwinError:
+            pass  # as above; the next query reports a loss
+
+    async def reload(self, by: str) -> Reloaded:
+        """Make the gateway read its files again (`fieldtwin.run.processes.reloading`); no poll is lost."""
+        if "gateway" not in self._clients:
+            raise Unreachable("the gateway is gone")
+        # own connection: statuses are queried meanwhile
+        own = await ControlClient.connect_unix(self.instance.path("gateway.sock"))
+        try:
+            return await reload(own, self._clients.get("plc"), by)
+        finally:
+            await own.aclose()
+
+    # -- stopping -------------------------------------------------------------------------------------------------------
+
+    async def _stop(self) -> None:
+        try:
+            await self._stop_in_order()
+        finally:
+            await self._nursery.__aexit__(None, None, None)
+
+    async def _end_judging(self) -> None:
+        """Stop checking invariants: the outputs' change to safe values at the stop is not a violation."""
+        if self._judging is not None:
+            self._judging.cancel()
+            await asyncio.wait([self._judging])
+
+    async def _stop_in_order(self) -> None:
+        self._notice_deaths()
+        await self._end_judging()
+        if self.shore is not None:
+            await self.shore.halt()
+        await self.refresh()
+        gateway = self._clients.get("gateway")
+        if gateway is not None:
+            try:
+                answer = await gateway.call("stop", timeout_s=2.0)
+                self.outputs_confirmed_safe, self.gateway_status = answer["safe"], answer["status"]
+            except FieldtwinError as e:
+                self.note_error(f"the gateway did not stop in order: {e}")
+        self.field_status = await self._get(self._field_client, "") or self.field_status
+        await self._judge()
+        if self.field_return is not None and (trouble := self.field_return.trouble):
+            self.note_error(trouble)

@@ -1,0 +1,386 @@
+"""The verdict on a run: whether both sides' counters, the published values and the observed states agree."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable
+from typing import Any, Protocol
+
+from fieldtwin.__about__ import __version__
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.plc.task import StopReason
+from fieldtwin.results.trace import refusal_text
+from fieldtwin.run.processes.states import StateWatch, expected_states
+from fieldtwin.run.processes.topside import Shore
+from fieldtwin.twin.site.system import System
+
+MOST_REFUSED = 10
+"""Refused outputs that a summary names one by one."""
+
+
+class Options(Protocol):
+    @property
+    def prototype(self) -> bool: ...
+
+
+class Named(Protocol):
+    @property
+    def name(self) -> str: ...
+
+
+class Oracle(Protocol):
+    """The comparison of published with held values."""
+
+    checked: int
+    wrong_count: int
+    wrong: list[str]
+
+    def describe(self) -> dict[str, Any]: ...
+
+
+class Invariants(Protocol):
+    """The check of the system file's invariants."""
+
+    def results(self) -> list[dict[str, Any]]: ...
+
+    def errors(self) -> list[str]: ...
+
+
+class Run(Protocol):
+    """A run that is over: of processes on this host, or in virtual time."""
+
+    @property
+    def invariants(self) -> Invariants | None:
+        """The check of the system file's invariants; None if the run had none."""
+        ...
+
+    @property
+    def options(self) -> Options: ...
+
+    @property
+    def system(self) -> System: ...
+
+    @property
+    def instance(self) -> Named: ...
+
+    @property
+    def errors(self) -> Iterable[str]: ...
+
+    @property
+    def oracle(self) -> Oracle: ...
+
+    @property
+    def states(self) -> StateWatch: ...
+
+    @property
+    def shore(self) -> Shore | None: ...
+
+    @property
+    def mapping(self) -> dict[Endpoint, Endpoint]: ...
+
+    @property
+    def gateway_status(self) -> dict[str, Any] | None: ...
+
+    @property
+    def plc_status(self) -> dict[str, Any] | None: ...
+
+    @property
+    def field_status(self) -> dict[str, Any] | None: ...
+
+    @property
+    def counted_before(self) -> dict[str, dict[str, int]]: ...
+
+    @property
+    def clients_before(self) -> dict[str, dict[str, dict[str, int]]]: ...
+
+    @property
+    def outputs_confirmed_safe(self) -> bool | None: ...
+
+    @property
+    def elapsed_s(self) -> float: ...
+
+    @property
+    def disturbed(self) -> bool:
+        """Return whether faults were injected: then the counts of both sides may differ."""
+        ...
+
+    @property
+    def calm(self) -> bool:
+        """Return whether the last fault has been over for long enough that the system must have recovered."""
+        ...
+
+
+GATEWAY_GONE = "the gateway did not answer at the end: what it published and what its outputs hold is not known"
+NOT_CALM = "whether devices and outputs were good at the end, because faults were put in"
+"""The message of a run that had faults until its end, or until shortly before."""
+
+
+def summarise(run: Run) -> dict[str, Any]:
+    """Return plain data for `--json` and for printing. `ok` is False when any check failed; `errors` lists the reasons."""
+    gateway = run.gateway_status or {}
+    plc = run.plc_status or {}
+    exchanges = _exchanges(run)
+    checks = [*_plc_checks(plc), *_loss_checks(gateway)]
+    if run.gateway_status is None:
+        checks.append(GATEWAY_GONE)
+    if run.calm:
+        checks = [*_device_checks(gateway, run.options.prototype and run.disturbed), *_output_checks(gateway), *checks]
+    if run.options.prototype:
+        checks += _oracle_checks(run) + ([] if run.disturbed else exchange_checks(exchanges) + _state_checks(run))
+    refusals = gateway.get("refusals", {})
+    checks += _refusal_checks(
+        refusals, getattr(run, "may_refuse", ()), disturbed=run.options.prototype and run.disturbed
+    )
+    invariants = run.invariants
+    errors = [*run.errors, *(invariants.errors() if invariants is not None else ()), *checks]
+    return {
+        "fieldtwin": __version__,
+        "system": run.system.name,
+        "system_hash": run.system.hash,
+        "prototype": run.options.prototype,
+        "instance": run.instance.name,
+        "duration_s": round(run.elapsed_s, 3),
+        "warnings": list(run.system.warnings),
+        "mapping": {str(plant): str(target) for plant, target in run.mapping.items()},
+        "devices": _devices(gateway, run.field_status or {}),
+        "states": {program: run.states.sequence(program) for program in run.states.programs},
+        "transitions": {p: [[round(t, 3), s] for t, s in seen] for p, seen in run.states.transitions.items()},
+        "exchanges": exchanges,
+        "faults": (run.field_status or {}).get("struck", []),
+        "published": {"values": gateway.get("published"), **run.oracle.describe()},
+        "mailboxes": gateway.get("mailboxes", {}),
+        "far_end": run.shore.describe() if run.shore else None,
+        "field": back.describe() if (back := getattr(run, "field_return", None)) else None,
+        "thread": getattr(run, "thread_status", None),
+        "learnt": gateway.get("learnt", {}),
+        "logged": gateway.get("logged", 0),
+        "writes": gateway.get("writes", {}),
+        "refused": refusals.get("entries", []),
+        "invariants": invariants.results() if invariants is not None else [],
+        "outputs_safe": run.outputs_confirmed_safe,
+        "plc": {
+            k: plc[k]
+            for k in (
+                "state",
+                "stop_reason",
+                "scans",
+                "missed_periods",
+                "overruns",
+                "lateness_us",
+                "duration_us",
+                "realtime",
+                "error",
+                "acts",
+                "forces",
+                "waiting",
+                "started_without",
+            )
+            if k in plc
+        },
+        "tags": gateway.get("tags", {}),
+        "errors": errors,
+        "not_judged": [] if run.calm else [NOT_CALM],
+        "ok": not errors,
+    }
+
+
+def _devices(gateway: dict[str, Any], field: dict[str, Any]) -> dict[str, Any]:
+    """Return the state of each device, and the model or recording that replaced it, if any."""
+    emulated = field.get("devices", {})
+    return {
+        name: {"state": "good" if d["online"] else "bad", "error": d["error"]}
+        | ({"plays": emulated[name]["plays"]} if name in emulated else {})
+        for name, d in gateway.get("devices", {}).items()
+    }
+
+
+def _exchanges(run: Run) -> dict[str, Any]:
+    """Return the requests and replies per bus, as counted by the gateway and by its emulators."""
+    gateway, field = run.gateway_status or {}, run.field_status or {}
+    out: dict[str, Any] = {}
+    for name, bus in gateway.get("buses", {}).items():
+        counters = bus["counters"]
+        can = run.system.buses[name].endpoint.is_can
+        prefix = "sdo_" if can else ""
+        row: dict[str, Any] = {
+            "gateway": {
+                "requests": counters.get(f"{prefix}requests", 0),
+                # For a client, an exception is a reply. The SDO counters do not separate them.
+                "replies": counters.get(f"{prefix}replies", 0) + counters.get("sdo_aborts" if can else "exceptions", 0),
+            },
+            "timeouts": counters.get(f"{prefix}timeouts", 0),
+            "crc_errors": counters.get("crc_errors", 0),
+        }
+        if can:
+            row["gateway"]["pdos"] = counters.get("pdos", 0)
+            row["gateway"]["heartbeats"] = counters.get("heartbeats", 0)
+        devices = [d for d in run.system.devices_on(name) if d.name in field.get("devices", {})]
+        if devices:
+            row["unanswered_at_stop"] = unanswered_at_stop(row, len(devices))
+            row["emulators"] = {
+                what: sum(
+                    field["devices"][d.name]["counters"][what] - run.counted_before.get(d.name, {}).get(what, 0)
+                    for d in devices
+                )
+                for what in ("requests", "replies")
+            }
+            others = _others(bus, field.get("clients", {}).get(name, {}), run.clients_before.get(name, {}))
+            if any(others.values()):
+                row["others"] = others
+                # The bus counts a request when it is sent, the node when it receives it. A third party is not stopped
+                # before the counts are read, so it may have one request in progress at each node.
+                row["under_way"] = len(devices) if can else 0
+                row["emulators"] = {what: number - others[what] for what, number in row["emulators"].items()}
+        if any(d.name == getattr(run, "lent", "") for d in devices):
+            row["shared"] = "the digital thread"
+        out[name] = row
+    return out
+
+
+def unanswered_at_stop(row: dict[str, Any], devices: int) -> int:
+    """Return how many requests the gateway had under way when it stopped: at most one for each of its `devices`.
+
+    Such a request has neither a reply nor a timeout on the gateway's side, but the emulator may have answered it.
+    """
+    answered = row["gateway"]["replies"] + row["timeouts"] + row["crc_errors"]
+    return min(devices, max(0, int(row["gateway"]["requests"]) - int(answered)))
+
+
+def _others(
+    bus: dict[str, Any], clients: dict[str, dict[str, int]], before: dict[str, dict[str, int]]
+) -> dict[str, int]:
+    """Return the traffic of third parties with the emulators of a bus: that of clients whose address is not the gateway's.
+
+    On a kernel CAN bus, where frames have no sender, these are the SDO requests that the gateway did not send itself.
+    If no client has an address of the gateway, addresses are translated on the way and the clients cannot be
+    distinguished.
+    """
+    ours = set(bus.get("local", ()))
+    if not clients:
+        number = bus["counters"].get("foreign_sdo_requests", 0)
+        return {"requests": number, "replies": number}
+    if not ours & clients.keys():
+        return {"requests": 0, "replies": 0}
+    return {
+        what: sum(c[what] - before.get(name, {}).get(what, 0) for name, c in clients.items() if name not in ours)
+        for what in ("requests", "replies")
+    }
+
+
+def exchange_checks(exchanges: dict[str, Any]) -> list[str]:
+    """Compare the counts of both sides of each bus; return one sentence for each difference.
+
+    A reply that was late, damaged, or still in transit when the gateway stopped counts on the emulators' side only. A
+    device that the digital thread also uses is not compared.
+    """
+    failed = []
+    for bus, row in exchanges.items():
+        under_way = row.get("under_way", 0)
+        unanswered = row.get("unanswered_at_stop", 0)
+        excused = {"requests": under_way, "replies": row["timeouts"] + row["crc_errors"] + under_way + unanswered}
+        for what in ("requests", "replies"):
+            if (
+                "shared" not in row
+                and "emulators" in row
+                and not -under_way <= row["emulators"][what] - row["gateway"][what] <= excused[what]
+            ):
+                failed.append(
+                    f"{bus}: the gateway counted {row['gateway'][what]} {what}, the emulators {row['emulators'][what]}"
+                )
+        if "emulators" in row and not row["emulators"]["replies"]:
+            failed.append(f"{bus}: nothing was exchanged")
+    return failed
+
+
+def _device_checks(gateway: dict[str, Any], disturbed: bool) -> list[str]:
+    """Return the errors of devices.
+
+    A fault that doubles frames looks like two nodes with one ID, so this is not an error when the run is `disturbed`.
+    """
+    return [
+        f"{name}: {d['error']}"
+        for name, d in gateway.get("devices", {}).items()
+        if not d["online"] or (d["error"] and not (disturbed and d["error"] == d.get("conflict")))
+    ]
+
+
+def _output_checks(gateway: dict[str, Any]) -> list[str]:
+    """Return the outputs that an online device does not hold at the end, although they may be written."""
+    devices = gateway.get("devices", {})
+    return [
+        f"{o['tag']}: {o['wanted']:g} was commanded by {o['by']}, and the device does not hold it"
+        for o in gateway.get("outputs", [])
+        if o["wanted"] is not None
+        and o["held"] != o["wanted"]
+        and not o["refused"]
+        and devices.get(o["tag"].partition(".")[0], {}).get("online")
+    ]
+
+
+def _refusal_checks(refusals: dict[str, Any], expected: Collection[str], *, disturbed: bool) -> list[str]:
+    """Return the errors of refused outputs of programs.
+
+    A refusal counts if the program or the configuration is wrong, and, in a run without faults, if the device refused.
+    A refusal by design, one that is retried, and one of a client's request do not fail a run.
+    """
+    found: dict[tuple[str, str, str], str] = {}
+    faults = ("program",) if disturbed else ("program", "device")
+    for entry in refusals.get("entries", []):
+        if entry["fault"] in faults and entry["tag"] not in expected:
+            found[entry["tag"], entry["cause"], entry["place"]] = refusal_text(entry["tag"], entry)
+    told = list(found.values())
+    if len(told) > MOST_REFUSED:
+        told[MOST_REFUSED:] = [f"{len(told) - MOST_REFUSED} more outputs were refused"]
+    if not found and not expected and any(refusals.get("faults", {}).get(fault) for fault in faults):
+        told = ["outputs of programs were refused, so many that the first are no longer kept: see the audit log"]
+    return told
+
+
+def _plc_checks(plc: dict[str, Any]) -> list[str]:
+    if not plc:
+        return []  # its death is in the run's errors already
+    # A stopped PLC still lists the programs that never ran.
+    failed = [
+        f"PLC: program {program} has not started: it waits for {start['reason']}"
+        for program, start in plc.get("waiting", {}).items()
+    ]
+    stops = plc.get("stops", {"count": 0})
+    if stops["count"]:
+        times = "once" if stops["count"] == 1 else f"{stops['count']} times"
+        failed.append(f"PLC: stopped by itself {times}, and began again after that; the last time: {stops['last']}")
+    error = plc.get("error")
+    told = failed and (plc.get("state") == "waiting" or plc.get("stop_reason") == StopReason.NOT_STARTED.value)
+    return [f"PLC: {error}", *failed] if error and not told else failed
+
+
+def _loss_checks(gateway: dict[str, Any]) -> list[str]:
+    failed = [
+        f"{n}: {m['dropped']} messages were dropped" for n, m in gateway.get("mailboxes", {}).items() if m["dropped"]
+    ]
+    if gateway.get("log_dropped"):
+        failed.append(f"{gateway['log_dropped']} entries of the exchange log were dropped")
+    if gateway.get("store_error"):
+        failed.append(gateway["store_error"])
+    buses = gateway.get("buses", {}).items()
+    return failed + [f"{name}: {bus['sync_producers']}" for name, bus in buses if bus.get("sync_producers")]
+
+
+def _oracle_checks(run: Run) -> list[str]:
+    oracle = run.oracle
+    judged = getattr(run, "messages", None)  # a run of processes cannot see each message
+    messages: list[str] = judged.wrong if judged is not None else []
+    if oracle.wrong_count:
+        return [f"{oracle.wrong_count} published values were never held by their device", *oracle.wrong, *messages]
+    return messages if oracle.checked else ["no value was published as good", *messages]
+
+
+def _state_checks(run: Run) -> list[str]:
+    """Check that the states are those that the topside controller's commands require, in order, beginning with STANDBY."""
+    if run.shore is None:
+        return []
+    expected = expected_states(run.shore.commands_sent)
+    failed = []
+    for program in run.states.relays:
+        seen = run.states.sequence(program)
+        if seen and seen != expected:
+            failed.append(f"{program}: the commands ask for {' '.join(expected)}, seen were {' '.join(seen)}")
+    return failed

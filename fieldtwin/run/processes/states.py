@@ -1,0 +1,99 @@
+"""The states that a run's programs passed through, read from the process image without affecting any process."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from fieldtwin.gateway.core.image.image import OUTPUTS, ImageLayout, RegionReader
+from fieldtwin.gateway.core.statemachine import STATES, encode_period
+from fieldtwin.twin.model.model import DigitalModel
+from fieldtwin.twin.plant.physical import attached
+from fieldtwin.twin.site.system import System
+
+NAMES = list(STATES)
+MAX_TRANSITIONS = 10_000
+
+
+def expected_states(periods_s: list[int]) -> list[str]:
+    """Return the states that a digital model passes through at these commands, from STANDBY; repeated states count once."""
+    model = DigitalModel()
+    expected = [model.state.name]
+    for period_s in periods_s:
+        state = model.process_event(encode_period(period_s)).name
+        if state != expected[-1]:
+            expected.append(state)
+    return expected
+
+
+def state_words(layout: ImageLayout, programs: Iterable[str]) -> dict[str, dict[int, str]]:
+    """Return, for each program with a `state` that has names, the name of each code."""
+    tags = {tag.name: tag for region in layout.regions for tag in region.tags}
+    return {p: dict(tags[f"{p}.state"].words) for p in programs if f"{p}.state" in tags and tags[f"{p}.state"].words}
+
+
+class StateWatch:
+    """A watcher of every program's exported `state` that keeps the transitions, with the time since the first check."""
+
+    def __init__(self, system: System) -> None:
+        self._programs = list(system.plc.programs)
+        self._words: dict[str, dict[int, str]] = {}
+        self._reader: RegionReader | None = None
+        self._first_ns = 0
+        self.current: dict[str, str] = {}
+        self.transitions: dict[str, list[tuple[float, str]]] = {}
+
+    @contextmanager
+    def attached(self, layout: ImageLayout, path: Path) -> Iterator[None]:
+        """Read from the image file within this context."""
+        self.knows(layout)
+        with attached(layout, path) as image:
+            self._reader = image.reader(OUTPUTS)
+            try:
+                yield
+            finally:
+                self._reader = None
+
+    def knows(self, layout: ImageLayout) -> None:
+        """Use the names of each program's states in this process image."""
+        self._words = state_words(layout, self._programs)
+
+    @property
+    def programs(self) -> list[str]:
+        """The programs that have named states."""
+        return list(self._words)
+
+    @property
+    def relays(self) -> list[str]:
+        """Return the programs that are the paper's state machine: only it follows the topside controller's commands."""
+        return [p for p in self.current if list(self._words.get(p, {}).values()) == NAMES]
+
+    def look(self, now_ns: int) -> None:
+        """Note every program's state."""
+        if self._reader is None:
+            return
+        snapshot = self._reader.snapshot()
+        if not snapshot.counter:
+            return
+        for program in self._programs:
+            words = self._words.get(program)
+            if not words:
+                continue
+            value = snapshot.value(f"{program}.state").value
+            if isinstance(value, int) and value in words:
+                self.note(program, words[value], now_ns)
+
+    def note(self, program: str, state: str, now_ns: int) -> None:
+        """Record that a program is in `state` now."""
+        self._first_ns = self._first_ns or now_ns
+        if self.current.get(program) == state:
+            return
+        self.current[program] = state
+        seen = self.transitions.setdefault(program, [])
+        if len(seen) < MAX_TRANSITIONS:
+            seen.append(((now_ns - self._first_ns) / 1e9, state))
+
+    def sequence(self, program: str) -> list[str]:
+        """Return the states of a program in the order in which it was in them."""
+        return [state for _, state in self.transitions.get(program, [])]

@@ -1,0 +1,1 @@
+"""A running digital shadow or digital twin of a plant."""

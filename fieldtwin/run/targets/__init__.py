@@ -1,0 +1,1 @@
+"""Run scenarios on each target: virtual, local, compose, real."""

@@ -1,0 +1,93 @@
+"""Run a network's scenario on the target `local`: all its systems as processes on this host, over their control channels."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from contextlib import AsyncExitStack
+from pathlib import Path
+
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.errors import FieldtwinError
+from fieldtwin.results.model import ScenarioResult
+from fieldtwin.results.trace import FAR_END, Kind, Trace
+from fieldtwin.run.benches.control_bench import ControlBench, Where
+from fieldtwin.run.benches.network_bench import MemberTrace, NetworkBench, Part
+from fieldtwin.run.live.network_session import NetworkOptions, NetworkSession
+from fieldtwin.run.live.session import RunSession
+from fieldtwin.scenarios.judging.runner import Runner
+from fieldtwin.scenarios.language.form import Scenario
+
+
+async def run_network(scenario: Scenario, seed: int | None, trace: Trace) -> ScenarioResult:
+    """Start the network, run the scenario, stop everything. Raises `FieldtwinError` for a part that has ended."""
+    assert scenario.network is not None
+    chosen = seed if seed is not None else scenario.form.seed
+    options = NetworkOptions(f"test-{os.getpid()}", 0.0, chosen, scenario.profiles, cold=True, capture=True)
+    session = NetworkSession(scenario.network, options)
+    async with AsyncExitStack() as stack:
+        kept = stack.enter_context(_Tidy())
+        await stack.enter_async_context(session)
+        kept.folders += [session.instance.dir, *(one.instance.dir for one in session.sessions.values())]
+        bench = NetworkBench(scenario.network, trace, "local", session.faults)
+        for name, one in session.sessions.items():
+            notes = MemberTrace(trace, name, _later(bench, name))
+            names = sorted(scenario.used | scenario.invariants.names)
+            used = [local for member, local in map(scenario.network.split, names) if member == name]
+            part = ControlBench(
+                one.system,
+                Where(one.instance.dir, capture=one.options.capture, own=True),
+                notes,
+                target="local",
+                names=used,
+                gone=_gone(one),
+            )
+            await stack.enter_async_context(part)
+            bench.parts[name] = Part(part, notes)
+        if session.shore is not None:
+            session.shore.on_send = _told(bench)
+            bench.shore = session.shore
+        return await Runner(scenario, bench).run()
+
+
+class _Tidy:
+    """The folders of a run, removed with it; if a part ended early they are kept, because its logs contain the reason."""
+
+    def __init__(self) -> None:
+        self.folders: list[Path] = []
+
+    def __enter__(self) -> _Tidy:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *rest: object) -> None:
+        if kind is None or not issubclass(kind, FieldtwinError):
+            for folder in self.folders:
+                shutil.rmtree(folder, ignore_errors=True)
+
+
+def _later(bench: NetworkBench, name: str) -> Callable[[], int]:
+    """Return a function that returns how much later than the first the bench of a system began."""
+    known: list[int] = []
+
+    def later_ns() -> int:
+        if not known:
+            part = bench.parts.get(name)
+            if part is None:
+                return 0
+            known.append(round((bench.now_s() - part.bench.now_s()) * NS_PER_S))
+        return known[0]
+
+    return later_ns
+
+
+def _gone(session: RunSession) -> Callable[[], FieldtwinError | None]:
+    return lambda: next((failed for child in session.children.values() if (failed := child.failure())), None)
+
+
+def _told(bench: NetworkBench) -> Callable[[int], None]:
+    def commanded(period_s: int) -> None:
+        data = {"text": f"commands {period_s} s", "period_s": period_s}
+        bench.trace.note(bench.now_ns(), Kind.NOTE, FAR_END, data)
+
+    return commanded

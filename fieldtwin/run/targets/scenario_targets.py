@@ -1,0 +1,297 @@
+"""Run scenarios on every target.
+
+`virtual` runs in this thread, `local` as processes on this host, `compose` and `real` use a running system or start one
+here. The scenario is the same; targets differ in their abilities and in what is allowed on them.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import shlex
+import shutil
+import signal
+from collections.abc import Callable
+from contextlib import AsyncExitStack
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import TracebackType
+
+from fieldtwin.conformance.core.case import Danger
+from fieldtwin.gateway.core.errors import FieldtwinError
+from fieldtwin.gateway.wallclock import WallClock
+from fieldtwin.reports.run.coverage import Collector
+from fieldtwin.reports.run.machines import machines_of
+from fieldtwin.results.model import ScenarioResult, Verdict
+from fieldtwin.results.trace import Trace, open_sink
+from fieldtwin.run.benches.control_bench import ControlBench, Where
+from fieldtwin.run.live.options import RunOptions
+from fieldtwin.run.live.session import RunSession
+from fieldtwin.run.processes.field_found import find_field
+from fieldtwin.run.processes.with_controller import WithController
+from fieldtwin.run.targets.local_network import run_network
+from fieldtwin.run.targets.virtual_scenario import prototype_of, reproduce, run_virtual
+from fieldtwin.scenarios.bench import Can, NothingKnown
+from fieldtwin.scenarios.judging.runner import Runner, gone
+from fieldtwin.scenarios.judging.target_limits import refusal
+from fieldtwin.scenarios.language.about import result_of
+from fieldtwin.scenarios.language.form import Scenario
+from fieldtwin.twin.plant.instance import Instance, runtime_root
+from fieldtwin.twin.prototype.field_process import FieldConfig
+
+
+@dataclass(frozen=True)
+class Target:
+    """The target of a scenario.
+
+    `instance` of `compose` and `real`: one that runs on this host already; empty: `compose` takes the system's name,
+    `real` starts the plant. `field_host`, `token`: the field simulator of `compose`. `far`: the remote end of a plant.
+    `capture`: the capture file of a running instance. `allow`: the highest impact level on a plant. `can`: on `local`
+    the interface of emulated CAN buses (`socketcan/vcan0`); empty: that of the prototype file. `controller`: on `local`
+    the user's program and its arguments, which replaces fieldtwin's gateway and PLC.
+    """
+
+    name: str = "virtual"
+    seed: int | None = None
+    instance: str = ""
+    field_host: str = ""
+    token: str = field(default="", repr=False)
+    far: str = ""
+    capture: Path | None = None
+    allow: Danger = Danger.READ
+    can: str = ""
+    controller: tuple[str, ...] = ()
+
+
+def run_scenario(
+    scenario: Scenario, target: Target, trace_file: Path | None = None, retries: int = 0
+) -> ScenarioResult:
+    """Run the scenario, and repeat it at most `retries` times while it is INCONCLUSIVE; the first other verdict counts.
+
+    In virtual time there is one attempt only, because all would be equal.
+    """
+    earlier: list[str] = []
+    while True:
+        result = _attempt(scenario, target, trace_file)
+        if result.verdict is not Verdict.INCONCLUSIVE or len(earlier) >= retries or target.name == "virtual":
+            return replace(result, earlier=tuple(earlier))
+        earlier.append(result.why)
+
+
+def _attempt(scenario: Scenario, target: Target, trace_file: Path | None) -> ScenarioResult:
+    """Run the scenario once.
+
+    A scenario that the target does not allow or cannot run is SKIPPED; a lost system is an ERROR with its reason.
+    """
+    if target.name == "virtual":
+        return run_virtual(scenario, target.seed, trace_file)
+    collector = Collector(scenario.system, machines_of(scenario.system))
+    began_ns = WallClock().monotonic_ns()
+    refused = _of_a_plant(scenario, target) if target.name == "real" else ""
+    if scenario.network is not None and target.name != "local":
+        refused = f"a network is a prototype, and the target {target.name} is none: each of its systems is a plant"
+    elif scenario.network is not None and target.can:
+        refused = "--can is of one system, and this is a network"
+    elif scenario.network is not None and target.controller:
+        refused = "a network has a controller in each of its systems, and --with starts one program"
+    elif target.controller:
+        refused = _of_a_foreign_controller(scenario)
+    sink = open_sink(trace_file) if trace_file is not None else None
+    trace = Trace(sink=sink)
+    trace.listen(collector.feed)
+    try:
+        if refused:  # then the plant is left alone
+            result = result_of(scenario, target.name, Verdict.SKIPPED, reason=refused)
+        else:
+            result = asyncio.run(_run(scenario, target, trace))
+    except asyncio.CancelledError:  # SIGTERM: everything has stopped in order
+        raise KeyboardInterrupt from None
+    except NothingKnown as e:  # the host was late, or another test interfered
+        result = result_of(scenario, target.name, Verdict.INCONCLUSIVE, reason=str(e), trace=tuple(trace.events))
+    except FieldtwinError as e:
+        events = tuple(trace.events)
+        checks = (gone(e, events[-1].t_ns if events else 0),)
+        result = result_of(scenario, target.name, Verdict.ERROR, checks=checks, reason=str(e), trace=events)
+    finally:
+        trace.close()
+    return replace(
+        result,
+        seed=target.seed if target.seed is not None else scenario.form.seed,
+        reproduce=reproduce(scenario, *_words(target)) + _with_words(target),
+        took_s=(WallClock().monotonic_ns() - began_ns) / 1e9,
+        counts=collector.finish(),
+        trace_hash="",  # no two runs on a clock have the same
+    )
+
+
+def _of_a_plant(scenario: Scenario, target: Target) -> str:
+    """Return the reason for which a plant cannot run the scenario, found before the plant is accessed, or an empty string."""
+    can = {Can.PROBE}
+    if target.far:
+        can.add(Can.SEND_COMMAND)
+    if target.capture or not target.instance:
+        can.add(Can.SEE_WIRE)
+    return refusal(scenario, target.name, can, target.allow)
+
+
+def _words(target: Target) -> list[str]:
+    """Return the target as command-line options, without a token."""
+    words = ["--target", target.name]
+    said = {
+        "--seed": "" if target.seed is None else str(target.seed),
+        "--instance": target.instance,
+        "--field": target.field_host,
+        "--far": target.far,
+        "--capture": str(target.capture or ""),
+        "--can": target.can,
+        "--allow": target.allow.value if target.name == "real" and target.allow is not Target.allow else "",
+    }
+    return words + [word for option, value in said.items() if value for word in (option, value)]
+
+
+def _with_words(target: Target) -> str:
+    """Return the end of the command line for a user's controller."""
+    return f" --with -- {shlex.join(target.controller)}" if target.controller else ""
+
+
+def _of_a_foreign_controller(scenario: Scenario) -> str:
+    """Return the reason why a user's program cannot be tested by the scenario; empty if it can."""
+    probed = {name for probe in scenario.probes for name in probe.names}
+    ours = sorted(scenario.used - probed) + [
+        f"the probe {probe.name} (serve)" for probe in scenario.probes if probe.serve
+    ]
+    if not ours:
+        return ""
+    told = f"{', '.join(ours[:5])}{', ...' if len(ours) > 5 else ''}"
+    return (
+        f"the scenario looks at {told}: fieldtwin's own gateway and PLC publish that, and here a program of yours "
+        "controls. Let the scenario look at registers through `probes`"
+    )
+
+
+async def _run(scenario: Scenario, target: Target, trace: Trace) -> ScenarioResult:
+    me = asyncio.current_task()
+    assert me is not None
+    asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, me.cancel)
+    if scenario.network is not None:
+        return await run_network(scenario, target.seed, trace)
+    async with AsyncExitStack() as stack:
+        gone: Callable[[], FieldtwinError | None] = lambda: None  # noqa: E731
+        if target.name == "compose" or target.instance:
+            where = await _running(scenario, target)
+            if where.foreign and (refused := _of_a_foreign_controller(scenario)):
+                return result_of(scenario, target.name, Verdict.SKIPPED, reason=refused)
+        elif target.controller:
+            name = f"test-{os.getpid()}"
+            both = await stack.enter_async_context(
+                WithController(scenario.system, _field_config(scenario, target), target.controller, name)
+            )
+            where = Where(both.instance.dir, own=True, foreign=True, env=both.env)
+            gone = both.failure
+        else:
+            session = _session(scenario, target)
+            own = session.instance.dir
+
+            def tidy(kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+                if kind is None or not issubclass(kind, FieldtwinError):  # else its logs contain the reason
+                    shutil.rmtree(own, ignore_errors=True)
+
+            stack.push(tidy)
+            await stack.enter_async_context(session)
+            where = Where(
+                own,
+                far=target.far,
+                capture=session.options.capture,
+                own=target.name == "local",
+                plant=target.name == "real",
+                allowed=target.allow if target.name == "real" else Danger.DISRUPT,
+            )
+
+            def ended() -> FieldtwinError | None:
+                return next((failed for child in session.children.values() if (failed := child.failure())), None)
+
+            gone = ended
+
+        bench = ControlBench(
+            scenario.system,
+            where,
+            trace,
+            target=target.name,
+            names=sorted(scenario.used | _invariant_names(scenario, where)),
+            probes=scenario.probes,
+            fresh=lambda can: scenario.form.start == "fresh" and not refusal(scenario, target.name, can, where.allowed),
+            gone=gone,
+        )
+        async with bench:
+            result = await Runner(scenario, bench).run()
+            return _with_what_was_in(result, bench)
+
+
+def _invariant_names(scenario: Scenario, where: Where) -> set[str]:
+    """Return the tags and variables of the system file's invariants, if a fieldtwin gateway publishes them."""
+    ours = not where.foreign and (where.run_dir / "gateway.sock").exists()
+    return scenario.invariants.names if ours else set()
+
+
+def _with_what_was_in(result: ScenarioResult, bench: ControlBench) -> ScenarioResult:
+    """Add to a result other than a pass the faults and values that were in the devices before the scenario began."""
+    before = bench.lease.before if bench.lease is not None else ""
+    if not before or result.verdict in (Verdict.PASSED, Verdict.SKIPPED):
+        return result
+    return replace(result, reason=f"{result.reason}; before this scenario began, these were in already: {before}")
+
+
+def _session(scenario: Scenario, target: Target) -> RunSession:
+    """Return the run of the system for this scenario."""
+    name = f"test-{os.getpid()}"
+    seed = target.seed if target.seed is not None else scenario.form.seed
+    plant = target.name == "real"
+    options = RunOptions(
+        system=str(scenario.system.path),
+        prototype=not plant,
+        allow_writes=plant and target.allow.rank >= Danger.WRITE.rank,
+        instance=name,
+        profiles=scenario.profiles,
+        prototype_file=prototype_of(scenario),
+        capture=Instance(name).dir / "capture.jsonl",
+        cold=True,
+        seed=None if plant else seed,
+        can="" if plant else target.can,
+    )
+    return RunSession(options)
+
+
+def _field_config(scenario: Scenario, target: Target) -> FieldConfig:
+    """Return the configuration of the simulated field devices for the user's program."""
+    system, file = scenario.system, prototype_of(scenario)
+    cans = [name for name, bus in system.buses.items() if bus.endpoint.is_can and target.can]
+    return FieldConfig(
+        system=str(system.path.resolve()),
+        run_dir="",
+        prototype=str(file.resolve()) if file is not None else "",
+        profiles=tuple(str(path.resolve()) for path in scenario.profiles),
+        listen=dict.fromkeys(cans, f"can:{target.can}"),
+        seed=target.seed if target.seed is not None else scenario.form.seed,
+    )
+
+
+async def _running(scenario: Scenario, target: Target) -> Where:
+    """Return the access to a running instance, by its name on this host (in its container, for `compose`)."""
+    plant = target.name == "real"
+    run_dir = runtime_root() / (target.instance or scenario.system.name)
+    host, socket, foreign = target.field_host, None, False
+    if not plant and not host:
+        under_with = {} if target.instance else os.environ
+        host, socket = await find_field(scenario.system, run_dir, under_with)
+        foreign = "FIELDTWIN_CONTROL" in under_with
+    return Where(
+        run_dir,
+        field_host="" if plant else host,
+        field_socket=socket,
+        foreign=foreign,
+        token=target.token,
+        far=target.far,
+        capture=target.capture,
+        plant=plant,
+        allowed=target.allow if plant else Danger.DISRUPT,
+    )

@@ -1,0 +1,56 @@
+"""Ask the user before running a foreign scenario, or a scenario of a foreign system, as for a template.
+
+Only the names in the scenario are examined: reading it completely assembles the process image of its system, which
+imports programs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from fieldtwin.gateway.core.errors import FieldtwinError
+from fieldtwin.gateway.core.files.yaml_file import load
+from fieldtwin.run.template import Ask, agree
+from fieldtwin.twin.site.data_files import network_file
+from fieldtwin.twin.site.system import System, load_system
+
+
+def agree_to_scenario(
+    ask: Ask, path: Path, profiles: Iterable[Path] = (), *, plant: bool = False, virtual: bool = False
+) -> None:
+    """Ask about the system or network of the scenario in `path`, and its probes, if they are inside a template.
+
+    `plant`: the run has no prototype; `virtual`: it opens no endpoint. A file that cannot be read is left to its next
+    reader. Raises `NotAllowed`.
+    """
+    profiles = tuple(profiles)
+    try:
+        said: Mapping[str, Any] = load(path).data
+        systems = _systems(path, said, profiles)
+    except FieldtwinError:
+        return
+    agree(ask, path, systems, beside=path, opens=() if virtual else _opens(said), plant=plant, virtual=virtual)
+
+
+def _systems(path: Path, said: Mapping[str, Any], profiles: tuple[Path, ...]) -> list[tuple[System, Path | None]]:
+    """Find the systems as `fieldtwin.scenarios.language.form` does: next to the scenario, or shipped.
+
+    A network yields all its members' systems.
+    """
+    name, prototype = str(said.get("system", "")), said.get("prototype")
+    beside = path.parent / name
+    named = str(beside) if beside.exists() else name.removesuffix(".yaml")
+    if (at := network_file(named, profiles)) is not None:
+        from fieldtwin.twin.network.network import load_network  # takes emulators, as a plant does not
+
+        return [(member.system, member.prototype.path) for member in load_network(at, profiles).members.values()]
+    return [(load_system(named, profiles), path.parent / prototype if isinstance(prototype, str) else None)]
+
+
+def _opens(said: Mapping[str, Any]) -> list[str]:
+    probes = said.get("probes")
+    entries = probes.items() if isinstance(probes, Mapping) else ()
+    asked = [(name, e["endpoint"]) for name, e in entries if isinstance(e, Mapping) and e.get("endpoint")]
+    return [f"it asks {endpoint} (probe {name})" for name, endpoint in asked]

@@ -1,0 +1,106 @@
+"""A scenario on the target `virtual`: a prototype in virtual time, in this thread, sealed off while it runs."""
+
+from __future__ import annotations
+
+import shlex
+import tempfile
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+from fieldtwin.emulators.virtual.chance import seeded
+from fieldtwin.emulators.virtual.loop import VirtualLoop
+from fieldtwin.emulators.virtual.seal import sealed
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
+from fieldtwin.gateway.core.errors import FieldtwinError
+from fieldtwin.gateway.wallclock import WallClock
+from fieldtwin.reports.run.coverage import Collector
+from fieldtwin.reports.run.machines import machines_of
+from fieldtwin.results.model import ScenarioResult, Verdict
+from fieldtwin.results.trace import Trace, open_sink
+from fieldtwin.run.benches.virtual_bench import VirtualBench
+from fieldtwin.run.targets.run_checks import RunJudge
+from fieldtwin.run.virtual.network import VirtualNetwork
+from fieldtwin.scenarios.judging.runner import ByChance, Runner, gone
+from fieldtwin.scenarios.language.about import result_of
+from fieldtwin.scenarios.language.form import Scenario
+from fieldtwin.twin.prototype.file import load_prototype
+
+
+def run_virtual(
+    scenario: Scenario, seed: int | None = None, trace_file: Path | None = None, by_chance: ByChance | None = None
+) -> ScenarioResult:
+    """Run it. `seed` before the scenario's own and the prototype file's. `by_chance`: random faults of a campaign."""
+    prototype = load_prototype(scenario.system, prototype_of(scenario)) if scenario.network is None else None
+    own = prototype.seed if prototype is not None else scenario.network.seed if scenario.network is not None else 0
+    chosen = seed if seed is not None else scenario.form.seed if scenario.form.seed is not None else own
+    judge = (
+        RunJudge(scenario, prototype, by_chance.faults if by_chance is not None else ())
+        if scenario.form.judge is not None
+        else None
+    )
+    collector = Collector(scenario.system, machines_of(scenario.system))
+    began_ns = WallClock().monotonic_ns()
+    loop = VirtualLoop()
+    error: FieldtwinError | None = None
+    result: ScenarioResult | None = None
+    with tempfile.TemporaryDirectory(prefix="ft-scenario-") as folder:
+        sink = open_sink(trace_file) if trace_file is not None else None
+        trace = Trace(sink=sink)
+        trace.listen(collector.feed)
+
+        async def main() -> ScenarioResult:
+            if scenario.network is not None:
+                async with VirtualNetwork(scenario.network, loop, Path(folder), trace, seed=chosen) as whole:
+                    return await _judged(scenario, Runner(scenario, whole.bench, by_chance), judge, whole.systems)
+            assert prototype is not None
+            async with VirtualBench(
+                scenario.system, prototype, loop, Path(folder), trace, seed=chosen, probes=scenario.probes
+            ) as bench:
+                return await _judged(scenario, Runner(scenario, bench, by_chance), judge, {"": bench})
+
+        try:
+            with seeded(chosen), sealed():
+                result = loop.run_until_complete(main())
+        except FieldtwinError as e:
+            error = e
+        finally:
+            loop.close()
+            trace.close()
+    if result is None:
+        assert error is not None
+        events = tuple(trace.events)
+        checks = (gone(error, events[-1].t_ns if events else 0),)
+        result = result_of(scenario, "virtual", Verdict.ERROR, checks=checks, reason=str(error), trace=events)
+    return replace(
+        result,
+        seed=chosen,
+        reproduce=reproduce(scenario, "--seed", str(chosen)),
+        took_s=(WallClock().monotonic_ns() - began_ns) / 1e9,
+        counts=collector.finish(),
+    )
+
+
+async def _judged(
+    scenario: Scenario, runner: Runner, judge: RunJudge | None, benches: Mapping[str, VirtualBench]
+) -> ScenarioResult:
+    """Run the scenario, with the checks of a run in addition if it requests them."""
+    if judge is None:
+        return await runner.run()
+    judge.attach(benches)
+    async with Nursery() as nursery:
+        nursery.start(judge.watch(), "judge")
+        result = await runner.run()
+    return await judge.finish(result)
+
+
+def reproduce(scenario: Scenario, *more: str) -> str:
+    """Return the command line that repeats a scenario."""
+    profiles = [word for folder in scenario.profiles for word in ("--profiles", str(folder))]
+    return shlex.join(["fieldtwin", "test", str(scenario.path), *more, *profiles])
+
+
+def prototype_of(scenario: Scenario) -> Path | None:
+    """Return the prototype file that the scenario names, if any."""
+    named = scenario.form.prototype
+    return None if named is None else scenario.path.parent / named

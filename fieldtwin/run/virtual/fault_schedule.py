@@ -1,0 +1,203 @@
+"""Faults that a seed chooses: kind, target, begin and end.
+
+The last part of a run has none, so that recovery can be observed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from random import Random
+from typing import Any
+
+from fieldtwin.emulators.faults.fault import Kind
+from fieldtwin.emulators.faults.registry import FAULTS, fault_class
+from fieldtwin.emulators.faults.schema import parse_fault
+from fieldtwin.emulators.faults.values.value_ranges import numbers
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.files.nearest import did_you_mean
+from fieldtwin.twin.network.network import WATER, Network
+from fieldtwin.twin.prototype.fault_aims import target
+from fieldtwin.twin.site.system import System
+
+MEAN_S = 120.0
+"""Mean number of seconds between two faults."""
+SHORTEST_S, LONGEST_S = 0.5, 20.0
+CALM_S = 120.0
+"""Time in seconds without faults at the end."""
+MOST = 500
+WATER_MEAN_S = 300.0
+LONGEST_IN_WATER_S = 60.0
+NOT_BY_CHANCE = frozenset({"set", "late-frame"})
+"""Faults that are never random.
+
+`set` is not a fault; no gateway could detect `late-frame`, because no CAN frame carries the time of its values.
+"""
+UNSEEN_ON_TCP = frozenset({"corrupt-bits", "collision", "wrong-baud", "wrong-parity", "noise", "echo"})
+"""Serial faults that sockets do not get: Modbus TCP has no check sum of its own, so no gateway could detect them."""
+
+
+@dataclass(frozen=True, slots=True)
+class RandomFaults:
+    """The choices of a seed.
+
+    `mean_s`: mean seconds between two faults. `kinds`: names of faults; empty: all that a gateway can detect, without
+    faults of values. `aims`: DEVICE, BUS (each device on it) or DEVICE.TAG (the fault affects that register or object
+    only); in a network they are prefixed by the name of their system, and `water` is the acoustic channel. Empty: every
+    device.
+    """
+
+    mean_s: float = MEAN_S
+    kinds: tuple[str, ...] = ()
+    aims: tuple[str, ...] = ()
+
+    def check(self, system: System, network: Network | None = None) -> None:
+        """Raise `UsageError` for a fault or an aim that does not exist, and for kinds that fit no aim."""
+        if self.mean_s <= 0:
+            raise UsageError(
+                "the time between two random faults", expected="more than 0, such as 30s", got=f"{self.mean_s:g}"
+            )
+        for name in self.kinds:
+            if fault_class(name).name in NOT_BY_CHANCE:
+                raise UsageError(f"{name!r} cannot be chosen by chance", hint="put it into the scenario as a step")
+        members = {"": system} if network is None else {f"{m.name}.": m.system for m in network.members.values()}
+        of = {prefix: self.under(prefix) for prefix in members}
+        known = [prefix + aim for prefix, one in members.items() for aim in _aims_of(one)]
+        for aim in self.aims:
+            if aim in known or (network is not None and aim == WATER):
+                continue
+            hint = did_you_mean(aim, known)
+            raise UsageError(
+                f"no device, bus or tag {aim!r} to aim random faults at",
+                expected="DEVICE, BUS or DEVICE.TAG",
+                hint=hint,
+            )
+        choices = [choice for prefix, one in members.items() for choice in _choices(one, of[prefix])]
+        if not any(names for _, _, names in choices) and WATER not in self.aims:
+            raise UsageError(
+                "no such fault fits what is aimed at",
+                got=f"{', '.join(self.kinds)} at {', '.join(self.aims) or 'every device'}",
+            )
+
+    def under(self, prefix: str) -> RandomFaults:
+        """Return the same for one system of a network, whose names begin with `prefix` (empty: a system alone)."""
+        aims = tuple(aim.removeprefix(prefix) for aim in self.aims if aim.startswith(prefix))
+        return RandomFaults(self.mean_s, self.kinds, aims or (("",) if self.aims else ()))
+
+
+ANY = RandomFaults()
+
+
+def _aims_of(system: System) -> Iterator[str]:
+    yield from system.buses
+    for device in system.devices.values():
+        yield device.name
+        yield from (f"{device.name}.{tag}" for tag in device.profile.tags)
+
+
+def _choices(system: System, wanted: RandomFaults) -> list[tuple[str, str, list[str]]]:
+    """Return each (device, tag or empty, names of the faults that can strike there), in the order of the system file."""
+    found: list[tuple[str, str, list[str]]] = []
+    for device in system.devices.values():
+        of_tag = [aim.partition(".")[2] for aim in wanted.aims if aim.startswith(f"{device.name}.")]
+        tags = ["", *of_tag] if {device.name, device.bus} & set(wanted.aims) or not wanted.aims else of_tag
+        for tag in tags:
+            found.append((device.name, tag, list(_fitting(system, wanted, device.name, tag))))
+    return found
+
+
+def _fitting(system: System, wanted: RandomFaults, device: str, tag: str) -> Iterator[str]:
+    endpoint = system.buses[system.devices[device].bus].endpoint
+    for name, kind in FAULTS.items():
+        if name in NOT_BY_CHANCE or (wanted.kinds and name not in wanted.kinds):
+            continue
+        if kind.kind is Kind.VALUE:  # the device reports a wrong value: only on request
+            if wanted.kinds and (_struck(system, name, device) if not tag else tag in _struck(system, name, device)):
+                yield name
+        elif kind.kind is (Kind.CAN if endpoint.is_can else Kind.BYTES) and _is_seen(name, endpoint):
+            fits = not tag or _can_aim(system, name, device, tag)
+            if fits:
+                yield name
+
+
+def _is_seen(name: str, endpoint: Endpoint) -> bool:
+    return endpoint.is_serial or name not in UNSEEN_ON_TCP
+
+
+def _struck(system: System, name: str, device: str) -> list[str]:
+    """Return the tags of `device` that a fault of values can strike."""
+    return [
+        tag.name
+        for tag in numbers(system.devices[device].profile.tags.values())
+        if _can_aim(system, name, device, tag.name)
+    ]
+
+
+def _can_aim(system: System, name: str, device: str, tag: str) -> bool:
+    try:
+        target(system, parse_fault({"name": name, "device": device, "register": tag}))
+    except UsageError:
+        return False
+    return True
+
+
+def random_network_schedule(
+    network: Network, seed: int, duration_s: float, wanted: RandomFaults = ANY
+) -> tuple[dict[str, Any], ...]:
+    """Return the random faults of each system, drawn with its own seed, and packet losses of the acoustic channel."""
+    found = []
+    for member in network.members.values():
+        chosen = random_schedule(member.system, f"{seed} {member.name}", duration_s, wanted.under(f"{member.name}."))
+        for fault in chosen:
+            found.append({**fault, "id": f"{member.name}-{fault['id']}", "device": f"{member.name}.{fault['device']}"})
+    if (wanted.aims and WATER not in wanted.aims) or (wanted.kinds and "drop" not in wanted.kinds):
+        return tuple(sorted(found, key=lambda fault: float(fault["from"])))
+    random = Random(f"faults {seed} {WATER}")
+    mean_s = WATER_MEAN_S * wanted.mean_s / MEAN_S
+    at_s, last_s, number = random.expovariate(1 / mean_s), _last_s(duration_s), 0
+    while at_s < last_s and number < MOST:
+        number += 1
+        until_s = min(last_s, at_s + random.uniform(SHORTEST_S, LONGEST_IN_WATER_S))
+        lost: dict[str, Any] = {"id": f"{WATER}-f{number}", "name": "drop", "bus": WATER}
+        if random.random() < 0.5:
+            lost["device"] = random.choice(list(network.places))
+        lost |= {"from": round(at_s, 3), "until": round(until_s, 3), "probability": round(random.uniform(0.1, 1.0), 2)}
+        if lost["until"] > lost["from"]:
+            found.append(lost)
+        at_s += random.expovariate(1 / mean_s)
+    return tuple(sorted(found, key=lambda fault: float(fault["from"])))
+
+
+def _last_s(duration_s: float) -> float:
+    return duration_s - min(CALM_S, duration_s / 2)
+
+
+def random_schedule(
+    system: System, seed: int | str, duration_s: float, wanted: RandomFaults = ANY
+) -> tuple[dict[str, Any], ...]:
+    """Return faults in the form of a fault file; the same for the same system, seed, duration and choice."""
+    random = Random(f"faults {seed}")
+    choices = [choice for choice in _choices(system, wanted) if choice[2]]
+    last_s = _last_s(duration_s)
+    found: list[dict[str, Any]] = []
+    at_s = random.expovariate(1 / wanted.mean_s)
+    while at_s < last_s and len(found) < MOST and choices:
+        device, tag, names = random.choice(choices)
+        until_s = min(last_s, at_s + random.uniform(SHORTEST_S, LONGEST_S))
+        fault: dict[str, Any] = {
+            "id": f"f{len(found) + 1}",
+            "name": random.choice(names),
+            "device": device,
+            "from": round(at_s, 3),
+            "until": round(until_s, 3),
+        }
+        of_values = FAULTS[fault["name"]].kind is Kind.VALUE
+        if tag or of_values:
+            fault["register"] = tag or random.choice(_struck(system, fault["name"], device))
+        if random.random() < 0.5 and not of_values:
+            fault["probability"] = round(random.uniform(0.1, 1.0), 2)
+        if fault["until"] > fault["from"]:
+            found.append(fault)
+        at_s += random.expovariate(1 / wanted.mean_s)
+    return tuple(found)

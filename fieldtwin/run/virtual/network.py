@@ -1,0 +1,98 @@
+"""A network in virtual time: the prototypes of all its systems in one loop, with the acoustic channel and one seed.
+
+Each system behaves as it does alone (`VirtualBench`); the systems affect each other only through their modems.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from fieldtwin.emulators.endpoints.memory_ports import MemoryNet
+from fieldtwin.emulators.models.acoustic_link import AcousticLink
+from fieldtwin.emulators.virtual.clock import VirtualClock
+from fieldtwin.emulators.virtual.loop import VirtualLoop
+from fieldtwin.gateway.core.concurrency.async_resource import Started
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
+from fieldtwin.results.trace import FAR_END, Kind, Trace
+from fieldtwin.run.benches.network_bench import MemberTrace, NetworkBench, Part
+from fieldtwin.run.benches.virtual_bench import VirtualBench
+from fieldtwin.run.processes.topside import Scripted, Shore
+from fieldtwin.twin.network.network import Network
+from fieldtwin.twin.network.ship import Ship
+from fieldtwin.twin.network.water_faults import WaterFaults
+
+SEEDS_APART = 1_000_003
+"""Distance between the seeds of a run's systems, so that none repeats the random numbers of another."""
+
+
+class VirtualNetwork(Started):
+    """A network: ``async with VirtualNetwork(network, loop, folder, trace, seed=7) as it``, inside `loop`.
+
+    `it.bench` is a scenario's bench. `folder` takes each system's audit log. `commands` are those that the topside
+    modem sends by itself; a scenario uses `send` instead.
+    """
+
+    def __init__(
+        self,
+        network: Network,
+        loop: VirtualLoop,
+        folder: Path,
+        trace: Trace,
+        *,
+        seed: int,
+        commands: list[Scripted] | None = None,
+    ) -> None:
+        super().__init__()
+        self.network = network
+        self.trace = trace
+        self.faults = WaterFaults(network, seed)
+        self.medium = network.medium(seed, self.faults.spoils)
+        self.bench = NetworkBench(network, trace, "virtual", self.faults)
+        self.systems: dict[str, VirtualBench] = {}
+        self._loop = loop
+        self._folder = folder
+        self._seed = seed
+        self._commands = commands or []
+
+    async def _start(self) -> None:
+        for number, (name, member) in enumerate(self.network.members.items()):
+            folder = self._folder / name
+            folder.mkdir()
+            notes = MemberTrace(self.trace, name, self._later(name))
+            seed = member.prototype.seed + SEEDS_APART * self._seed + number
+            bench = VirtualBench(
+                member.system,
+                replace(member.prototype, seed=seed),
+                self._loop,
+                folder,
+                notes,
+                far_end=False,
+                water={member.modem: AcousticLink(self.medium, name)},
+            )
+            self.systems[name] = bench
+            await self._stack.enter_async_context(bench)
+            self.bench.parts[name] = Part(bench, notes)
+        self.faults.start_ns = next(iter(self.systems.values())).run.started_ns
+        if self.network.ship is not None:
+            await self._board()
+
+    def _later(self, name: str) -> Callable[[], int]:
+        """Return how much later than the first a system began."""
+        return lambda: self.systems[name].run.started_ns - next(iter(self.systems.values())).run.started_ns
+
+    async def _board(self) -> None:
+        """Open the topside modem and its controller."""
+        clock, net = VirtualClock(self._loop), MemoryNet(self._loop)
+        ship = Ship(self.network, self.medium, clock)
+        endpoint = await ship.open(net)
+        self._stack.push_async_callback(ship.aclose)
+        self.bench.shore = shore = Shore(ship.like.system, ship.like.modem, endpoint, clock, net)
+        shore.on_send = self._commanded
+        nursery = await self._stack.enter_async_context(Nursery())
+        nursery.start(shore.run(self._commands), "ship")
+
+    def _commanded(self, period_s: int) -> None:
+        data = {"text": f"commands {period_s} s", "period_s": period_s}
+        self.trace.note(self.bench.now_ns(), Kind.NOTE, FAR_END, data)

@@ -1,0 +1,314 @@
+"""A run in virtual time: ``fieldtwin run SYSTEM --prototype --virtual --seed N --for 24h``.
+
+Everything happens in this thread, without access to clocks, sockets and threads; between two pieces of the run that
+access is allowed, to report progress. Everything that is the same from run to run is traced and hashed.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from fieldtwin.emulators.faults.schema import seconds
+from fieldtwin.emulators.virtual.loop import VirtualLoop
+from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.statemachine import encode_period
+from fieldtwin.gateway.core.values import Quality, TagValue
+from fieldtwin.gateway.runtime.buses.learnt_gaps import describe_learnt
+from fieldtwin.gateway.runtime.gateway import stale_limits
+from fieldtwin.gateway.runtime.status import describe
+from fieldtwin.results.trace import Event, Kind
+from fieldtwin.run.benches.invariant_watch import InvariantWatch
+from fieldtwin.run.benches.virtual_bench import VirtualBench
+from fieldtwin.run.live.summary import summarise
+from fieldtwin.run.processes.states import StateWatch, expected_states
+from fieldtwin.run.processes.topside import Shore, script
+from fieldtwin.run.virtual.age_oracle import AgeOracle
+from fieldtwin.run.virtual.driven import DrivenRun
+from fieldtwin.run.virtual.fault_schedule import RandomFaults, random_schedule
+from fieldtwin.run.virtual.message_oracle import MessageOracle
+from fieldtwin.scenarios.judging.runner import TICK_S
+from fieldtwin.twin.prototype.field import FieldSide
+from fieldtwin.twin.prototype.field_process import FieldConfig, resolve
+
+SETTLE_S = 10.0
+"""Time in seconds for a command in progress after the end of the run."""
+LAST_REPLIES_S = 0.5
+CALM_S = 60.0
+"""Time in seconds after the last fault in which the system must recover."""
+CAN_WIRE_NS = 10 * NS_PER_MS
+"""The time that a frame may need on a CAN bus: several attempts, after other frames."""
+STALE_CHECK_NS = 100 * NS_PER_MS
+"""Minimum time between two checks for values that are still good although they exceed their maximum age."""
+_GOOD = Quality.GOOD  # an Enum's members are slow to look up
+
+
+@dataclass(frozen=True)
+class VirtualOptions:
+    """The system to run and the duration of the run. `faults` are injected in addition; `trace` is a file for every event."""
+
+    system: str
+    duration_s: float
+    seed: int | None = None
+    profiles: tuple[Path, ...] = ()
+    prototype_file: Path | None = None
+    recordings: dict[str, str] = field(default_factory=dict)
+    speed: float = 0.0
+    commands: tuple[int, ...] = ()
+    faults: tuple[dict[str, Any], ...] = ()
+    random_faults: RandomFaults | None = None
+    """The random faults that the seed chooses, in addition to `faults`."""
+    trace: Path | None = None
+
+    prototype: bool = True
+    field_host: str = ""
+
+    def make(self) -> VirtualRun:
+        """Return the run of these options."""
+        return VirtualRun(self)
+
+
+class _Instance:
+    name = "virtual"
+
+
+class VirtualRun(DrivenRun):
+    """One run. `summary()` afterwards; `trace` and `oracle` while it runs."""
+
+    def __init__(self, options: VirtualOptions) -> None:
+        config = FieldConfig(
+            system=options.system,
+            run_dir="",
+            prototype=str(options.prototype_file) if options.prototype_file else "",
+            profiles=tuple(map(str, options.profiles)),
+            recordings=options.recordings,
+            speed=options.speed,
+        )
+        twin = resolve(config)  # report errors in the files before anything starts
+        self.options = options
+        self.system = twin.ecs.system
+        self.prototype = twin.prototype
+        super().__init__(
+            self.prototype.seed if options.seed is None else options.seed, options.duration_s, options.trace
+        )
+        self.faults = options.faults
+        if options.random_faults is not None:
+            options.random_faults.check(self.system)
+            self.faults += random_schedule(self.system, self.seed, options.duration_s, options.random_faults)
+        self.instance = _Instance()
+        self.states = StateWatch(self.system)
+        self.oracle = AgeOracle()
+        self.messages = MessageOracle()
+        """Compares the commands that reached the gateway through a mailbox with those that the remote client sent."""
+        self.invariants: InvariantWatch | None = None
+        """The invariants that this run checks; a scenario checks the invariants itself."""
+        self._stated = InvariantWatch(self.system)
+        self.gateway_status: dict[str, Any] | None = None
+        self.plc_status: dict[str, Any] | None = None
+        self.field_status: dict[str, Any] | None = None
+        self.counted_before: dict[str, dict[str, int]] = {}
+        self.clients_before: dict[str, dict[str, dict[str, int]]] = {}
+        self.outputs_confirmed_safe: bool | None = None
+        self.mapping: dict[Endpoint, Endpoint] = {}
+        self.far: dict[str, Endpoint] = {}
+        self.shore: Shore | None = None
+        self._numbers: dict[str, int] = {}
+        self._emulated: frozenset[str] = frozenset()
+
+    @property
+    def scripted(self) -> list[tuple[float, int]]:
+        """The times (s) and periods of the remote client's commands; empty if the prototype has no link for them."""
+        o = self.options
+        if not o.commands or all(device.form.far is None for device in self.prototype.devices.values()):
+            return []
+        return [(one.at_s, one.period_s) for one in script(o.commands, o.duration_s)]
+
+    @property
+    def disturbed(self) -> bool:
+        return bool(self.faults)
+
+    @property
+    def calm(self) -> bool:
+        """Return whether every fault had been over for `CALM_S` at the end."""
+        ends = (fault.get("until") for fault in self.faults)
+        return all(end is not None and seconds(end) <= self.elapsed_s - CALM_S for end in ends)
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        return self.system.hash, self.prototype.path.read_text(encoding="utf-8")
+
+    async def _main(self, loop: VirtualLoop, run_dir: Path) -> None:
+        o = self.options
+        commands = script(o.commands, o.duration_s) if o.commands else []
+        async with VirtualBench(
+            self.system,
+            self.prototype,
+            loop,
+            run_dir,
+            self.trace,
+            seed=self.seed,
+            commands=commands,
+            far_end=bool(commands),
+        ) as bench:
+            self.attach(bench)
+            for fault in self.faults:  # each has its own start time
+                await bench.inject(fault)
+            async with Nursery() as nursery:
+                self.watch_invariants(bench, nursery)
+                await self._through(bench, loop, lambda: self.judge(bench))
+                await self._settle(bench)
+            if self.shore is not None:
+                await self.shore.halt()
+            await self.finish(bench)
+
+    def watch_invariants(self, bench: VirtualBench, nursery: Nursery) -> None:
+        """Judge the invariants of the system file from now on, as long as `nursery` is open."""
+        self.invariants = self._stated
+        if self._stated:
+            nursery.start(self._stated.run(bench, TICK_S), "invariants")
+
+    def attach(self, bench: VirtualBench) -> None:
+        """Begin to check the events on `bench`."""
+        self._judged = True
+        self.mapping, self.far, self.shore = bench.run.mapping, bench.run.field.far, bench.shore
+        self._emulated = frozenset(bench.run.field.devices)
+        bench.run.gateway.tags.on_put = self._watched(bench)
+        if self.shore is not None:
+            for pump in bench.run.gateway.pumps:
+                if pump.driver.config.name in self.far:
+                    self.messages.watch(pump.driver.emitter)
+        bench.trace.listen(self._on_state, Kind.STATE)
+        self.states.knows(bench.run.twin.ecs.layout)
+        for program, state in bench.states().items():
+            self.states.note(program, state, bench.loop.now_ns)
+
+    def judge(self, bench: VirtualBench) -> None:
+        """Check the values published since the last call. Call it often enough that no journal overflows."""
+        self.elapsed_s = bench.now_s()
+        self._judge(bench.run.field)
+
+    async def finish(self, bench: VirtualBench) -> None:
+        """Stop the gateway in order and take the last figures; then `summary`."""
+        self.outputs_confirmed_safe = await bench.run.stop_gateway()
+        outputs = describe(bench.run.gateway, bench.loop.now_ns)["outputs"]  # a stopped node has no certain values
+        await bench.sleep_until_s(bench.now_s() + LAST_REPLIES_S)
+        self._judge(bench.run.field)
+        if self.shore is not None:
+            self.messages.judge([encode_period(period).data for period in self.shore.commands_sent])
+        self._take_status(bench, outputs)
+
+    async def _settle(self, bench: VirtualBench) -> None:
+        """Wait for a command in progress."""
+        deadline_s = bench.now_s() + SETTLE_S
+        while self.shore is not None and bench.now_s() < deadline_s:
+            expected = expected_states(self.shore.commands_sent)
+            if all(self.states.sequence(p) == expected for p in self.states.relays):
+                return
+            await bench.sleep_until_s(bench.now_s() + 0.1)
+
+    # -- checks
+    # ---------------------------------------------------------------------------------------------------------
+
+    def _watched(self, bench: VirtualBench) -> Callable[[str, TagValue], None]:
+        told, loop = bench.run.gateway.tags.on_put, bench.loop
+        asked_by_device = {
+            name: bench.asked_ns[device.bus]
+            for name, device in self.system.devices.items()
+            if not self.system.buses[device.bus].endpoint.is_can
+        }
+        check_ages = self._age_check(bench)
+        asked_of: dict[str, deque[int] | None] = {}
+        """By tag: the times of requests on its bus; None for a message that a node sends by itself."""
+
+        def put(name: str, value: TagValue) -> None:
+            if told is not None:
+                told(name, value)
+            check_ages()
+            if value.quality is _GOOD:
+                # A value is timed at the moment when its reply was complete; the device answered after the request. A
+                # node's unrequested message was on the bus for some time, longer if it had to be sent again.
+                try:
+                    asked = asked_of[name]
+                except KeyError:
+                    asked = asked_of[name] = asked_by_device.get(name.partition(".")[0])
+                since_ns = value.t_ns
+                if asked is None:
+                    since_ns -= CAN_WIRE_NS
+                else:
+                    for asked_ns in reversed(asked):
+                        if asked_ns <= since_ns:
+                            since_ns = asked_ns
+                            break
+                self.oracle.published(name, value.raw, value.value, since_ns, loop.now_ns)
+
+        return put
+
+    def _age_check(self, bench: VirtualBench) -> Callable[[], None]:
+        """Return a function that reports to the check which values the gateway still considers good, whether new or not.
+
+        The device must have held such a value within the value's maximum age, plus the time of one exchange. The
+        function does so at most every `STALE_CHECK_NS`.
+        """
+        tags, loop = bench.run.gateway.tags, bench.loop
+        limits_ns = {
+            tag: limit_ms * NS_PER_MS + self._exchange_ns(driver.config.bus)
+            for driver in bench.run.gateway.drivers.values()
+            for tag, limit_ms in stale_limits(driver).items()
+            if limit_ms is not None
+        }
+        next_ns = 0
+
+        def check() -> None:
+            nonlocal next_ns
+            if loop.now_ns < next_ns:
+                return
+            next_ns = loop.now_ns + STALE_CHECK_NS
+            for tag, limit_ns in limits_ns.items():
+                value = tags.current(tag, loop.now_ns)
+                if value.quality is _GOOD:
+                    self.oracle.still_good(tag, value.raw, value.value, loop.now_ns - limit_ns, loop.now_ns)
+
+        return check
+
+    def _exchange_ns(self, bus: str) -> int:
+        """Return in ns how much older than its last refresh a value may be, because the device held it before its reply came."""
+        config = self.system.buses[bus]
+        return CAN_WIRE_NS if config.endpoint.is_can else round(config.timeout_s * NS_PER_S)
+
+    def _on_state(self, event: Event) -> None:
+        if event.where.endswith(".state") and isinstance(event.data["value"], str):
+            self.states.note(event.where.removesuffix(".state"), event.data["value"], event.t_ns)
+
+    def _judge(self, side: FieldSide) -> None:
+        for name, device in side.devices.items():
+            for held in device.journal.since(self._numbers.get(name, 0)):
+                self.oracle.held(f"{name}.{held.tag}", held.raw, held.t_ns)
+                self._numbers[name] = held.number
+        self.oracle.judge(self._emulated)
+
+    def _take_status(self, bench: VirtualBench, outputs: list[dict[str, Any]]) -> None:
+        now_ns = bench.loop.now_ns
+        gateway, plc = bench.run.gateway, bench.run.plc
+        self.gateway_status = {
+            **describe(gateway, now_ns),
+            "outputs": outputs,
+            "learnt": describe_learnt(gateway.drivers.values()),
+            "store_error": "",
+        }
+        self.plc_status = {**plc.describe(), "gateway_alive": plc.gateway_alive, "counters": plc.counters()}
+        self.field_status = bench.run.field.status()
+
+    def summary(self) -> dict[str, Any]:
+        """Return the summary of a run on this computer, with seed and trace; it does not depend on the speed of the run."""
+        return {
+            **summarise(self),
+            "virtual": True,
+            "seed": self.seed,
+            "trace": {"events": self.trace.count, "sha256": self.trace.hexdigest()},
+            "virtual_s": round(self.elapsed_s, 3),
+        }

@@ -1,0 +1,73 @@
+"""The process that answers a question: ``python -m fieldtwin.run.what_if.asked``. It reads one JSON object and writes one.
+
+Input, as `Asked`: a system, its known state, a command and the requirements. Output: ``{"objection": TEXT}``, empty if
+nothing speaks against the command. With ``"only_check": true`` nothing is run, and the objection is an error in the
+question.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+import msgspec
+
+from fieldtwin.gateway.core.errors import FieldtwinError
+from fieldtwin.run.processes.topside import Scripted
+from fieldtwin.run.what_if.asking import Asked
+from fieldtwin.run.what_if.fork import Fork, answer, check
+from fieldtwin.run.what_if.outcome import Outcome
+from fieldtwin.run.what_if.plan import Plan
+from fieldtwin.run.what_if.state import KnownState
+
+NICE = 5
+"""Niceness of the process: a plant or twin on the same computer has priority."""
+
+
+def objection(asked: Asked) -> str:
+    """Return the prototype's objection to the command; empty if all requirements hold."""
+    fork = Fork(
+        asked.system,
+        KnownState(asked.values, asked.programs, source="the twin's knowledge"),
+        asked.horizon_s,
+        tuple(map(Path, asked.profiles)),
+        Path(asked.prototype_file) if asked.prototype_file else None,
+        settle_s=asked.settle_s,
+    )
+    plan = Plan("the command", (Scripted(0.0, asked.period_s),), (), asked.require, asked.finally_)
+    try:
+        if asked.only_check:
+            check(fork, plan)
+            return ""
+        return told(answer(fork, plan))
+    except FieldtwinError as e:
+        return str(e)
+
+
+def told(outcome: Outcome) -> str:
+    """Return why a plan must not be followed: its fork failed, or the first requirement that does not hold."""
+    if outcome.error:
+        return f"the prototype failed: {outcome.error}"
+    for requirement in outcome.requirements:
+        if requirement.broken_s is not None:
+            when = "at the end" if requirement.kind == "finally" else "then"
+            return (
+                f"{requirement.text!r} does not hold {requirement.broken_s:.0f} s from now; {when} {requirement.seen}"
+            )
+    return ""
+
+
+def main() -> int:
+    if hasattr(os, "nice"):
+        os.nice(NICE)
+    answers = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # output of control logic must not mix with the answer
+    asked = msgspec.json.decode(sys.stdin.buffer.read(), type=Asked)
+    with answers:
+        answers.write(msgspec.json.encode({"objection": objection(asked)}) + b"\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,247 @@
+"""One fork: a prototype in virtual time that starts from the known state, executes a plan, and is observed up to the
+horizon.
+
+The gateway, the PLC and the emulators are those of every prototype run, unmodified; the events are summarized instead
+of traced. The fork is isolated like every run in virtual time.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from contextlib import AsyncExitStack, ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from fieldtwin.emulators.virtual.chance import seeded
+from fieldtwin.emulators.virtual.loop import VirtualLoop
+from fieldtwin.emulators.virtual.seal import sealed
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.concurrency.nursery import Nursery
+from fieldtwin.gateway.core.errors import FieldtwinError, UsageError
+from fieldtwin.gateway.core.values import Quality, Reason
+from fieldtwin.gateway.wallclock import WallClock
+from fieldtwin.plc.publishing import Change
+from fieldtwin.plc.task import StopReason
+from fieldtwin.run.processes.states import state_words
+from fieldtwin.run.processes.topside import Shore
+from fieldtwin.run.what_if.begin import begin, otherwise, retain_for
+from fieldtwin.run.what_if.outcome import Outcome, Requirement
+from fieldtwin.run.what_if.plan import Plan
+from fieldtwin.run.what_if.state import KnownState
+from fieldtwin.scenarios.language.expression import Expression
+from fieldtwin.twin.prototype.field_process import FieldConfig, resolve
+from fieldtwin.twin.prototype.virtual import VirtualPrototype
+
+LOOK_S = 1.0
+"""Interval in seconds at which requirements are evaluated, in addition to each change of a program's variables."""
+BEGUN_S = 2.0
+"""A plan without a command in this time (seconds) has not moved a program from its initial state."""
+MAX_TRANSITIONS = 10_000
+MAX_HORIZON_S = 30 * 86_400.0
+
+
+@dataclass(frozen=True)
+class Fork:
+    """A fork of `system` (name or path), from `state`, for `horizon_s` seconds.
+
+    Requirements count from `settle_s` on, because before that the gateway has not read everything yet.
+    """
+
+    system: str
+    state: KnownState
+    horizon_s: float
+    profiles: tuple[Path, ...] = ()
+    prototype_file: Path | None = None
+    seed: int | None = None
+    settle_s: float = 5.0
+
+
+def answer(fork: Fork, plan: Plan) -> Outcome:
+    """Run `plan` in a fork.
+
+    A failure inside it is in the outcome's `error`. Raises `FileInvalid` or `UsageError` if the fork cannot be started
+    at all.
+    """
+    _check_horizon(fork)
+    run = _ForkRun(fork, plan)
+    clock = WallClock()
+    began_ns = clock.monotonic_ns()
+    run.run()
+    run.outcome.took_s = (clock.monotonic_ns() - began_ns) / NS_PER_S
+    return run.outcome
+
+
+def check(fork: Fork, plan: Plan) -> None:
+    """Check that a fork can be started and that the plan's requirements can be evaluated; nothing is run.
+
+    Raises like `answer`.
+    """
+    _check_horizon(fork)
+    _ForkRun(fork, plan)
+
+
+def _check_horizon(fork: Fork) -> None:
+    if not 0 < fork.horizon_s <= MAX_HORIZON_S:
+        raise UsageError("the horizon", expected="over 0 s to 30 days", got=f"{fork.horizon_s:g} s")
+
+
+class _ForkRun:
+    def __init__(self, fork: Fork, plan: Plan) -> None:
+        config = FieldConfig(
+            system=fork.system,
+            run_dir="",
+            prototype=str(fork.prototype_file) if fork.prototype_file else "",
+            profiles=tuple(map(str, fork.profiles)),
+        )
+        twin = resolve(config)
+        self.fork, self.plan = fork, plan
+        self.system, self.prototype = twin.ecs.system, twin.prototype
+        self.outcome = Outcome(plan.name, fork.horizon_s)
+        self._words = {
+            f"{p}.state": words for p, words in state_words(twin.ecs.layout, self.system.plc.programs).items()
+        }
+        self._known = [f"{d}.{t}" for d, c in self.system.devices.items() for t in c.profile.tags]
+        self._variables = [t.name for region in twin.ecs.layout.regions for t in region.tags]
+        self._requirements = [self._requirement("require", text) for text in plan.require]
+        self._at_the_end = [self._requirement("finally", text) for text in plan.finally_]
+        self._run: VirtualPrototype | None = None
+        self._over = False
+
+    def _requirement(self, kind: str, text: str) -> tuple[Requirement, Expression]:
+        expression = Expression(text, [*self._known, *self._variables])
+        made = Requirement(kind, text)
+        self.outcome.requirements.append(made)
+        return made, expression
+
+    def run(self) -> None:
+        loop = VirtualLoop()
+        with ExitStack() as stack:
+            run_dir = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="ft-what-if-")))
+            stack.callback(loop.close)
+            retain_for(self.fork.state, run_dir)
+            with seeded(self.fork.seed or 0), sealed():
+                try:
+                    loop.run_until_complete(self._main(loop, run_dir))
+                except FieldtwinError as e:
+                    self.outcome.error = str(e)
+            for context in loop.unhandled[:1]:
+                told = f"{context.get('message')} {context.get('exception') or ''}".strip()
+                self.outcome.error = self.outcome.error or f"nobody caught: {told}"
+
+    async def _main(self, loop: VirtualLoop, run_dir: Path) -> None:
+        run = self._run = VirtualPrototype(
+            self.system,
+            self.prototype,
+            loop,
+            run_dir,
+            seed=self.fork.seed,
+            on_change=self._changed,
+            prepare=lambda made: self.outcome.not_taken.extend(begin(made, self.fork.state)),
+        )
+        async with AsyncExitStack() as stack:
+            await stack.enter_async_context(run)
+            run.gateway.tags.on_put = self.outcome.saw_tag
+            if self.plan.commands or run.field.far:  # without a topside controller, the modems would stay full
+                nursery = await stack.enter_async_context(Nursery())
+                nursery.start(self._shore().run(list(self.plan.commands)), "far end")
+            for fault in self.plan.faults:
+                run.field.faults.inject(fault)
+            await self._watch(run, loop)
+            if run.plc.stop_reason is not StopReason.NONE:  # whatever its variables say, no requirement holds any more
+                self.outcome.error = f"the PLC stopped ({run.plc.stop_reason.value}): {run.plc.error or 'on request'}"
+            self.outcome.ends(loop.now_ns)
+            # The end of the run (safe outputs) is not part of the plan.
+            run.gateway.tags.on_put, self._over = None, True
+            for requirement, expression in self._at_the_end:
+                self._judge(requirement, expression)
+
+    def _shore(self) -> Shore:
+        assert self._run is not None
+        device = next(iter(self._run.field.far), None)
+        if device is None:
+            raise UsageError("nobody can command this system", expected="a transmitter with a far end")
+        return Shore(self.system, device, self._run.field.far[device], self._run.clock, self._run.net)
+
+    async def _watch(self, run: VirtualPrototype, loop: VirtualLoop) -> None:
+        end_ns = run.started_ns + round(self.fork.horizon_s * NS_PER_S)
+        settled_ns = run.started_ns + round(min(self.fork.settle_s, self.fork.horizon_s) * NS_PER_S)
+        begun = False
+        while loop.now_ns < end_ns:
+            await run.clock.sleep_until_ns(min(loop.now_ns + round(LOOK_S * NS_PER_S), end_ns))
+            failure = run.failure()
+            if failure is not None:
+                raise failure
+            if not begun and (not run.plc.starts.waiting or loop.now_ns >= settled_ns):
+                begun = True
+                if all(c.at_s > max(BEGUN_S, self._now_s()) for c in self.plan.commands):
+                    self.outcome.not_taken.extend(otherwise(run, self.fork.state))
+            if loop.now_ns >= settled_ns:
+                for requirement, expression in self._requirements:
+                    self._judge(requirement, expression)
+
+    # -- what is seen ---------------------------------------------------------------------------------------------------
+
+    def _now_s(self) -> float:
+        assert self._run is not None
+        return (self._run.loop.now_ns - self._run.started_ns) / NS_PER_S
+
+    def _changed(self, change: Change) -> None:
+        if self._over:
+            return
+        value = self._named(change.tag, change.after)
+        assert self._run is not None  # it was made before any variable changed
+        self.outcome.saw_variable(change.tag, value, self._run.loop.now_ns)
+        if change.tag in self._words:
+            seen = self.outcome.states.setdefault(change.tag.removesuffix(".state"), [])
+            if len(seen) < MAX_TRANSITIONS:
+                seen.append((self._now_s(), str(value)))
+
+    def _named(self, tag: str, value: Any) -> Any:
+        return self._words[tag].get(value, value) if tag in self._words else value
+
+    def _judge(self, requirement: Requirement, expression: Expression) -> None:
+        # An unknown one is not met either.
+        if requirement.broken_s is None and expression.truth(self._look) is not True:
+            requirement.broken_s = self._now_s()
+            requirement.seen = "; ".join(
+                f"{name}: {self._look('value', name)!r}" for name in dict.fromkeys(expression.names)
+            )
+
+    def _look(self, function: str, name: str) -> Any:
+        run = self._run
+        assert run is not None
+        if name == "plc.late":
+            return 0.0
+        if name == "command_pending":
+            return False
+        tags = run.gateway.tags
+        if name not in tags:
+            outputs = run.plc.outputs.last()
+            known = {
+                "value": self._named(name, outputs.get(name)),
+                "quality": "good",
+                "age": 0.0,
+                "reason": "",
+                "updates": 0,
+            }
+            return known[function]
+        now_ns = run.clock.monotonic_ns()
+        seen = tags.current(name, now_ns)
+        match function:
+            case "quality" if seen.value is None:
+                return None  # it has not turned bad: it never had a value
+            case "quality":
+                return Quality(seen.quality).name.lower()
+            case "reason":
+                return Reason(seen.reason).name.lower()
+            case "age":
+                return (now_ns - seen.t_ns) / NS_PER_S
+            case "updates":
+                return self.outcome.variables[name].updates if name in self.outcome.variables else 0
+        return seen.value
+
+
+Progress = Callable[[Outcome], None]
+"""Called with each outcome as soon as it is available."""

@@ -1,0 +1,28 @@
+"""Runs several plans in parallel, in processes on this computer."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import Future, as_completed
+
+from fieldtwin.run.processes.workers import Workers
+from fieldtwin.run.what_if.fork import Fork, Progress, answer
+from fieldtwin.run.what_if.outcome import Outcome
+from fieldtwin.run.what_if.plan import Plan
+
+
+def answers(fork: Fork, plans: Sequence[Plan], jobs: int, progress: Progress = lambda outcome: None) -> list[Outcome]:
+    """Return the outcome of each plan, in their order. One job or one plan runs in this process. Raises like `answer`."""
+    if jobs <= 1 or len(plans) == 1:
+        found = []
+        for plan in plans:
+            found.append(answer(fork, plan))
+            progress(found[-1])
+        return found
+    with Workers(min(jobs, len(plans))) as pool:
+        waiting: dict[Future[Outcome], int] = {pool.submit(answer, fork, plan): n for n, plan in enumerate(plans)}
+        outcomes: dict[int, Outcome] = {}
+        for done in as_completed(waiting):
+            outcomes[waiting[done]] = done.result()
+            progress(done.result())
+    return [outcomes[n] for n in range(len(plans))]

@@ -1,0 +1,1 @@
+"""Run a scenario on a bench and judge it."""

@@ -1,0 +1,1 @@
+"""The language of scenario files: their form, expressions, invariants and probes."""

@@ -1,0 +1,59 @@
+"""Metadata of a scenario's result: its case id, the role under test, and its impact level.
+
+This module uses no bench and runs nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from fieldtwin.conformance.core.case import Danger
+from fieldtwin.results.model import ScenarioResult, Verdict
+from fieldtwin.scenarios.language.form import Scenario
+from fieldtwin.scenarios.language.words import Step, word_of
+
+SUFFIX = ".scenario.yaml"
+ROLE = "controller"
+"""The role under test: the gateway and PLC of the system, or the controller that the scenario's probes read."""
+_DANGER = {"send": Danger.WRITE, "set": Danger.WRITE, "fault": Danger.DISRUPT, "clear": Danger.DISRUPT}
+"""Impact levels of steps; all other steps observe."""
+
+
+def case_of(path: Path) -> str:
+    """Return the case id: the file's name without its suffix."""
+    return path.name.removesuffix(SUFFIX)
+
+
+def dangers(scenario: Scenario) -> Iterator[tuple[Danger, str]]:
+    """Yield each step and probe as its impact level and a description for people."""
+    for n, step in enumerate(scenario.form.steps, 1):
+        yield _danger_of(step), f"step {n}"
+    for probe in scenario.probes:
+        yield Danger.READ, f"the probe {probe.name}"
+
+
+def _danger_of(step: Step) -> Danger:
+    return _DANGER.get(word_of(step), Danger.OBSERVE)
+
+
+def danger_of(scenario: Scenario) -> Danger:
+    """Return the highest impact level of all its steps and probes."""
+    return max((danger for danger, _ in dangers(scenario)), key=lambda d: d.rank, default=Danger.OBSERVE)
+
+
+def result_of(scenario: Scenario, target: str, verdict: Verdict, **more: Any) -> ScenarioResult:
+    """Return a result with the scenario's metadata; `more` are the other fields of `ScenarioResult`."""
+    return ScenarioResult(
+        scenario.form.scenario,
+        verdict,
+        requirements=tuple(scenario.form.requirements),
+        file=str(scenario.path),
+        line=1,
+        target=target,
+        case=case_of(scenario.path),
+        role=ROLE,
+        danger=danger_of(scenario).value,
+        **more,
+    )

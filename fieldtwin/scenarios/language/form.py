@@ -1,0 +1,411 @@
+"""Reads a scenario file and checks it against its system: every error has file, line, column and the nearest known word."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from fieldtwin.emulators.faults.schema import FaultSpec, checked, parse_fault, seconds
+from fieldtwin.gateway.core.errors import FileInvalid, UsageError
+from fieldtwin.gateway.core.files.nearest import did_you_mean
+from fieldtwin.gateway.core.files.yaml_file import Key, YamlFile, load, validate
+from fieldtwin.scenarios.bench import Can
+from fieldtwin.scenarios.language.expression import QUALITIES, Expression, NotUnderstood
+from fieldtwin.scenarios.language.invariants import Invariants, load_invariants
+from fieldtwin.scenarios.language.probe_form import Probe, read_probe
+from fieldtwin.scenarios.language.words import WORDS, Bounds, Expect, ScenarioForm, Set, Step, Time, WireForm
+from fieldtwin.twin.network.faults import check_network_fault
+from fieldtwin.twin.network.network import Network, load_network
+from fieldtwin.twin.prototype.fault_aims import target
+from fieldtwin.twin.site.data_files import network_file
+from fieldtwin.twin.site.schema import NONE_STATED
+from fieldtwin.twin.site.system import System, load_system
+
+_TOGETHER = {
+    "tag": ("tag", "value", "tolerance", "quality", "like", "within", "during"),
+    "updates": ("tag", "quality", "updates_per_s", "during"),
+    "wire": ("wire", "access", "function", "register", "value", "times", "within"),
+    "rate": ("wire", "access", "function", "register", "value", "requests_per_s", "during"),
+    "that": ("that", "within", "during"),
+}
+"""The permitted keys of an expectation, by its subject."""
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A scenario file, checked against its system."""
+
+    path: Path
+    form: ScenarioForm
+    file: YamlFile
+    system: System
+    needs: tuple[Can, ...]
+    always: tuple[Expression, ...]
+    never: tuple[Expression | WireForm, ...]
+    known: tuple[str, ...] = ()
+    """The names that expressions may contain."""
+    own: tuple[str, ...] = ()
+    """Those of `known` that belong to the system."""
+    words: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    """The possible words of each name whose value is a word: the states of programs."""
+    probes: tuple[Probe, ...] = ()
+    profiles: tuple[Path, ...] = ()
+    network: Network | None = None
+    """The network, if it is a network's scenario; `system` is then the network's `whole`."""
+    used: set[str] = field(default_factory=set, compare=False)
+    """The tags and variables that the scenario uses."""
+    invariants: Invariants = field(default_factory=Invariants)
+    """The invariants of the system file, or of each system file of the network."""
+
+    def line(self, *loc: Key) -> str:
+        """Return FILE:LINE of a part of the scenario."""
+        line, _ = self.file.positions.get(loc, (1, 1))
+        return f"{self.path}:{line}"
+
+    def expression(self, text: str, *loc: Key) -> Expression:
+        """Return `text` as an expression. Raises `FileInvalid` with its place."""
+        try:
+            expression = Expression(text, self.known, self.words)
+        except UsageError as e:
+            error = self.file.error(loc, e.message, expected=e.expected, got=e.got, hint=e.hint)
+            raise self._inside(error, text, e.at_column if isinstance(e, NotUnderstood) else 0) from e
+        self.used.update(expression.names)
+        return expression
+
+    def _inside(self, error: FileInvalid, text: str, offset: int) -> FileInvalid:
+        """Return the error with its exact place inside the expression, if the file has the expression unchanged in one
+        line.
+        """
+        try:
+            line = self.path.read_text(encoding="utf-8").splitlines()[(error.line or 1) - 1]
+        except (OSError, IndexError):
+            return error
+        begins = line.find(text, (error.column or 1) - 1)
+        if begins < 0:
+            return error
+        return FileInvalid(
+            error.message, path=error.path, line=error.line, column=begins + 1 + offset, expected=error.expected,
+            got=error.got, hint=error.hint,
+        )  # fmt: skip
+
+
+def names_of(system: System, network: Network | None = None) -> dict[str, tuple[str, ...]]:
+    """Return the names that expressions may contain: DEVICE.TAG and PROGRAM.VARIABLE, in a network after the name of
+    their system. The value is a tuple of the words that a program's state can be, and empty for all other names."""
+    from fieldtwin.twin.plant.physical import image_layout
+
+    if network is not None:
+        of_all = [(m.name, names_of(m.system)) for m in network.members.values()]
+        return {f"{member}.{name}": words for member, names in of_all for name, words in names.items()}
+    names: dict[str, tuple[str, ...]] = {
+        f"{d.name}.{t.name}": () for d in system.devices.values() for t in d.profile.tags.values()
+    }
+    states = {f"{program}.state" for program in system.plc.programs}
+    for region in image_layout(system).regions:
+        for spec in region.tags:
+            names[spec.name] = tuple(word for _, word in spec.words) if spec.name in states else ()
+    return names
+
+
+def invariants_of(system: System, network: Network | None = None) -> Invariants:
+    """Return the invariants of a system, or of all systems of a network. Raises `FileInvalid`."""
+    if network is None:
+        return load_invariants(system, names_of(system)) if system.invariants != NONE_STATED else Invariants()
+    every = [load_invariants(m.system, names_of(m.system), f"{m.name}.") for m in network.members.values()]
+    return sum(every, Invariants())
+
+
+def load_scenario(path: Path, profiles: tuple[Path, ...] = ()) -> Scenario:
+    """Read a scenario and check it. Raises `FileInvalid`, `UsageError`."""
+    file = load(path)
+    _check_one_thing(file)
+    form = validate(file, ScenarioForm)
+    system, network = _system(file, form, profiles)
+    served = [one.name for one in system.serving.serve]
+    probes = tuple(read_probe(file, name, one, served) for name, one in form.probes.items())
+    own = names_of(system, network)
+    for probe in probes:
+        if probe.name in system.devices or probe.name in system.plc.programs:
+            raise file.error(("probes", probe.name), f"{probe.name!r} is a device or program of the system already")
+    known = tuple(dict.fromkeys([*own, *(name for probe in probes for name in probe.names)]))
+    scenario = Scenario(
+        path,
+        form,
+        file,
+        system,
+        _needs(file, form),
+        (),
+        (),
+        known,
+        tuple(own),
+        {name: words for name, words in own.items() if words},
+        probes,
+        profiles,
+        network,
+        invariants=invariants_of(system, network),
+    )
+    always = tuple(_looks(scenario, text, ("always", n)) for n, text in enumerate(form.always))
+    never: list[Expression | WireForm] = []
+    for n, one in enumerate(form.never):
+        if isinstance(one, str):
+            never.append(_looks(scenario, one, ("never", n)))
+        else:
+            _known(file, ("never", n, "wire"), "device", one.wire, list(system.devices))
+            _check_register(scenario, one.wire, one.register_, one.value, ("never", n))
+            if one.unless is not None:
+                scenario.expression(one.unless, "never", n, "unless")
+            never.append(one)
+    scenario = replace(scenario, always=always, never=tuple(never))
+    _check_whole_run(scenario)
+    for n, tag in enumerate(form.refused):
+        _known(file, ("refused", n), "tag", tag, scenario.own)
+        scenario.used.add(tag)
+    faults: list[str] = []
+    for n, step in enumerate(form.steps):
+        _check_step(scenario, step, n)
+        if step.fault is not None:
+            faults.append(str(step.fault.get("id", f"step {n + 1}")))
+        if step.clear is not None:
+            _known(file, ("steps", n, "clear"), "fault of an earlier step", step.clear, faults)
+    return scenario
+
+
+def _check_one_thing(file: YamlFile) -> None:
+    """Check, before the contents, that each step has only one word. Two words are usually caused by a missing hyphen."""
+    steps = file.data.get("steps")
+    for n, step in enumerate(steps if isinstance(steps, list) else ()):
+        said = [word for word in step if word in WORDS] if isinstance(step, dict) else []
+        if len(said) > 1:
+            raise file.error(("steps", n), "a step is one thing", expected=" or ".join(WORDS), got=", ".join(said))
+
+
+def _system(file: YamlFile, form: ScenarioForm, profiles: tuple[Path, ...]) -> tuple[System, Network | None]:
+    """Return the system that the file names, from its folder or the shipped ones, or the `whole` of the network."""
+    folder = Path(file.path).parent
+    beside = folder / form.system
+    named = str(beside) if beside.exists() else form.system.removesuffix(".yaml")
+    try:
+        at = network_file(named, profiles)
+        network = load_network(at, profiles) if at is not None else None
+        if network is not None:
+            _check_of_network(file, form)
+            return network.whole, network
+        system = load_system(named, list(profiles))
+    except UsageError as e:
+        raise file.error(("system",), e.message, expected=e.expected, got=e.got, hint=e.hint) from e
+    if form.prototype is not None and not (folder / form.prototype).is_file():
+        there = [one.name for one in sorted(folder.glob("*.yaml"))]
+        hint = did_you_mean(form.prototype, there)
+        raise file.error(("prototype",), f"no file {form.prototype!r} beside it", hint=hint)
+    return system, None
+
+
+def _needs(file: YamlFile, form: ScenarioForm) -> tuple[Can, ...]:
+    words = [can.value for can in Can]
+    for n, need in enumerate(form.needs):
+        _known(file, ("needs", n), "need", need, words)
+    asked = [Can(need) for need in form.needs]
+    if form.probes:
+        asked.append(Can.PROBE)
+    if form.start is not None:
+        asked.append(Can.FRESH_START)
+    if form.judge is not None:
+        asked.append(Can.JUDGE_RUN)
+    if any(isinstance(one, WireForm) for one in form.never) or any(one.wire is not None for one in form.rate):
+        asked.append(Can.SEE_WIRE)
+    asked += [need for step in form.steps for need in needs_of(step)]
+    return tuple(dict.fromkeys(asked))
+
+
+_IMPLIED = {"send": Can.SEND_COMMAND, "set": Can.SET_VALUE, "fault": Can.INJECT_FAULT, "clear": Can.INJECT_FAULT}
+
+
+def needs_of(step: Step) -> list[Can]:
+    """Return the capabilities of a target that a step needs."""
+    needs = [need for word, need in _IMPLIED.items() if getattr(step, word) is not None]
+    if step.expect is not None and step.expect.wire is not None:
+        needs.append(Can.SEE_WIRE)
+    if step.expect is not None and step.expect.like is not None:
+        needs.append(Can.SEE_HELD)
+    return needs
+
+
+def _check_step(scenario: Scenario, step: Step, n: int) -> None:
+    file, loc = scenario.file, ("steps", n)
+    said = [word for word in WORDS if getattr(step, word) is not None]
+    if len(said) != 1:
+        raise file.error(loc, "a step is one thing", expected=" or ".join(WORDS), got=", ".join(said) or "nothing")
+    try:
+        if step.fault is not None:
+            spec = parse_fault(step.fault, file, (*loc, "fault"), n + 1)
+            checked(lambda one: _aim(scenario, one), spec, file, (*loc, "fault"))
+        if step.wait is not None:
+            _looks(scenario, step.wait.until, (*loc, "wait", "until"))
+            _time(file, (*loc, "wait", "within"), step.wait.within)
+        if step.pause is not None:
+            _time(file, (*loc, "pause"), step.pause)
+        if step.set is not None:
+            _check_set(scenario, step.set, (*loc, "set"))
+        if step.expect is not None:
+            _check_expect(scenario, step.expect, (*loc, "expect"))
+    except UsageError as e:
+        raise file.error(loc, e.message, expected=e.expected, got=e.got, hint=e.hint) from e
+
+
+def _check_set(scenario: Scenario, said: Set, loc: tuple[Key, ...]) -> None:
+    _known(scenario.file, (*loc, "tag"), "tag", said.tag, scenario.own)
+    device, _, name = said.tag.rpartition(".")
+    found = scenario.system.devices.get(device)
+    if found is None or name not in found.profile.tags or said.value is None:
+        return
+    if found.profile.tags[name].is_text != isinstance(said.value, str):
+        wanted = "a text" if found.profile.tags[name].is_text else "a number"
+        raise scenario.file.error((*loc, "value"), f"{said.tag} is {wanted}", got=repr(said.value))
+
+
+def _aim(scenario: Scenario, spec: FaultSpec) -> None:
+    """Check a fault's aim. Raises `WrongAim` if it is neither in the system nor between the systems of a network."""
+    if scenario.network is not None:
+        check_network_fault(scenario.network, spec)
+    else:
+        target(scenario.system, spec)
+
+
+def _check_of_network(file: YamlFile, form: ScenarioForm) -> None:
+    """Refuse keys that apply to one system only."""
+    for key in ("probes", "prototype"):
+        if getattr(form, key):
+            raise file.error(
+                (key,), f"{key!r} says nothing about a network", expected="a scenario of one of its systems"
+            )
+
+
+def _check_expect(scenario: Scenario, expect: Expect, loc: tuple[Key, ...]) -> None:
+    said = [word for word in ("tag", "wire", "that") if getattr(expect, word) is not None]
+    if len(said) != 1:
+        raise scenario.file.error(loc, "an expectation is about one thing", expected="tag, wire or that")
+    kind = "rate" if expect.requests_per_s is not None else "updates" if expect.updates_per_s is not None else said[0]
+    for name in sorted(expect.model_fields_set):
+        key = type(expect).model_fields[name].alias or name
+        if key not in _TOGETHER[kind]:
+            raise scenario.file.error(
+                (*loc, key), f"{key!r} says nothing about this", expected=", ".join(_TOGETHER[kind])
+            )
+    if kind in ("rate", "updates") and expect.during is None:
+        raise scenario.file.error(loc, "a rate is one of some time", expected="during: 10s")
+    _check_numbers(scenario.file, expect, loc)
+    if expect.quality is not None:
+        _known(scenario.file, (*loc, "quality"), "quality", expect.quality, QUALITIES)
+    if expect.like is not None and (expect.tag or "").rpartition(".")[0] not in scenario.system.devices:
+        raise scenario.file.error((*loc, "like"), "only what a device holds can be like it", expected="tag: DEVICE.TAG")
+    if expect.tag is not None:
+        _known(scenario.file, (*loc, "tag"), "tag", expect.tag, scenario.known)
+        words = scenario.words.get(expect.tag, ())
+        if words and isinstance(expect.value, str):
+            _known(scenario.file, (*loc, "value"), f"value of {expect.tag}", expect.value, words)
+        scenario.used.add(expect.tag)
+    if expect.wire is not None:
+        devices = scenario.system.devices
+        _known(scenario.file, (*loc, "wire"), "device", expect.wire, list(devices))
+        _check_register(scenario, expect.wire, expect.register_, expect.value, loc)
+    if expect.that is not None:
+        _looks(scenario, expect.that, (*loc, "that"))
+
+
+def _check_register(scenario: Scenario, device: str, register: str | None, value: object, loc: tuple[Key, ...]) -> None:
+    """Check that `register` is a tag of the device. A `value` needs a register: without one it would never match."""
+    if register is not None:
+        tags = list(scenario.system.devices[device].profile.tags)
+        _known(scenario.file, (*loc, "register"), f"tag of {device}", register, tags)
+    elif value is not None:
+        raise scenario.file.error((*loc, "value"), "a value of which register?", expected="register: TAG")
+
+
+def _check_numbers(file: YamlFile, expect: Expect, loc: tuple[Key, ...]) -> None:
+    """Check the times, and that the bounds can be both met and missed."""
+    if expect.during is not None and _time(file, (*loc, "during"), expect.during) <= 0:
+        raise file.error((*loc, "during"), "what is looked at for no time is not seen", expected="during: 10s")
+    if expect.within is not None:
+        _time(file, (*loc, "within"), expect.within)
+    _check_bounds(file, (*loc, "requests_per_s"), expect.requests_per_s)
+    _check_bounds(file, (*loc, "times"), expect.times if isinstance(expect.times, Bounds) else None)
+    rate = list(expect.updates_per_s or (0, 0))
+    if len(rate) != 2 or rate[0] > rate[1]:
+        raise file.error(
+            (*loc, "updates_per_s"), "a rate is from one number to another", expected="[9, 11]", got=str(rate)
+        )
+
+
+def _looks(scenario: Scenario, text: str, loc: tuple[Key, ...]) -> Expression:
+    """Return an expression that names something of the system, so that it can be true or false."""
+    expression = scenario.expression(text, *loc)
+    if expression.is_constant:
+        raise scenario.file.error(loc, "this looks at nothing", expected="a tag or a variable in it", got=text)
+    return expression
+
+
+def _check_bounds(file: YamlFile, loc: tuple[Key, ...], bounds: Bounds | None) -> None:
+    if bounds is None:
+        return
+    if bounds.min is None and bounds.max is None:
+        raise file.error(loc, "these bounds hold whatever comes", expected="min or max")
+    if bounds.min is not None and bounds.max is not None and bounds.min > bounds.max:
+        raise file.error(loc, "nothing is within these bounds", got=f"min {bounds.min:g}, max {bounds.max:g}")
+
+
+def _check_whole_run(scenario: Scenario) -> None:
+    """Check the rules of the whole run: `within`, `rate`, `cycle`."""
+    file, form = scenario.file, scenario.form
+    for n, within in enumerate(form.within):
+        _looks(scenario, within.after, ("within", n, "after"))
+        _looks(scenario, within.then, ("within", n, "then"))
+        _time(file, ("within", n, "within"), within.within)
+    for n, rate in enumerate(form.rate):
+        loc: tuple[Key, ...] = ("rate", n)
+        ours = (rate.tag is not None, rate.updates_per_s is not None, rate.wire is None, rate.requests_per_s is None)
+        if len(set(ours)) != 1:
+            expected = "tag and updates_per_s, or wire and requests_per_s"
+            raise file.error(loc, "a rate is one of a tag or of a wire", expected=expected)
+        if rate.tag is not None:
+            _known(file, (*loc, "tag"), "tag", rate.tag, scenario.known)
+            scenario.used.add(rate.tag)
+        if rate.wire is not None:
+            _known(file, (*loc, "wire"), "device", rate.wire, list(scenario.system.devices))
+        _check_bounds(file, (*loc, "updates_per_s"), rate.updates_per_s)
+        _check_bounds(file, (*loc, "requests_per_s"), rate.requests_per_s)
+        if _time(file, (*loc, "over"), rate.over) <= 0:
+            raise file.error((*loc, "over"), "a rate is one of some time", expected="over: 10s")
+        if rate.while_ is not None:
+            scenario.expression(rate.while_, *loc, "while")
+    for n, cycle in enumerate(form.cycle):
+        loc = ("cycle", n)
+        bounds = (cycle.min is not None or cycle.max is not None) and cycle.changes_of is not None
+        if bounds == (cycle.late is not None):
+            raise file.error(loc, "a cycle has bounds", expected="changes_of: NAME with min or max; or late: 5ms")
+        if cycle.changes_of is not None:
+            _known(file, (*loc, "changes_of"), "tag or variable", cycle.changes_of, scenario.known)
+            scenario.used.add(cycle.changes_of)
+        times = {
+            key: _time(file, (*loc, key), said)
+            for key in ("min", "max", "late")
+            if (said := getattr(cycle, key)) is not None
+        }
+        if times.get("min", 0) > times.get("max", times.get("min", 0)):
+            raise file.error(loc, "nothing is within these bounds", got=f"min {cycle.min}, max {cycle.max}")
+        if cycle.while_ is not None:
+            scenario.expression(cycle.while_, *loc, "while")
+
+
+def _time(file: YamlFile, loc: tuple[Key, ...], text: Time) -> float:
+    try:
+        return seconds(text)
+    except UsageError as e:
+        raise file.error(loc, e.message, expected=e.expected, got=e.got, hint=e.hint) from e
+
+
+def _known(file: YamlFile, loc: tuple[Key, ...], what: str, name: str, known: Sequence[str]) -> None:
+    if name in known:
+        return
+    hint = did_you_mean(name, known)
+    raise file.error(loc, f"no {what} {name!r}", expected=", ".join(known) if len(known) < 30 else "", hint=hint)

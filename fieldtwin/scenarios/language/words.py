@@ -1,0 +1,146 @@
+"""The words of a scenario file and the forms of their contents: strict, and independent of any system."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from fieldtwin.scenarios.language.probe_form import ProbeForm
+
+Time = str | float | int
+Number = float | int
+
+
+class _Form(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, populate_by_name=True)
+
+
+class Send(_Form):
+    """The step `send`: the remote client commands a period."""
+
+    from_: str = Field(default="shore", alias="from")
+    period_s: int
+
+
+class Set(_Form):
+    """The step `set`: a device holds a value for DEVICE.TAG; null ends that."""
+
+    tag: str
+    value: Number | bool | str | None
+
+
+class Wait(_Form):
+    until: str
+    within: Time = 5
+
+
+class Bounds(_Form):
+    min: Number | None = None
+    max: Number | None = None
+
+
+class WireForm(_Form):
+    """A pattern of exchanges on a device's bus."""
+
+    wire: str
+    access: Literal["read", "write"] | None = None
+    function: int | None = None
+    register_: str | None = Field(default=None, alias="register")
+    value: Number | None = None
+    unless: str | None = None
+
+
+class Expect(_Form):
+    """One expectation: `tag` and its keys, or `wire` and its keys, or `that`."""
+
+    tag: str | None = None
+    value: Number | bool | str | None = None
+    tolerance: Number = Field(default=0, ge=0)
+    quality: str | None = None
+    like: Literal["recording"] | None = None
+    updates_per_s: tuple[Number, Number] | list[Number] | None = None
+    wire: str | None = None
+    access: Literal["read", "write"] | None = None
+    function: int | None = None
+    register_: str | None = Field(default=None, alias="register")
+    times: int | Bounds | None = None
+    requests_per_s: Bounds | None = None
+    that: str | None = None
+    within: Time | None = None
+    during: Time | None = None
+
+
+class Step(_Form):
+    """A step: exactly one of these keys."""
+
+    send: Send | None = None
+    set: Set | None = None
+    fault: dict[str, Any] | None = None
+    clear: str | None = None
+    wait: Wait | None = None
+    expect: Expect | None = None
+    pause: Time | None = None
+
+
+class Within(_Form):
+    """Each time that `after` becomes true, `then` must become true `within` a time."""
+
+    after: str
+    then: str
+    within: Time
+
+
+class Rate(_Form):
+    """How often a tag is published, or a device asked, in any period of `over`; `while` says when it counts."""
+
+    tag: str | None = None
+    updates_per_s: Bounds | None = None
+    wire: str | None = None
+    requests_per_s: Bounds | None = None
+    over: Time = 10
+    while_: str | None = Field(default=None, alias="while")
+
+
+class Cycle(_Form):
+    """The time between changes of a tag or variable; or, without one, how late a scan of the PLC may begin."""
+
+    changes_of: str | None = None
+    min: Time | None = None
+    max: Time | None = None
+    late: Time | None = None
+    while_: str | None = Field(default=None, alias="while")
+
+
+class ScenarioForm(_Form):
+    scenario: str = Field(min_length=1, max_length=200)
+    about: str = ""
+    requirements: list[str] = []
+    system: str
+    prototype: str | None = None
+    seed: int | None = None
+    start: Literal["fresh"] | None = None
+    """Restart PLC, simulations and devices first, on every target."""
+    needs: list[str] = []
+    stopped: list[Literal["plc"]] = []
+    """Parts of the system that stop in this scenario. Without it, a part that stops fails the scenario; with it, a part
+    that does not stop."""
+    always: list[str] = []
+    never: list[str | WireForm] = []
+    within: list[Within] = []
+    rate: list[Rate] = []
+    cycle: list[Cycle] = []
+    refused: list[str] = []
+    """Tags whose outputs are expected to be refused, each at least once. Any other refused output fails the scenario."""
+    judge: Literal["run"] | None = None
+    """Also apply the checks of a `run` in virtual time."""
+    probes: dict[str, ProbeForm] = {}
+    steps: list[Step] = Field(min_length=1, max_length=10_000)
+
+
+WORDS = ("send", "set", "fault", "clear", "wait", "expect", "pause")
+
+
+def word_of(step: Step) -> str:
+    """Return the word of a step."""
+    return next(word for word in WORDS if getattr(step, word) is not None)

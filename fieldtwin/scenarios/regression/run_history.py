@@ -1,0 +1,159 @@
+"""What a run was about, by its trace or capture: what each tag and state was and when, how quick devices were, what came in.
+
+That, and not bytes or nanoseconds, is what runs of different versions have in common. Pure: events in, a `Story` out. Bounded: so
+many changes a field; what is more is counted.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+from fieldtwin.capture.decoding.decoder import Decoder
+from fieldtwin.capture.decoding.exchange import Exchange
+from fieldtwin.gateway.core.statemachine import encode_period
+from fieldtwin.results.trace import FAR_END, Event, Kind
+from fieldtwin.twin.site.system import System
+
+MOST = 200_000
+"""Changes of a field."""
+SELDOM = 5
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """From `t_ns` on the field was `value`, of `quality` ("" for a state, and for what was only seen on a wire)."""
+
+    t_ns: int
+    value: Any
+    quality: str = ""
+
+    def says(self) -> tuple[Any, str]:
+        """What matters of it: a bad value is no value."""
+        return (None if self.quality == "bad" else self.value), self.quality
+
+    def __str__(self) -> str:
+        value, quality = self.says()
+        shown = f"{value:g}" if isinstance(value, float) else str(value)
+        return shown if quality in ("", "good") else quality if value is None else f"{shown} ({quality})"
+
+
+@dataclass(frozen=True, slots=True)
+class Came:
+    """A command of the far end of `device`: its payload. As it was sent, or, where that was not seen, as it came in."""
+
+    t_ns: int
+    device: str
+    payload: bytes
+
+
+@dataclass
+class Story:
+    """`tags` and `states`: changes by DEVICE.TAG and PROGRAM.VARIABLE; `latency_ns` and `problems` by (device, service) and
+    (device, service, problem); `faults` as events have them."""
+
+    end_ns: int = 0
+    tags: dict[str, list[Change]] = field(default_factory=dict)
+    states: dict[str, list[Change]] = field(default_factory=dict)
+    latency_ns: dict[tuple[str, str], list[int]] = field(default_factory=lambda: defaultdict(list))
+    asked: Counter[tuple[str, str]] = field(default_factory=Counter)
+    problems: Counter[tuple[str, str, str]] = field(default_factory=Counter)
+    commands: list[Came] = field(default_factory=list)
+    faults: list[Event] = field(default_factory=list)
+    published: Counter[str] = field(default_factory=Counter)
+    """How often each tag was, changed or not."""
+    left_out: int = 0
+
+    def pace_ns(self, name: str) -> int:
+        """How long it may be from a tag's change to the next time that it is published: one and a half of its usual interval.
+        0 for a state, and for what is hardly ever read."""
+        times = self.published[name]
+        return self.end_ns * 3 // (2 * times) if times >= SELDOM else 0
+
+    def note(self, into: dict[str, list[Change]], name: str, change: Change) -> None:
+        """`name` is so; nothing where it was so before."""
+        changes = into.setdefault(name, [])
+        if changes and changes[-1].says() == change.says():
+            return
+        if len(changes) >= MOST:
+            self.left_out += 1
+        else:
+            changes.append(change)
+
+
+def story_of(system: System, events: Iterable[Event]) -> Story:
+    """Read events in their order. Of a capture, which has frames alone, tags are what devices answered."""
+    story, decoder = Story(), Decoder(system)
+    answered: list[tuple[str, Change]] = []
+    sent: list[Came] = []
+    boxes: dict[str, tuple[int, ...]] = {}
+
+    def take(exchanges: Iterable[Exchange]) -> None:
+        for exchange in exchanges:
+            _count(story, exchange)
+            _mailbox(story, system, boxes, exchange)
+            if exchange.ok and len(answered) < MOST and not exchange.secrets:
+                answered.extend(
+                    (f"{exchange.device}.{tag}", Change(exchange.end_ns, value))
+                    for tag, value in exchange.tags.items()
+                    if value is not None and _is_measured(system, exchange, tag)
+                )
+
+    for event in events:
+        story.end_ns = max(story.end_ns, event.t_ns)
+        if event.kind is Kind.FRAME:
+            take(decoder.feed(event))
+        elif event.kind is Kind.TAG:
+            change = Change(event.t_ns, event.data.get("value"), str(event.data.get("quality", "")))
+            story.note(story.tags, event.where, change)
+            story.published[event.where] += 1
+        elif event.kind is Kind.STATE:
+            story.note(story.states, event.where, Change(event.t_ns, event.data.get("value")))
+        elif event.kind is Kind.FAULT:
+            story.faults.append(event)
+        elif event.kind is Kind.NOTE and event.where == FAR_END and isinstance(event.data.get("period_s"), int):
+            sent.append(Came(event.t_ns, event.where, encode_period(event.data["period_s"]).data))
+    take(decoder.finish())
+    story.commands = sent or story.commands
+    if not story.tags:
+        for name, change in answered:
+            story.note(story.tags, name, change)
+            story.published[name] += 1
+    return story
+
+
+def _is_measured(system: System, exchange: Exchange, tag: str) -> bool:
+    """Not a message, of which a device has many, each once; and nothing of a sensor that has not sampled yet."""
+    config = system.devices.get(exchange.device)
+    if config is None or tag not in config.profile.tags:
+        return False
+    sampled = config.profile.sampled
+    return sampled is None or exchange.tags.get(sampled.count) != 0
+
+
+def _count(story: Story, exchange: Exchange) -> None:
+    key = exchange.device or f"{exchange.bus}/{exchange.unit}", exchange.service
+    story.asked[key] += 1
+    if exchange.problem:
+        story.problems[(*key, exchange.problem)] += 1
+    elif exchange.latency_ns is not None:
+        story.latency_ns[key].append(exchange.latency_ns)
+
+
+def _mailbox(story: Story, system: System, boxes: dict[str, tuple[int, ...]], exchange: Exchange) -> None:
+    """A message in an inbox: sequence, length in bytes, payload, two bytes a register. Each sequence is one command."""
+    config = system.devices.get(exchange.device)
+    box = config.profile.inbox if config is not None else None
+    if box is None or not exchange.ok or not exchange.reads() or len(exchange.registers) < 2:
+        return
+    if exchange.spans[0].table != box.at.table or exchange.address != box.at.address:
+        return
+    number, length = exchange.registers[:2]
+    payload = b"".join(word.to_bytes(2, "big") for word in exchange.registers[2:])[:length]
+    seen = boxes.setdefault(exchange.device, ())
+    if number == 0 or (seen and seen[-1] == number) or len(payload) < length:
+        return
+    boxes[exchange.device] = (number,)
+    story.commands.append(Came(exchange.t_ns, exchange.device, payload))

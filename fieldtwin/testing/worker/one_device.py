@@ -1,0 +1,152 @@
+"""Write a system of one device as files: a test's description of a device becomes the input of a field simulator.
+
+So a device in a test is the device of any system: the same emulator, the same faults, the same names. Pure except for
+the files.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.files.profile import DeviceProfile, load_profile
+from fieldtwin.twin.site.data_files import find, find_recording
+
+DEVICE, BUS = "device", "wire"
+RECORDINGS = {"ctd-reference": "cast.jsonl", "inclinometer-cia410": "incl.jsonl"}
+"""Shipped profiles whose recording has a different name."""
+KINDS = ("pty", "tcp", "udp", "rtu+tcp", "can")
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """A test's request for a device.
+
+    `on` is one of `KINDS`, or ``can:INTERFACE/CHANNEL``; "" selects the device's usual one.
+    """
+
+    device: str
+    on: str = ""
+    unit: int | None = None
+    recording: str = ""
+    values: dict[str, Any] = field(default_factory=dict)
+    identity: dict[str, str] = field(default_factory=dict)
+    speed: float = 1.0
+    at_end: str = "loop"
+    pace: bool = False
+    seed: int = 1
+
+
+def write_system(wanted: Wanted, folder: Path, profiles: tuple[Path, ...] = (), beside: Path | None = None) -> Path:
+    """Write the system file and its prototype file into `folder`; return the path of the system file.
+
+    `beside` is the folder of the test, which may contain its own profiles and recordings. Raises `UsageError` for a
+    missing file, `FileInvalid` for an invalid profile.
+    """
+    path = find("devices", wanted.device, beside=beside / "x" if beside else None, extra=profiles)
+    profile = load_profile(path)
+    plant, listen = _wires(wanted.on or _usual(profile), profile)
+    can = plant.startswith("can")
+    form = profile.form
+    unit = wanted.unit if wanted.unit is not None else form.factory.node if can else form.factory.unit
+    system = {
+        "fieldtwin": 1,
+        "system": "test",
+        "buses": {BUS: {"url": plant}},
+        "devices": {DEVICE: {"profile": str(path.resolve()), "bus": BUS, "node" if can else "unit": unit}},
+        "plc": {"programs": {"none": {"source": "none.st"}}},  # no PLC runs here, but a system file must have a program
+    }
+    emulated = _stand_in(wanted, profile, path, beside)
+    prototype = {
+        "prototype_of": "test.yaml",
+        "seed": wanted.seed,
+        "buses": {BUS: {"listen": listen, "pace": wanted.pace}},
+        "devices": {DEVICE: emulated},
+    }
+    written = folder / "test.yaml"
+    written.write_text(yaml.safe_dump(system, sort_keys=False), encoding="utf-8")
+    (folder / "test.prototype.yaml").write_text(yaml.safe_dump(prototype, sort_keys=False), encoding="utf-8")
+    return written
+
+
+def _usual(profile: DeviceProfile) -> str:
+    if profile.protocol == "canopen":
+        return "can"
+    return "tcp" if profile.inbox is not None else "pty"
+
+
+def _wires(on: str, profile: DeviceProfile) -> tuple[str, str]:
+    """Return the plant's endpoint, and the endpoint on which the emulator listens."""
+    kind = on.partition(":")[0]
+    if kind not in KINDS:
+        raise UsageError(f"a wire {on!r}", expected=", ".join(KINDS) + ", or can:INTERFACE/CHANNEL")
+    if (kind == "can") != (profile.protocol == "canopen"):
+        raise UsageError(f"a {profile.protocol} device on {on}", expected="can" if kind != "can" else "pty, tcp or udp")
+    if kind == "can":
+        return "can:socketcan/none", on if ":" in on else "can:fieldtwin/127.0.0.1:0"
+    if kind == "pty":
+        factory = profile.form.factory
+        return f"rtu:/dev/none?baudrate={factory.baudrate}&frame={factory.frame}", "pty:wire"
+    if kind == "rtu+tcp":
+        return "rtu+tcp://127.0.0.1:1", "rtu+tcp://127.0.0.1:0"
+    return f"{kind}://127.0.0.1:1", f"{kind}://127.0.0.1:0"
+
+
+def _stand_in(wanted: Wanted, profile: DeviceProfile, path: Path, beside: Path | None) -> dict[str, Any]:
+    """Return the device's entry in the prototype file.
+
+    It replays the recording that was named; else it is a model of its profile, whose registers accept writes; else, if
+    registers alone are not sufficient, it replays the shipped recording.
+    """
+    common: dict[str, Any] = {"identity": wanted.identity} if wanted.identity else {}
+    if profile.inbox is not None:
+        return {"model": "mailbox", "far": "tcp://127.0.0.1:0", **common}
+    named = wanted.recording
+    model = profile.sampled is None and profile.protocol == "modbus"
+    if not named and not model:
+        named = _shipped(path.stem)
+    if named and wanted.values and model:
+        raise UsageError("a recording and values", expected="one of them, and set() for single values")
+    if named:
+        found = find_recording(named, beside=beside / "x" if beside else None)
+        playing = {"recording": str(found.resolve()), "speed": wanted.speed, "at_end": wanted.at_end}
+        return {**playing, **common}
+    if model:
+        return {"model": "profile", "values": wanted.values, **common}
+    raise UsageError(f"nothing to play for {profile.name}", expected='recording="FILE.jsonl"')
+
+
+def _shipped(stem: str) -> str:
+    name = RECORDINGS.get(stem, f"{stem}.jsonl")
+    try:
+        return str(find_recording(name))
+    except UsageError:
+        return ""
+
+
+def endpoint_words(endpoint: Endpoint) -> dict[str, Any]:
+    """Return an endpoint as plain data.
+
+    It has `url`, and those of `path`, `host`, `port`, `interface`, `channel`, `baudrate`, `frame` that apply.
+    """
+    words: dict[str, Any] = {"url": str(endpoint)}
+    if endpoint.scheme == "pty" or endpoint.is_serial:
+        words["path"] = endpoint.path
+        if endpoint.is_serial:
+            settings = endpoint.serial
+            words |= {"baudrate": settings.baudrate, "frame": settings.frame}
+    elif endpoint.is_can:
+        words |= {"interface": endpoint.interface, "channel": endpoint.path}
+    if (
+        endpoint.scheme != "pty"
+        and not endpoint.is_serial
+        and (not endpoint.is_can or endpoint.interface == "fieldtwin")
+    ):
+        host, port = endpoint.address
+        words |= {"host": host, "port": port}
+    return words

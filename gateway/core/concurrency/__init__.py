@@ -1,0 +1,1 @@
+"""Tasks, locks, timeouts and event handlers for asyncio."""

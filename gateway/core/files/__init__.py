@@ -1,0 +1,1 @@
+"""The files that a user writes: safe reading, YAML, device profiles, recordings."""

@@ -1,0 +1,561 @@
+"""A device profile with everything resolved: addresses as sent, sizes, groups, commands.
+
+The driver and the emulator read the same profile and share nothing else: the driver decodes with
+fieldtwin.gateway.devices.codec, the emulator encodes with its own codec (DESIGN.md, the one idea). Addresses are shown
+in two forms, as printed in manuals and as sent (decision 9).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.files.profile_schema import BoxForm, MessageForm, ProfileForm, TagForm
+from fieldtwin.gateway.core.files.yaml_file import Key, YamlFile, load, validate
+
+Table = Literal["coil", "discrete", "input", "holding"]
+
+PRINTED: tuple[tuple[Table, int], ...] = (("coil", 0), ("discrete", 1), ("input", 3), ("holding", 4))
+READ_FUNCTION: dict[Table, int] = {"coil": 1, "discrete": 2, "holding": 3, "input": 4}
+REGISTERS_OF = {
+    "int16": 1, "uint16": 1, "int32": 2, "uint32": 2, "float32": 2, "int64": 4, "uint64": 4, "float64": 4, "bool": 1,
+    "bcd16": 1, "bcd32": 2,
+}  # fmt: skip
+INTEGER_RANGES = {
+    "bool": (0, 1), "int8": (-0x80, 0x7F), "uint8": (0, 0xFF), "int16": (-0x8000, 0x7FFF), "uint16": (0, 0xFFFF),
+    "int32": (-0x80000000, 0x7FFFFFFF), "uint32": (0, 0xFFFFFFFF), "int64": (-(1 << 63), (1 << 63) - 1),
+    "uint64": (0, (1 << 64) - 1), "bcd16": (0, 9999), "bcd32": (0, 99_999_999),
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class RegisterRange:
+    """`count` registers (or bits) of `table` from PDU address `address` (0 to 65535)."""
+
+    table: Table
+    address: int
+    count: int
+
+    @property
+    def end(self) -> int:
+        """Return the address after the last one."""
+        return self.address + self.count
+
+    def overlaps(self, other: RegisterRange) -> bool:
+        """Return whether the two ranges have a register (or bit) in common."""
+        return self.table == other.table and self.address < other.end and other.address < self.end
+
+    def __str__(self) -> str:
+        """Return both forms of the address, ``30001 (input:0)``, with the count if it is not 1."""
+        digit = dict(PRINTED)[self.table]
+        number = self.address + 1
+        printed = f"{digit}{number:04d}" if number <= 9999 else f"{digit}{number:05d}"
+        return f"{printed} ({self.table}:{self.address})" + (f" x {self.count}" if self.count != 1 else "")
+
+
+@dataclass(frozen=True, slots=True)
+class Tag:
+    """One value of a device. Exactly one of `at` (Modbus) and `object` (CANopen index, subindex) is set."""
+
+    name: str
+    type: str
+    at: RegisterRange | None
+    object: tuple[int, int] | None
+    order: str
+    poll: str
+    access: str
+    unit: str
+    scale: float
+    offset: float
+    values: tuple[tuple[int, str], ...]
+    range: tuple[float, float] | None
+    counter: bool
+    secret: bool
+    danger: str
+    scale_by: str | None = None
+    bits: tuple[int, int] | None = None
+    sentinels: tuple[int, ...] = ()
+    nonvolatile: bool = False
+
+    @property
+    def registers(self) -> RegisterRange:
+        """Return the registers of a Modbus tag; the profile's protocol guarantees that it has some."""
+        assert self.at is not None
+        return self.at
+
+    def number_of(self, value: int | float | str) -> int | float | str:
+        """Return the number of a value that the profile names (`values: {0: OFF}`), and every other value unchanged."""
+        return next((number for number, name in self.values if name == value), value)
+
+    @property
+    def readable(self) -> bool:
+        return self.access != "wo"
+
+    @property
+    def writable(self) -> bool:
+        return self.access != "ro"
+
+    @property
+    def is_text(self) -> bool:
+        return self.type in ("string", "bytes")
+
+    @property
+    def is_bit(self) -> bool:
+        """Return whether the value is a single bit: type bool, or one bit of a register."""
+        return self.type == "bool" or (self.bits is not None and self.bits[0] == self.bits[1])
+
+    @property
+    def is_integer(self) -> bool:
+        """Return whether the engineering value is a whole number: an integer type without scale and offset."""
+        plain = self.scale == 1.0 and self.offset == 0.0 and self.scale_by is None
+        return self.type in INTEGER_RANGES and plain
+
+    @property
+    def limits(self) -> tuple[float, float] | None:
+        """Return the smallest and largest value that may be written, in engineering units; None if there are no limits."""
+        if self.range is not None:
+            return self.range
+        if self.bits is not None:
+            return 0, (1 << (self.bits[1] - self.bits[0] + 1)) - 1
+        if self.type in INTEGER_RANGES:
+            low, high = INTEGER_RANGES[self.type]
+            a, b = low * self.scale + self.offset, high * self.scale + self.offset
+            return min(a, b), max(a, b)
+        return None
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """A block of registers passed on unaltered when the tag `when` changes."""
+
+    name: str
+    at: RegisterRange
+    when: str
+
+
+@dataclass(frozen=True, slots=True)
+class Sampled:
+    """The tag that counts samples and the tag that holds their period in seconds."""
+
+    count: str
+    period: str
+    slack_ms: int
+    poll: str
+
+
+@dataclass(frozen=True, slots=True)
+class Box:
+    """One mailbox: two registers (sequence, length in bytes), the payload after them, and the acknowledged sequence elsewhere."""
+
+    name: str
+    at: RegisterRange
+    bytes: int
+    ack: RegisterRange
+
+
+@dataclass(frozen=True, slots=True)
+class OwnFunction:
+    """A function of the device that is not in the standard.
+
+    `request` and `reply` are its data, without the function code. `sets` maps tags to the values that they hold
+    afterwards, in engineering units.
+    """
+
+    name: str
+    code: int
+    request: bytes
+    reply: bytes
+    sets: tuple[tuple[Tag, float], ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Effect:
+    """A side effect of reading or writing `tag`: `sets` maps tags to the values that they hold afterwards, in
+    engineering units.
+
+    If `value` is not None, only writing that value has the effect.
+    """
+
+    tag: Tag
+    on_read: bool
+    value: float | None
+    sets: tuple[tuple[Tag, float], ...]
+
+
+@dataclass(frozen=True)
+class DeviceProfile:
+    """A profile, resolved. Dictionaries keep the file's order."""
+
+    path: str
+    hash: str
+    form: ProfileForm
+    tags: dict[str, Tag]
+    messages: dict[str, Message]
+    sampled: Sampled | None
+    inbox: Box | None
+    outbox: Box | None
+    gaps: tuple[RegisterRange, ...] = ()
+
+    @property
+    def name(self) -> str:
+        return self.form.device
+
+    @property
+    def protocol(self) -> str:
+        return self.form.protocol
+
+    @property
+    def eds_path(self) -> Path | None:
+        """Return the path of the EDS that a CANopen profile names, in the profile's folder."""
+        return Path(self.path).parent / self.form.eds if self.form.eds else None
+
+    def group(self, poll: str) -> list[Tag]:
+        """Return the readable tags of a poll group, in the file's order."""
+        return [t for t in self.tags.values() if t.poll == poll and t.readable]
+
+    @property
+    def groups(self) -> list[str]:
+        """Return the poll groups, in the file's order."""
+        return list(dict.fromkeys(t.poll for t in self.tags.values() if t.readable))
+
+    @property
+    def command_list(self) -> frozenset[str]:
+        """Return the commands that a device of this profile accepts (SPEC ruling 12).
+
+        They are ``read_<group>`` for each poll group, the names in `commands`, and ``set_<tag>`` for a writable tag
+        without one. A transmitter accepts ``send`` and ``acknowledge``, a CANopen node the NMT commands.
+        """
+        named = set(self.form.commands.values())
+        commands = {f"read_{g}" for g in self.groups} | set(self.form.commands)
+        commands |= {f"set_{t.name}" for t in self.tags.values() if t.writable and t.name not in named}
+        if self.inbox is not None:
+            commands |= {"receive", "acknowledge", "send"}
+        if self.protocol == "canopen":
+            commands |= {"nmt_start", "nmt_stop", "nmt_preoperational", "nmt_reset_node", "nmt_reset_communication"}
+        return frozenset(commands)
+
+    @property
+    def own_functions(self) -> dict[str, OwnFunction]:
+        """Return the device-specific functions, by name."""
+        return {
+            name: OwnFunction(
+                name,
+                f.code,
+                bytes.fromhex(f.request),
+                bytes.fromhex(f.request if f.reply is None else f.reply),
+                tuple((self.tags[tag], float(value)) for tag, value in f.sets.items()),
+            )
+            for name, f in self.form.functions.items()
+        }
+
+    @property
+    def effects(self) -> tuple[Effect, ...]:
+        """Return the side effects of reading and writing tags, in the file's order."""
+        return tuple(
+            Effect(
+                self.tags[e.read or e.written or ""],
+                e.read is not None,
+                None if e.value is None else float(e.value),
+                tuple((self.tags[tag], float(value)) for tag, value in e.sets.items()),
+            )
+            for e in self.form.effects
+        )
+
+    def command_for(self, tag: str) -> str:
+        """Return the command that writes `tag`."""
+        return next((c for c, t in self.form.commands.items() if t == tag), f"set_{tag}")
+
+
+def resolve_address(text: int | str, numbering: str, count: int = 1) -> RegisterRange:
+    """Read an address: ``30001`` / ``400001`` as printed in manuals, ``input:0`` / ``holding:0x10`` as sent.
+
+    Raises ValueError with a sentence that names a valid form.
+    """
+    if isinstance(text, str) and ":" in text:
+        table, _, number = text.partition(":")
+        if table not in READ_FUNCTION:
+            raise ValueError(f"no table {table!r}: coil, discrete, input or holding")
+        address = int(number, 0)
+        found: Table | None = table
+    elif numbering == "printed" and re.fullmatch(r"[0-9]{5,6}", str(text)):
+        digits = str(text)
+        found = next((t for t, d in PRINTED if d == int(digits[0])), None)
+        address = int(digits[1:]) - 1
+    else:
+        raise ValueError(f"address {text!r}: 30001 or 400001 as printed in manuals, or holding:0x10 as sent")
+    if found is None:
+        raise ValueError(
+            f"address {text!r} starts with {str(text)[0]}: 0 coil, 1 discrete, 3 input, 4 holding register"
+        )
+    if address < 0 or address + count > 65536:
+        raise ValueError(f"address {text!r} with {count} registers leaves the table (0 to 65535 as sent)")
+    return RegisterRange(found, address, count)
+
+
+def resolve_gap(text: str, numbering: str) -> RegisterRange:
+    """Read a range of registers, both ends included: ``30001..30010`` as printed, ``input:0..9`` or ``input:5`` as
+    sent.
+
+    Raises ValueError with a sentence that names a valid form.
+    """
+    first, dots, last = text.partition("..")
+    start = resolve_address(first, numbering)
+    if not dots:
+        return start
+    end = resolve_address(f"{start.table}:{last}" if ":" in first else last, numbering)
+    if end.table != start.table or end.address < start.address:
+        raise ValueError(f"range {text!r}: from the lower to the higher address of one table")
+    return RegisterRange(start.table, start.address, end.end - start.address)
+
+
+def gap_text(gap: RegisterRange) -> str:
+    """Return a range in the notation of a profile's `gaps`, as sent; `resolve_gap` reads it."""
+    last = f"..{gap.end - 1}" if gap.count > 1 else ""
+    return f"{gap.table}:{gap.address}{last}"
+
+
+def load_profile(path: Path) -> DeviceProfile:
+    """Read a profile. Raises `FileInvalid` with line and column for every error."""
+    return resolve(load(path))
+
+
+def resolve(file: YamlFile) -> DeviceProfile:
+    """Return a parsed profile file as a `DeviceProfile`."""
+    form = validate(file, ProfileForm)
+    tags: dict[str, Tag] = {}
+    for name, tag_form in form.tags.items():
+        for tag in _tags_of(file, form, name, tag_form):
+            if tag.name in tags:
+                raise file.error(("tags", name), f"the tag {tag.name!r} stands twice")
+            tags[tag.name] = tag
+    profile = DeviceProfile(
+        path=file.path,
+        hash=hashlib.sha256(form.model_dump_json(exclude_defaults=True).encode()).hexdigest()[:16],
+        form=form,
+        tags=tags,
+        messages={n: _message(file, form, n, m) for n, m in form.messages.items()},
+        sampled=Sampled(**form.sampled.model_dump()) if form.sampled else None,
+        inbox=_box(file, form, "inbox", form.mailbox.inbox) if form.mailbox else None,
+        outbox=_box(file, form, "outbox", form.mailbox.outbox) if form.mailbox else None,
+        gaps=tuple(_gap(file, form, i, text) for i, text in enumerate(form.gaps)),
+    )
+    _check_references(file, profile)
+    return profile
+
+
+def _tags_of(file: YamlFile, form: ProfileForm, name: str, t: TagForm) -> Iterable[Tag]:
+    """Return one tag, or several for a name such as ``voltage_l1..3``, whose registers directly follow each other."""
+    loc: tuple[Key, ...] = ("tags", name)
+    kind = t.type or form.defaults.type
+    if form.protocol == "canopen":
+        if t.object is None or t.at is not None:
+            raise file.error(loc, f"the tag {name!r} of a CANopen device", expected='`object: "6010:00"`, and no `at`')
+        first, last = None, 0
+        indexes = (int(t.object[:4], 16), int(t.object[5:], 16))
+    else:
+        if t.at is None or t.object is not None:
+            raise file.error(loc, f"the tag {name!r} of a Modbus device", expected="`at: 30001`, and no `object`")
+        if kind in ("int8", "uint8"):
+            raise file.error((*loc, "type"), f"the tag {name!r} is an {kind}", expected="16 bits at least: a register")
+        if kind in ("string", "bytes") and t.registers is None:
+            raise file.error(loc, f"the tag {name!r} is a {kind}", expected="`registers: N`, its length")
+        first = _address(file, (*loc, "at"), form, t.at, t.registers or REGISTERS_OF[kind])
+        indexes = None
+    if t.bits is not None and not (kind == "uint16" and 0 <= t.bits[0] <= t.bits[1] <= 15):
+        raise file.error((*loc, "bits"), f"the bits of {name!r}", expected="type uint16 and [low, high] within 0 to 15")
+    match = re.fullmatch(r"(.*?)([0-9]+)\.\.([0-9]+)", name)
+    names = [name]
+    if match:
+        start, last = int(match[2]), int(match[3])
+        names = [f"{match[1]}{n}" for n in range(start, last + 1)]
+    for i, single in enumerate(names):
+        at = None
+        if first is not None:
+            step = first.count
+            at = RegisterRange(first.table, first.address + i * step, step)
+        yield Tag(
+            name=single,
+            type=kind,
+            at=at,
+            object=(indexes[0], indexes[1] + i) if indexes else None,
+            order=t.order or form.defaults.order,
+            poll=t.poll or form.defaults.poll,
+            access=t.access,
+            unit=t.unit,
+            scale=t.scale,
+            offset=t.offset,
+            values=tuple((t.values or {}).items()),
+            range=t.range,
+            counter=t.counter,
+            secret=t.secret,
+            danger=t.danger,
+            scale_by=t.scale_by,
+            bits=t.bits,
+            sentinels=tuple(t.sentinels),
+            nonvolatile=t.nonvolatile,
+        )
+
+
+def _address(file: YamlFile, loc: tuple[Key, ...], form: ProfileForm, at: int | str, count: int) -> RegisterRange:
+    try:
+        return resolve_address(at, form.numbering, count)
+    except ValueError as e:
+        raise file.error(loc, str(e)) from e
+
+
+def _gap(file: YamlFile, form: ProfileForm, i: int, text: str) -> RegisterRange:
+    try:
+        return resolve_gap(text, form.numbering)
+    except ValueError as e:
+        raise file.error(("gaps", i), str(e)) from e
+
+
+def _message(file: YamlFile, form: ProfileForm, name: str, m: MessageForm) -> Message:
+    return Message(name, _address(file, ("messages", name, "at"), form, m.at, m.registers), m.when)
+
+
+def _box(file: YamlFile, form: ProfileForm, name: str, box: BoxForm) -> Box:
+    at = _address(file, ("mailbox", name, "at"), form, box.at, 2 + (box.bytes + 1) // 2)
+    ack = _address(file, ("mailbox", name, "ack"), form, box.ack, 1)
+    return Box(name, at, box.bytes, ack)
+
+
+WRITE_FUNCTIONS: dict[Table, tuple[int, ...]] = {"coil": (5, 15), "holding": (6, 16), "discrete": (), "input": ()}
+
+
+def _check_functions(file: YamlFile, p: DeviceProfile) -> None:
+    """Check that the device has the functions to read every value, and to write every value that is marked as writable."""
+    functions = p.form.limits.functions
+    for tag in p.tags.values():
+        if tag.at is None:
+            continue
+        table, loc = tag.at.table, ("tags", tag.name)
+        if tag.readable and functions is not None and READ_FUNCTION[table] not in functions:
+            raise file.error(
+                loc,
+                f"the value {tag.name!r} is read with a function that the device does not have",
+                expected=f"{READ_FUNCTION[table]} in `limits: functions`",
+            )
+        if not tag.writable:
+            continue
+        if not WRITE_FUNCTIONS[table]:
+            raise file.error(loc, f"the value {tag.name!r} cannot be written: it is in the table {table!r}")
+        usable = [f for f in WRITE_FUNCTIONS[table] if functions is None or f in functions]
+        if not usable or (usable == [6] and tag.at.count > 1):
+            needed = "16" if tag.at.count > 1 else " or ".join(str(f) for f in WRITE_FUNCTIONS[table])
+            raise file.error(
+                loc,
+                f"the value {tag.name!r} is written with a function that the device does not have",
+                expected=f"{needed} in `limits: functions`",
+            )
+
+
+def _check_reads(file: YamlFile, p: DeviceProfile) -> None:
+    """Check that one value, message or sample fits into one read, and that a sample's counter can count."""
+    most = p.form.limits.read_registers
+    for tag in p.tags.values():
+        if tag.at is not None and tag.readable and tag.at.count > most:
+            raise file.error(
+                ("tags", tag.name),
+                f"the value {tag.name!r} cannot be read at once",
+                expected=f"at most {most} registers (`limits: read_registers`)",
+                got=str(tag.at.count),
+            )
+        for i, gap in enumerate(p.gaps):
+            if tag.at is not None and tag.at.overlaps(gap):
+                raise file.error(("gaps", i), f"the gap {p.form.gaps[i]!r} is where the tag {tag.name!r} stands")
+    for message in p.messages.values():
+        if message.at.count > most:
+            raise file.error(
+                ("messages", message.name),
+                f"the message {message.name!r} cannot be read at once",
+                expected=f"at most {most} registers (`limits: read_registers`)",
+                got=str(message.at.count),
+            )
+    if p.sampled is None:
+        return
+    count = p.tags[p.sampled.count]
+    if not count.is_integer:
+        raise file.error(("sampled", "count"), f"the counter {count.name!r}", expected="a whole number, without scale")
+    if count.poll != p.sampled.poll:
+        raise file.error(
+            ("sampled",),
+            f"the counter {count.name!r} is not read with {p.sampled.poll!r}",
+            expected=f"poll: {count.poll}",
+        )
+
+
+def _check_sets(file: YamlFile, p: DeviceProfile, loc: tuple[Key, ...], sets: Iterable[str]) -> None:
+    for tag in sets:
+        if p.tags[tag].bits is not None or p.tags[tag].is_text:
+            raise file.error((*loc, "sets", tag), f"{tag!r} is text, or a part of a register")
+
+
+def _check_stated(file: YamlFile, p: DeviceProfile) -> None:
+    """Check that the device has what is needed by its effects and by its functions that carry no registers."""
+    for i, effect in enumerate(p.effects):
+        if not (effect.tag.readable if effect.on_read else effect.tag.writable):
+            verb = "read" if effect.on_read else "written"
+            raise file.error(
+                ("effects", i), f"the tag {effect.tag.name!r} is never {verb}", expected="another `access`"
+            )
+        _check_sets(file, p, ("effects", i), p.form.effects[i].sets)
+    form, allowed = p.form, p.form.limits.functions
+    stated: list[tuple[str, int, object]] = [
+        ("server_id", 0x11, form.server_id),
+        ("identification", 0x2B, form.identification),
+        ("files", 0x14, form.files),
+        ("fifos", 0x18, form.fifos),
+    ]
+    for key, code, said in stated:
+        if said and allowed is not None and code not in allowed:
+            raise file.error((key,), f"function {code:02X}h is not in `limits: functions`", expected=str(code))
+    if form.identification and not {0, 1, 2} <= form.identification.keys():
+        raise file.error(("identification",), "vendor, product code and revision", expected="objects 0, 1 and 2")
+
+
+def _check_references(file: YamlFile, p: DeviceProfile) -> None:
+    """Check that every tag that the profile refers to exists and is of the required kind."""
+    wanted: list[tuple[tuple[Key, ...], str]] = [(("commands", c), t) for c, t in p.form.commands.items()]
+    wanted += [(("messages", m.name, "when"), m.when) for m in p.messages.values()]
+    wanted += [(("identify", i, "tag"), e.tag) for i, e in enumerate(p.form.identify)]
+    wanted += [(("tags", t.name, "scale_by"), t.scale_by) for t in p.tags.values() if t.scale_by is not None]
+    wanted += [(("functions", n, "sets", t), t) for n, f in p.form.functions.items() for t in f.sets]
+    for i, effect in enumerate(p.form.effects):
+        wanted += [(("effects", i), effect.read or effect.written or "")]
+        wanted += [(("effects", i, "sets", t), t) for t in effect.sets]
+    if p.form.trigger is not None:
+        wanted.append((("trigger", "tag"), p.form.trigger.tag))
+    if p.sampled:
+        wanted += [(("sampled", "count"), p.sampled.count), (("sampled", "period"), p.sampled.period)]
+    for loc, tag in wanted:
+        if tag not in p.tags:
+            raise file.error(loc, f"no tag {tag!r} in this profile", expected="one of " + ", ".join(p.tags))
+    _check_reads(file, p)
+    _check_functions(file, p)
+    for command, tag in p.form.commands.items():
+        if not p.tags[tag].writable:
+            raise file.error(("commands", command), f"the tag {tag!r} is read-only", expected="`access: rw` or `wo`")
+    for name, behaviour in p.form.behaviours.items():
+        for command in behaviour:
+            if command not in p.form.commands:
+                raise file.error(
+                    ("behaviours", name, command),
+                    f"no command {command!r}",
+                    expected=", ".join(p.form.commands) or "none",
+                )
+    for name, function in p.form.functions.items():
+        allowed = p.form.limits.functions
+        if allowed is not None and function.code not in allowed:
+            raise file.error(("functions", name, "code"), f"{function.code:02X}h is not in `limits: functions`")
+        if max(len(t) for t in (function.request, function.reply or "")) > 3 * 252:
+            raise file.error(("functions", name), "more data than a PDU holds", expected="at most 252 bytes")
+        _check_sets(file, p, ("functions", name), function.sets)
+    _check_stated(file, p)
+    if p.protocol == "canopen" and p.form.eds is None:
+        raise FileInvalid("a CANopen profile names its EDS", path=p.path, line=1, expected="`eds: FILE.eds`")

@@ -1,0 +1,304 @@
+"""Read YAML as users mean it, with errors that name line and column.
+
+Scalars follow YAML 1.2's core schema: only ``true`` and ``false`` are booleans and no number is sexagesimal, so ``OFF``
+and ``1017:00`` stay strings (PyYAML's 1.1 reads them as False and 61020). It is stricter than 1.2 in one respect: a
+float needs a point, so that ``8E1`` is a serial frame and not 80. Duplicate keys are refused. The line and column of
+every key and value are kept, so that a validation error can name them.
+
+`load` reads a file, `validate` turns it into a pydantic model; both raise `FileInvalid` and no other error.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
+
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.files.input_file import read_input
+from fieldtwin.gateway.core.files.nearest import did_you_mean
+
+MAX_BYTES = 8 * 1024 * 1024
+"""A configuration file larger than this is a mistake (a recording given as a system file, say)."""
+
+MAX_VALUES = 100_000
+
+MAX_DIGITS = 21
+"""The largest number of characters of an integer, including its sign."""
+
+Key = str | int
+Position = tuple[int, int]
+M = TypeVar("M", bound=BaseModel)
+
+
+class _Loader(yaml.SafeLoader):
+    """A SafeLoader with the scalars of YAML 1.2's core schema."""
+
+
+_Loader.yaml_implicit_resolvers = {}
+for _tag, _pattern, _first in (
+    ("tag:yaml.org,2002:bool", r"^(?:true|false)$", "tf"),
+    ("tag:yaml.org,2002:null", r"^(?:~|null|)$", ["~", "n", ""]),
+    ("tag:yaml.org,2002:int", r"^[-+]?(?:0|[1-9][0-9]*|0x[0-9a-fA-F]+)$", "-+0123456789"),
+    ("tag:yaml.org,2002:float", r"^[-+]?(?:[0-9]+\.[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?$", "-+.0123456789"),
+):
+    _Loader.add_implicit_resolver(_tag, re.compile(_pattern), list(_first))
+
+
+def _integer(loader: _Loader, node: yaml.ScalarNode) -> int:
+    """Read an integer of at most 64 bits. More digits would cost time, and registers, objects and times are not longer."""
+    text = str(node.value)
+    value = (
+        int(text, 0) if len(text) <= MAX_DIGITS and "x" in text else int(text) if len(text) <= MAX_DIGITS else 1 << 64
+    )
+    if not -(1 << 63) <= value < 1 << 64:
+        raise yaml.constructor.ConstructorError(None, None, "an integer of more than 64 bits", node.start_mark)
+    return value
+
+
+def _number(loader: _Loader, node: yaml.ScalarNode) -> float:
+    value = float(node.value)
+    if not math.isfinite(value):
+        raise yaml.constructor.ConstructorError(None, None, "a number that is too large", node.start_mark)
+    return value
+
+
+_Loader.add_constructor("tag:yaml.org,2002:int", _integer)
+_Loader.add_constructor("tag:yaml.org,2002:float", _number)
+
+_OTHER_FILES = (
+    (b"PK\x03\x04", "a zip; if it is a template: fieldtwin template unpack"),
+    (b"\xff\xfe", "it looks like UTF-16: save it as UTF-8"),
+    (b"\xfe\xff", "it looks like UTF-16: save it as UTF-8"),
+)
+"""Files that users give by mistake, recognised by their first bytes."""
+
+
+@dataclass(frozen=True)
+class YamlFile:
+    """A parsed file: plain data, and the position of each path of keys (line and column from 1)."""
+
+    path: str
+    data: dict[str, Any]
+    positions: dict[tuple[Key, ...], Position]
+
+    def line(self, loc: tuple[Key, ...]) -> int:
+        """Return the line of `loc`, or of its nearest parent that is in the file."""
+        return self._place(loc)[0]
+
+    def _place(self, loc: tuple[Key, ...]) -> Position:
+        while loc and loc not in self.positions:
+            loc = loc[:-1]
+        return self.positions.get(loc, (1, 1))
+
+    def error(
+        self, loc: tuple[Key, ...], message: str, *, expected: str = "", got: str = "", hint: str = ""
+    ) -> FileInvalid:
+        """Return a `FileInvalid` at the position of `loc`, or of its nearest parent that is in the file."""
+        line, column = self._place(loc)
+        return FileInvalid(message, path=self.path, line=line, column=column, expected=expected, got=got, hint=hint)
+
+
+def load(path: Path) -> YamlFile:
+    """Read and parse `path`. The top level must be a mapping."""
+    try:
+        text = read_input(path, MAX_BYTES).decode("utf-8")
+    except OSError as e:
+        raise FileInvalid(f"cannot read the file: {e.strerror or e}", path=str(path)) from e
+    except UnicodeDecodeError as e:
+        hint = next((told for begins, told in _OTHER_FILES if e.object.startswith(begins)), "")
+        got = f"byte {e.object[e.start]:02X}h"
+        raise FileInvalid("the file is not UTF-8 text", path=str(path), got=got, hint=hint) from e
+    return parse(text, str(path))
+
+
+def parse(text: str, path: str) -> YamlFile:
+    """Parse YAML text; `path` is for messages."""
+    loader: _Loader | None = None
+    try:
+        loader = _Loader(text)
+        node = loader.get_single_node()
+        positions: dict[tuple[Key, ...], Position] = {}
+        if not isinstance(node, yaml.MappingNode):
+            raise FileInvalid("the file holds no keys", path=path, line=1, expected="a mapping such as `key: value`")
+        _note_positions(loader, node, (), positions, path)
+        data = loader.construct_document(node)
+    except yaml.MarkedYAMLError as e:
+        mark = e.problem_mark or e.context_mark
+        line, column = (mark.line + 1, mark.column + 1) if mark else (1, 1)
+        problem = f"{e.context}, {e.problem}" if e.context else str(e.problem)
+        hint = "YAML indents with spaces, never tabs" if "\\t" in problem else ""
+        raise FileInvalid(f"not YAML: {problem}", path=path, line=line, column=column, hint=hint) from e
+    except yaml.YAMLError as e:
+        raise FileInvalid(f"not YAML: {e}", path=path, line=1) from e
+    except RecursionError as e:
+        raise FileInvalid("the file is nested too deeply", path=path, line=1) from e
+    finally:
+        if loader is not None:
+            loader.dispose()
+    return YamlFile(path, data, positions)
+
+
+def _note_positions(
+    loader: _Loader, node: yaml.Node, loc: tuple[Key, ...], out: dict[tuple[Key, ...], Position], path: str
+) -> None:
+    """Walk the node tree, note the position of each value, and refuse duplicate keys."""
+    out.setdefault(loc, (node.start_mark.line + 1, node.start_mark.column + 1))
+    if len(out) > MAX_VALUES:  # a few aliases of aliases can expand to millions of values
+        raise FileInvalid("the file holds too many values", path=path, line=1, expected=f"at most {MAX_VALUES}")
+    if isinstance(node, yaml.SequenceNode):
+        for i, child in enumerate(node.value):
+            _note_positions(loader, child, (*loc, i), out, path)
+    elif isinstance(node, yaml.MappingNode):
+        seen: dict[Any, int] = {}
+        for key_node, value_node in node.value:
+            line, column = key_node.start_mark.line + 1, key_node.start_mark.column + 1
+            if not isinstance(key_node, yaml.ScalarNode):
+                raise FileInvalid("a key must be a plain word", path=path, line=line, column=column)
+            key = loader.construct_object(key_node)
+            if key in seen:
+                raise FileInvalid(
+                    f"the key {key!r} stands twice",
+                    path=path,
+                    line=line,
+                    column=column,
+                    hint=f"first at line {seen[key]}",
+                )
+            seen[key] = line
+            out[(*loc, key)] = (line, column)
+            _note_positions(loader, value_node, (*loc, key), out, path)
+
+
+def validate(file: YamlFile, model: type[M]) -> M:
+    """Return the file as a `model`.
+
+    Raises `FileInvalid` for the first error, with line, expected and given value; `FileInvalid.others` holds the other errors.
+    """
+    try:
+        return model.model_validate(file.data)
+    except ValidationError as e:
+        raise _translate(file, model, e) from e
+
+
+def _translate(file: YamlFile, model: type[BaseModel], e: ValidationError) -> FileInvalid:
+    errors = sorted(e.errors(), key=lambda d: d["type"] != "extra_forbidden")  # a misspelt key explains a missing one
+    places: dict[tuple[Key, ...], list[ErrorDetails]] = {}
+    for error in errors:
+        missing = (str(error["loc"][-1]),) if error["type"] == "missing" else ()
+        places.setdefault((*_in_file(file, error["loc"]), *missing), []).append(error)
+    first, *others = (_translate_place(file, model, found) for found in places.values())
+    first.others = tuple(others[: FileInvalid.MAX_OTHERS])
+    return first
+
+
+def _translate_place(file: YamlFile, model: type[BaseModel], errors: list[ErrorDetails]) -> FileInvalid:
+    """Return one error for a value that fits no branch of a union, with what every branch expects."""
+    expected = [expected_value(error, _keys_at(model, error["loc"])) for error in errors]
+    if not all(expected):
+        return _translate_one(file, model, errors[0])
+    loc = _in_file(file, errors[0]["loc"])
+    name = ".".join(str(part) for part in loc) or "the file"
+    given = errors[0]["input"]
+    got = str(given).lower() if isinstance(given, bool) else repr(given)[:80]
+    return file.error(loc, name, expected=" or ".join(dict.fromkeys(expected)), got=got)
+
+
+_KINDS = {
+    "int": "a whole number",
+    "float": "a number",
+    "string": "text",
+    "bool": "true or false",
+    "list": "a list",
+    "tuple": "a list",
+    "dict": "keys with values",
+    "model": "keys with values",
+}
+_LIMITS = {"greater_than": "gt", "greater_than_equal": "ge", "less_than": "lt", "less_than_equal": "le"}
+_LIMIT_WORDS = {"gt": "more than", "ge": "at least", "lt": "less than", "le": "at most"}
+
+
+def expected_value(error: ErrorDetails, keys: Iterable[str] = ()) -> str:
+    """Return in plain English what pydantic expected of a value, or an empty text if pydantic's own message has to be
+    used.
+
+    `keys` are the keys of the form that the value should have been.
+    """
+    kind, _, rest = error["type"].partition("_")
+    if kind == "model" and keys:
+        return f"the keys {', '.join(keys)}"
+    if rest in ("type", "parsing", "from_float", "attributes_type"):
+        return _KINDS.get(kind, "")
+    if limit := _LIMITS.get(error["type"]):
+        value = error["ctx"][limit]
+        return f"{_LIMIT_WORDS[limit]} {f'{value:g}' if isinstance(value, float) else value}"
+    return ""
+
+
+def _keys_at(model: type[BaseModel], loc: tuple[int | str, ...]) -> list[str]:
+    """Return the keys of the form at `loc`, or an empty list if `loc` is not a form."""
+    return _known_keys(model, loc) if loc else list(model.model_fields)
+
+
+def _translate_one(file: YamlFile, model: type[BaseModel], error: ErrorDetails) -> FileInvalid:
+    loc = _in_file(file, error["loc"])
+    name = ".".join(str(part) for part in loc)
+    if error["type"] == "extra_forbidden":
+        known = _known_keys(model, error["loc"][:-1])
+        expected = "one of " + ", ".join(sorted(known))
+        hint = did_you_mean(str(loc[-1]), known)
+        return file.error(loc, f"unknown key {str(loc[-1])!r}{_inside(loc)}", expected=expected, hint=hint)
+    if error["type"] == "missing":
+        missing = str(error["loc"][-1])
+        return file.error(loc, f"the key {missing!r} is missing{_inside((*loc, missing))}")
+    if error["type"] == "too_short" and not error["input"]:
+        return file.error(loc, f"{name} is empty")
+    got = "" if error["type"] == "value_error" else repr(error["input"])[:80]
+    if error["type"] == "literal_error":
+        known = re.findall(r"'([^']*)'", str(error["ctx"]["expected"]))
+        hint = did_you_mean(str(error["input"]), known)
+        return file.error(loc, name, expected=" or ".join(known), got=got, hint=hint)
+    return file.error(loc, f"{name}: {error['msg'].removeprefix('Value error, ')}", got=got)
+
+
+def _inside(loc: tuple[Key, ...]) -> str:
+    return f" in {'.'.join(str(part) for part in loc[:-1])!r}" if len(loc) > 1 else ""
+
+
+def _in_file(file: YamlFile, loc: tuple[Key, ...]) -> tuple[Key, ...]:
+    """Return pydantic's location without the parts that are not in the file (union tags, "[key]")."""
+    out: tuple[Key, ...] = ()
+    for part in loc:
+        if (*out, part) in file.positions:
+            out = (*out, part)
+    return out
+
+
+def _known_keys(model: type[BaseModel], loc: tuple[Key, ...]) -> list[str]:
+    """Return the keys that the model at `loc` knows, found by walking annotations; the keys of the top level if that fails."""
+    current: Any = model
+    for part in loc:
+        fields = getattr(current, "model_fields", None)
+        if fields and part in fields:
+            current = fields[part].annotation
+        for candidate in _models_in(current):
+            current = candidate
+            break
+    fields = getattr(current, "model_fields", None) or model.model_fields
+    return [info.alias or name for name, info in fields.items()]
+
+
+def _models_in(annotation: Any) -> list[type[BaseModel]]:
+    """Return the pydantic models inside an annotation such as ``dict[str, Bus] | None``."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    found: list[type[BaseModel]] = []
+    for arg in getattr(annotation, "__args__", ()):
+        found.extend(_models_in(arg))
+    return found

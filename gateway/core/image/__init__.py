@@ -1,0 +1,1 @@
+"""The process image: the data that gateway and PLC share."""

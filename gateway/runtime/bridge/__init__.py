@@ -1,0 +1,1 @@
+"""The bridge: Modbus clients of the gateway reach units on its buses."""

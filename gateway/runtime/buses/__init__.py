@@ -1,0 +1,1 @@
+"""The gateway's buses: connections, polls, queues and writes."""

@@ -1,0 +1,233 @@
+"""The order of polls on a Modbus bus: the state of its devices, and the poll that goes next.
+
+Pure: times are monotonic nanoseconds, passed in. This module must not know a connection or what a poll does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.devices.config import DeviceConfig
+from fieldtwin.gateway.devices.register_device import Reading, RegisterDriver
+from fieldtwin.gateway.runtime.buses.backoff import Backoff
+from fieldtwin.gateway.runtime.buses.poll_schedule import PollSchedule, Rate, spread
+from fieldtwin.gateway.runtime.buses.probing import MARGIN_NS, Probing
+
+FOREVER_NS = 2**62
+"""The end of a free time that no poll limits."""
+
+
+@dataclass
+class DeviceState:
+    """The bus's record of one of its devices. `tried`: it was asked since the connection was opened. `polls`
+    counts the groups that were read, and the tries while it was away."""
+
+    driver: RegisterDriver
+    schedule: PollSchedule
+    backoff: Backoff
+    online: bool = False
+    tried: bool = False
+    error: str = "not asked yet"
+    polls: int = 0
+    poll_errors: int = 0
+    next_try_ns: int = 0
+    busy_until_ns: int = 0
+    """The device answered "busy" and is given time until then."""
+    reading: Reading | None = None
+    """The group that is being read, with some transactions left; it has been due since `reading_due_ns`."""
+    reading_due_ns: int = 0
+    triggered: set[str] = field(default_factory=set)
+    alone: bool = False
+    """Whether it is the only device of its bus."""
+    asked_ns: int = 0
+    """When it was last tried while it was away."""
+    late_ns: int = 0
+    """The duration of its reply that came after a shortened timeout; 0: there was none."""
+    last_cost_ns: int = 0
+    """How long it used the bus without success although it answered at first."""
+    timeout_ns: int = 0
+    """The timeout of its next try; 0: its own."""
+    answered_ns: int = 0
+    """When it last answered a poll."""
+    silences: int = 0
+    """How many of its polls in a row had no reply while it counts as online."""
+    fits: bool = True
+    """Whether its next try can end before another device misses a period."""
+
+    @property
+    def retries_left(self) -> bool:
+        """Whether a request without a reply is worth repeating: not while the device may be absent and other devices
+        wait."""
+        return self.online or (self.alone and not self.backoff.failures)
+
+
+def states_of(drivers: list[RegisterDriver], offset: float) -> list[DeviceState]:
+    """Return the states of a bus's devices, with the phases of their groups; `offset` keeps several buses apart."""
+    rates = rates_of([driver.config for driver in drivers], offset)
+    alone = len(drivers) == 1
+    return [_state(driver, rates[driver.config.name], alone) for driver in drivers]
+
+
+def rates_of(configs: Sequence[DeviceConfig], offset: float = 0.0) -> dict[str, dict[str, Rate]]:
+    """Return the rates of the groups of one bus's devices, by device name."""
+    groups: list[tuple[tuple[str, str], int]] = []
+    stated: dict[tuple[str, str], int] = {}
+    for config in configs:
+        groups += [((config.name, group), every_ms) for group, every_ms in config.poll.items()]
+        stated |= {(config.name, group): phase_ms for group, phase_ms in config.phase.items()}
+    rates = spread(groups, stated, offset)
+    return {config.name: {group: rates[config.name, group] for group in config.poll} for config in configs}
+
+
+def _state(driver: RegisterDriver, rates: dict[str, Rate], alone: bool) -> DeviceState:
+    config, known = driver.config, driver.config.expect
+    once = [
+        group
+        for group in driver.plans
+        if group not in config.poll and any(t.name not in known for t in driver.profile.group(group))
+    ]
+    backoff = Backoff(config.backoff_first_s, config.backoff_limit_s)
+    return DeviceState(driver, PollSchedule(rates, once), backoff, alone=alone)
+
+
+def restate(device: DeviceState, config: DeviceConfig, rates: dict[str, Rate], now_ns: int) -> None:
+    """Apply a new configuration to a device of which nothing is being read."""
+    device.driver.reconfigure(config)
+    device.backoff.restate(config.backoff_first_s, config.backoff_limit_s)
+    device.schedule.restate(rates, config.phase, now_ns, there=device.online)
+    device.triggered &= rates.keys()
+
+
+class Turns:
+    """The order of polls among `devices`, and the tries that `Probing` grants to devices that are away. For `share` see
+    there."""
+
+    def __init__(self, devices: list[DeviceState], share: float, t35_ns: int = 0) -> None:
+        self._devices = devices
+        self._probing = Probing(share, t35_ns)
+        self._failed_ns = 0
+        self.doubt_ns = 0
+        """Devices that answered a poll since this time are polled before the others; repetitions come last."""
+
+    def next(
+        self, spaced_ns: Callable[[int], int], now_ns: int, seen_ns: int = 0, bus_timeout_s: float = 1.0
+    ) -> tuple[DeviceState | None, str, int]:
+        """Return the most overdue poll of those that may start now, else the one that may start first; and its time.
+
+        `spaced_ns` returns the end of a unit's pause; `seen_ns` is the longest latency seen lately. A device that is
+        away has only its next try (group ""), for which its `timeout_ns` is set. A group that is partly read is
+        continued before another group of its device begins.
+        """
+        best: tuple[int, int, int, int] | None = None
+        found: tuple[DeviceState | None, str] = None, ""  # a bus without polls only carries jobs
+        doubt_ns = self.doubt_ns
+        away: list[tuple[int, DeviceState, int]] = []
+        for order, device in enumerate(self._devices):
+            ready_ns = spaced_ns(device.driver.config.address)
+            if ready_ns < now_ns:
+                ready_ns = now_ns
+            if not device.online:
+                away.append((order, device, ready_ns))
+                continue
+            choices: Iterable[tuple[str, int]]
+            if device.reading is not None:
+                choices = ((device.reading.what, device.reading_due_ns),)
+            else:
+                choices = device.schedule.due_ns.items()
+            for group, due_ns in choices:
+                at_ns = due_ns if due_ns > ready_ns else ready_ns
+                doubt = 0 if device.answered_ns >= doubt_ns else 2 if device.silences else 1
+                key = at_ns, doubt, due_ns, order
+                if best is None or key < best:
+                    best, found = key, (device, group)
+        if away:
+            free_ns = self._free_until_ns(best[0] if best is not None else None, now_ns)
+            probe = self._next_probe(away, now_ns, free_ns, seen_ns, bus_timeout_s)
+            if best is None or probe[0] < (best[0], best[2]):
+                return probe[1], "", probe[0][0]
+        return *found, best[0] if best is not None else now_ns + NS_PER_S
+
+    def restate(self, share: float) -> None:
+        """Set a new share, from the next try on."""
+        self._probing.restate(share)
+
+    def _free_until_ns(self, poll_ns: int | None, now_ns: int) -> int | None:
+        """Return until when the devices that answer do not need the bus; `now_ns` while a poll is due. None: no device
+        answers."""
+        online = [device for device in self._devices if device.online]
+        if not online:
+            return None
+        if poll_ns is not None and poll_ns <= now_ns:
+            return now_ns
+        ends = [end for device in online if (end := device.schedule.free_until_ns()) is not None]
+        return min(ends, default=FOREVER_NS)
+
+    def _next_probe(
+        self,
+        away: list[tuple[int, DeviceState, int]],
+        now_ns: int,
+        free_ns: int | None,
+        seen_ns: int,
+        bus_timeout_s: float,
+    ) -> tuple[tuple[int, int], DeviceState]:
+        """Return the device to ask first of those that are away, with the time of the try, and since when it waits.
+
+        Devices that were not asked yet come first; among them, the one that was asked least recently.
+        """
+        untried = [entry for entry in away if not entry[1].tried]
+        best: tuple[tuple[int, int, int, int], DeviceState] | None = None
+        for order, device, ready_ns in untried or away:
+            due_ns = device.next_try_ns if device.tried else self._failed_ns
+            ready_ns = max(ready_ns, due_ns)
+            at_ns = self._probe_ns(device, ready_ns, now_ns, free_ns, seen_ns, bus_timeout_s)
+            key = at_ns, due_ns, device.asked_ns, order
+            if best is None or key < best[0]:
+                best = key, device
+        assert best is not None
+        return best[0][:2], best[1]
+
+    def _probe_ns(
+        self,
+        device: DeviceState,
+        ready_ns: int,
+        now_ns: int,
+        free_ns: int | None,
+        seen_ns: int,
+        bus_timeout_s: float,
+    ) -> int:
+        """Return when `device` may be asked, not before `ready_ns`. Sets the timeout of that try."""
+        own_ns = _own_ns(device, bus_timeout_s)
+        probing, failures, late_ns = self._probing, device.backoff.failures, device.late_ns
+        device.fits = True
+        if len(self._devices) == 1:
+            device.timeout_ns = 0
+            return ready_ns
+        if free_ns is None:
+            device.timeout_ns = probing.growing_ns(own_ns, seen_ns, late_ns, failures)
+            return ready_ns
+        device.timeout_ns = probing.short_ns(own_ns, seen_ns, late_ns)
+        if ready_ns > now_ns:
+            return ready_ns
+        device.fits = probing.fits(max(device.timeout_ns + MARGIN_NS, device.last_cost_ns), now_ns, free_ns)
+        if device.tried and probing.long_may_go(failures, now_ns):
+            device.timeout_ns, device.fits = own_ns, False
+        return probing.may_go_ns(device.fits, now_ns)
+
+    def short_s(self, device: DeviceState, seen_ns: int, bus_timeout_s: float) -> float:
+        """Return the shortened timeout of a device, in seconds."""
+        return self._probing.short_ns(_own_ns(device, bus_timeout_s), seen_ns, device.late_ns) / NS_PER_S
+
+    def failed(self, device: DeviceState, begun_ns: int, now_ns: int, clear_ns: int) -> None:
+        """Note that `device` used the bus without success; the bus can be used again at `clear_ns`, after its
+        quarantine."""
+        self._failed_ns = now_ns
+        if any(other.online for other in self._devices):
+            self._probing.took(begun_ns, clear_ns, device.fits)
+
+
+def _own_ns(device: DeviceState, bus_timeout_s: float) -> int:
+    """Return how long the device may take to answer, in ns."""
+    own_s = device.driver.config.timeout_s
+    return round((bus_timeout_s if own_s is None else own_s) * NS_PER_S)

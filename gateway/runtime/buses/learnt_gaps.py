@@ -1,0 +1,126 @@
+"""The gaps that were learnt about devices, kept between runs, and reported so that they can go into their profiles.
+
+They are in one JSON file in the run directory. An entry is used only for the device from which it was learnt: same
+profile (by its hash), same endpoint, same unit ID. A file that cannot be read, or that has any other content, is
+ignored: the gaps are learnt again. This module must not know a connection.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from fieldtwin.gateway.core.errors import Unreachable
+from fieldtwin.gateway.core.files.profile import RegisterRange, gap_text, resolve_gap
+from fieldtwin.gateway.devices.config import BusConfig
+from fieldtwin.gateway.devices.read_plan import Learnt
+from fieldtwin.gateway.devices.register_device import RegisterDriver
+
+MOST_BYTES = 4_000_000
+"""Our files are never larger; a larger file is not read."""
+
+
+class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One device. `gaps` as in a profile; `borders`, which have no registers, by the address of the first register
+    after them."""
+
+    profile: str
+    endpoint: str
+    unit: int
+    gaps: list[str]
+    borders: list[str]
+    missing: list[str]
+
+
+class LearntFile:
+    """The file at `path`, for `drivers` on `buses`. Call `load` before they are used, and `save` from time to time."""
+
+    def __init__(self, path: Path, drivers: Iterable[RegisterDriver], buses: Mapping[str, BusConfig]) -> None:
+        self._path = path
+        self._drivers = list(drivers)
+        self._buses = buses
+        self._saved = 0
+
+    def load(self) -> None:
+        """Give every driver what was learnt about its device before."""
+        try:
+            with self._path.open("rb") as file:
+                entries = msgspec.json.decode(file.read(MOST_BYTES), type=dict[str, Entry])
+        except (OSError, msgspec.DecodeError):
+            # there is no file yet, or it is not one of ours: the gaps are learnt again and the file is written anew
+            return
+        for driver in self._drivers:
+            entry = entries.get(driver.config.name)
+            if entry is not None and self._same(driver, entry):
+                learnt = _learnt(driver, entry)
+                if learnt is not None:
+                    driver.know(learnt)
+
+    def save(self) -> None:
+        """Write the file if something was learnt since. Raises `Unreachable` if the disk refuses."""
+        changes = sum(driver.learnt.changes for driver in self._drivers)
+        if changes == self._saved:
+            return
+        entries = {d.config.name: self._entry(d) for d in self._drivers if d.learnt.gaps or d.learnt.missing}
+        new = self._path.with_suffix(".new")
+        try:
+            with os.fdopen(os.open(new, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "wb") as file:
+                file.write(msgspec.json.encode(entries))
+            new.replace(self._path)
+        except OSError as e:
+            raise Unreachable(f"cannot write what was learnt: {e.strerror}", where=str(self._path)) from e
+        self._saved = changes
+
+    def _same(self, driver: RegisterDriver, entry: Entry) -> bool:
+        return entry.profile == driver.profile.hash and (entry.endpoint, entry.unit) == self._place(driver)
+
+    def _place(self, driver: RegisterDriver) -> tuple[str, int]:
+        return str(self._buses[driver.config.bus].endpoint), driver.config.address
+
+    def _entry(self, driver: RegisterDriver) -> Entry:
+        learnt = driver.learnt
+        endpoint, unit = self._place(driver)
+        return Entry(
+            driver.profile.hash,
+            endpoint,
+            unit,
+            [gap_text(g) for g in learnt.profile_gaps],
+            [f"{g.table}:{g.address}" for g in learnt.gaps if not g.count],
+            list(learnt.missing),
+        )
+
+
+def _learnt(driver: RegisterDriver, entry: Entry) -> Learnt | None:
+    """Return what an entry contains; None if it is invalid."""
+    try:
+        gaps = [resolve_gap(text, "sent") for text in entry.gaps]
+        borders = [resolve_gap(text, "sent") for text in entry.borders]
+    except ValueError:
+        return None
+    if not set(entry.missing) <= set(driver.profile.tags):
+        return None
+    gaps += [RegisterRange(b.table, b.address, 0) for b in borders]
+    return Learnt(gaps, list(entry.missing))
+
+
+def describe_learnt(drivers: Iterable[object]) -> dict[str, Any]:
+    """Return what was learnt, for every device with an entry: `gaps`, `borders`, `missing` tags, and `line`, which
+    replaces the `gaps` in its profile ("" if nothing belongs there)."""
+    found: dict[str, Any] = {}
+    for driver in drivers:
+        if isinstance(driver, RegisterDriver) and (driver.learnt.gaps or driver.learnt.missing):
+            learnt, profile = driver.learnt, driver.profile
+            gaps = [gap_text(g) for g in learnt.profile_gaps]
+            found[driver.config.name] = {
+                "profile": profile.name,
+                "gaps": gaps,
+                "borders": [f"{g.table}:{g.address}" for g in learnt.gaps if not g.count],
+                "missing": list(learnt.missing),
+                "line": f"gaps: {json.dumps([*profile.form.gaps, *gaps])}" if gaps else "",
+            }
+    return found

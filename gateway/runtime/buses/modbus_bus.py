@@ -1,0 +1,552 @@
+"""One Modbus bus: its connection, its queue and the polls of its devices.
+
+The bus carries one transaction at a time. Writes go first; polls that are due and the requests of bridge clients
+alternate after them. While one unit ID has its pause after a transaction, the bus serves other units.
+
+A device that does not answer costs the other devices its own timeouts once. After that it is asked once per try, after
+growing pauses, and all such tries together get no more than a configured share of the bus's time while other devices
+answer (case 62 of the test-case list). This module opens connections only through the `Connector`. A connection that
+ends is opened again without limit, with back-off; until then the devices' tags are bad and carry the reason.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import Counter, deque
+from collections.abc import Awaitable, Callable
+from dataclasses import asdict, dataclass
+from typing import TypeVar
+
+from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S, Clock
+from fieldtwin.gateway.core.concurrency.timeout import alarm, ring
+from fieldtwin.gateway.core.connection import Connector
+from fieldtwin.gateway.core.errors import (
+    ConnectionLost,
+    DeviceRefused,
+    EndpointBusy,
+    FieldtwinError,
+    ReplyTimeout,
+    Unreachable,
+    WireError,
+    WrongDevice,
+)
+from fieldtwin.gateway.core.latency import Latencies
+from fieldtwin.gateway.core.values import Reason
+from fieldtwin.gateway.devices.config import BusConfig
+from fieldtwin.gateway.devices.register_device import RegisterDriver
+from fieldtwin.gateway.devices.transmitter import TransmitterDriver
+from fieldtwin.gateway.protocols.modbus.client import ModbusClient
+from fieldtwin.gateway.protocols.modbus.framings import framing_of
+from fieldtwin.gateway.protocols.modbus.refusals import Acknowledged, GatewayRefusal, ServerBusy
+from fieldtwin.gateway.protocols.modbus.server import NO_RESPONSE
+from fieldtwin.gateway.runtime.buses.backoff import Backoff
+from fieldtwin.gateway.runtime.buses.bridge_queue import GuestQueue
+from fieldtwin.gateway.runtime.buses.bus_turns import DeviceState, Turns, rates_of, restate, states_of
+from fieldtwin.gateway.runtime.buses.pending_config import Coming
+from fieldtwin.gateway.runtime.buses.unanswered import MOST_UNANSWERED, Unanswered
+from fieldtwin.gateway.runtime.tags import TagTable
+
+T = TypeVar("T")
+
+MAX_JOBS = 256
+
+
+def reason_of(error: FieldtwinError) -> Reason:
+    """Return the reason that a tag's quality carries after `error`."""
+    if isinstance(error, WrongDevice):
+        return Reason.WRONG_DEVICE
+    if isinstance(error, GatewayRefusal):
+        return Reason.TIMEOUT if error.code == NO_RESPONSE else Reason.UNREACHABLE
+    if isinstance(error, DeviceRefused):
+        return Reason.REFUSED
+    if isinstance(error, ReplyTimeout):
+        return Reason.TIMEOUT
+    return Reason.UNREACHABLE if isinstance(error, Unreachable) else Reason.WIRE_ERROR
+
+
+ALARM_NS = 10 * NS_PER_S
+"""How long the devices of a bus are polled with shortened timeouts after one of them stopped answering."""
+STREAMS = frozenset({"tcp", "tls", "rtu+tcp"})
+
+
+@dataclass
+class Job:
+    """A request to carry out on the bus before the next poll. `done` is called once, with None or the error."""
+
+    driver: RegisterDriver
+    run: Callable[[], Awaitable[None]]
+    done: Callable[[FieldtwinError | None], None]
+
+
+MOST_LOCALS = 64
+"""How many local addresses are remembered; each time the bus is opened adds one."""
+
+
+class ModbusBus:
+    """A Modbus bus that runs until cancelled. `on_offline` is called with the driver of a device that was lost.
+
+    `offset`, 0 to less than 1, moves the polls of this bus within the slots that their periods allow, so that the buses
+    of one gateway do not all poll at the same time.
+    """
+
+    def __init__(
+        self,
+        config: BusConfig,
+        drivers: list[RegisterDriver],
+        connector: Connector,
+        clock: Clock,
+        tags: TagTable,
+        on_offline: Callable[[RegisterDriver], None],
+        offset: float = 0.0,
+    ) -> None:
+        self.config = config
+        self.devices = states_of(drivers, offset)
+        self.connected = False
+        self.opens = 0
+        self.locals: deque[str] = deque(maxlen=MOST_LOCALS)
+        """The local addresses of the connections so far, latest last; an empty text for a medium without addresses."""
+        self.error = ""
+        self.down: FieldtwinError | None = None
+        """Why the last attempt to open the bus failed; None while the bus is open, or was open until just now."""
+        self.guests = GuestQueue()
+        self.guests.on_put = self._wake
+        self._guest_was_last = False
+        line = config.endpoint
+        t35_ns = round(3.5 * line.serial.char_time_s * NS_PER_S) if line.is_serial else 0
+        self._turns = Turns(self.devices, config.probe_share, t35_ns)
+        self._connector = connector
+        self._clock = clock
+        self._tags = tags
+        self._on_offline = on_offline
+        self._offset = offset
+        self._coming: Coming | None = None
+        self._jobs: deque[Job] = deque()
+        self._awake = False
+        """Set when the bus has new work to look at, whether `_serve` sleeps or not."""
+        self._sleeper: asyncio.Future[None] | None = None
+        self._idle = asyncio.Event()
+        self._halted = False
+        self._alarm_until_ns = 0
+        """Until this time, devices that answer are polled with shortened timeouts, because one of them stopped
+        answering."""
+        self.latency = Latencies()
+        self._past: Counter[str] = Counter()
+        self._client: ModbusClient | None = None
+
+    # -- status and requests ------------------------------------------------------------------------------------------
+
+    def online(self, driver: RegisterDriver) -> bool:
+        """Return whether the device answers and is the expected one."""
+        return any(d.driver is driver and d.online for d in self.devices)
+
+    def submit(self, job: Job) -> None:
+        """Queue a job, ahead of every poll. If the queue is full or there is no connection, the job fails at once."""
+        if not self.connected:
+            job.done(Unreachable(f"not connected: {self.error}", where=f"{self.config.name} {self.config.endpoint}"))
+        elif len(self._jobs) >= MAX_JOBS:
+            job.done(EndpointBusy("the bus has no room for another request", where=self.config.name))
+        else:
+            self._jobs.append(job)
+            self._wake()
+
+    def reconfigure(self, coming: Coming) -> None:
+        """Take over a new configuration between two polls: each device's part when no group of it is being read."""
+        self._coming = coming
+        if self._client is None:
+            self._take_over()
+        self._wake()
+
+    def _take_over(self) -> None:
+        coming, now_ns = self._coming, self._clock.monotonic_ns()
+        assert coming is not None
+        config = self.config = coming.bus
+        self._turns.restate(config.probe_share)
+        if self._client is not None:
+            self._client.restate(
+                timeout_s=config.timeout_s, turnaround_s=config.turnaround_s, spacing_s=config.spacing_s
+            )
+        rates = rates_of([coming.devices[d.driver.config.name] for d in self.devices], self._offset)
+        for device in self.devices:
+            driver = device.driver
+            new = coming.devices[driver.config.name]
+            if device.reading is None and driver.config is not new:
+                restate(device, new, rates[new.name], now_ns)
+                coming.taken(driver)
+        if all(d.driver.config is coming.devices[d.driver.config.name] for d in self.devices):
+            self._coming = None
+            coming.done.set()
+
+    def _wake(self) -> None:
+        self._awake = True
+        if self._sleeper is not None:
+            ring(self._sleeper)
+
+    def totals(self) -> Counter[str]:
+        """Return counters over all connections so far: requests, replies, timeouts and so on. `missed_polls` counts the
+        periods in which a group of an online device was not read."""
+        totals = self._past + Counter(asdict(self._client.counters)) if self._client else Counter(self._past)
+        totals["missed_polls"] = sum(sum(d.schedule.missed.values()) for d in self.devices)
+        return totals
+
+    async def halt(self, timeout_s: float) -> None:
+        """Stop sending: return when the request under way has ended, or after `timeout_s` seconds."""
+        self._halted = True
+        self._wake()
+        if self._client is not None:
+            try:
+                async with asyncio.timeout(timeout_s):
+                    await self._idle.wait()
+            except TimeoutError:
+                pass  # a slow device; the process ends all the same
+
+    # -- running --------------------------------------------------------------------------------------------------------
+
+    async def run(self) -> None:
+        """Open the connection, serve, and open it again, until cancelled."""
+        backoff = Backoff(0.25, 5.0)
+        endpoint = self.config.endpoint
+        epoch_ns = self._clock.monotonic_ns()
+        for device in self.devices:
+            device.schedule.anchor(epoch_ns)
+        while True:
+            if self._coming is not None:
+                self._take_over()
+            config = self.config
+            try:
+                connection = await self._connector.open_bytes(endpoint)
+            except Unreachable as e:
+                self.down = e
+                self._lost(e)
+                self.guests.fail_all(e)
+                await self._pause(backoff.next_s())
+                continue
+            client = ModbusClient.at(
+                endpoint,
+                connection,
+                self._clock,
+                timeout_s=config.timeout_s,
+                echo=config.echo,
+                strict=config.strict,
+                turnaround_s=config.turnaround_s,
+                spacing_s=config.spacing_s,
+            )
+            client.latency = self.latency
+            self._client = client
+            self.connected, self.error, self.down = True, "", None
+            self.locals.append(connection.local)
+            self.opens += 1
+            try:
+                for device in self.devices:
+                    device.driver.attach_client(connection, client)
+                    device.next_try_ns, device.tried = 0, False
+                if config.connect_pause_s:
+                    await self._pause(config.connect_pause_s)
+                await self._serve(client, backoff)
+            except ConnectionLost as e:
+                self._lost(e)
+                await self._pause(backoff.next_s())
+            finally:
+                self._past.update(asdict(client.counters))
+                self._client = None
+                self.connected = False
+                await client.aclose()
+
+    async def _pause(self, seconds: float) -> None:
+        await self._clock.sleep_until_ns(self._clock.monotonic_ns() + int(seconds * NS_PER_S))
+
+    def _lost(self, error: FieldtwinError) -> None:
+        self.connected, self.error = False, str(error)
+        for device in self.devices:
+            self._offline(device, error)
+        while self._jobs:
+            self._jobs.popleft().done(error)
+
+    async def _serve(self, client: ModbusClient, backoff: Backoff) -> None:
+        unanswered = Unanswered(client)
+        stream = self.config.endpoint.scheme in STREAMS
+        while True:
+            self._awake = False
+            if client.late_ns:
+                self._heard_late(client)
+            if stream and unanswered.too_many(any(device.online for device in self.devices)):
+                raise ConnectionLost(
+                    f"{MOST_UNANSWERED} requests in a row were not answered: the connection is made anew",
+                    where=str(self.config.endpoint),
+                )
+            if self._coming is not None:
+                self._take_over()
+            if self._halted:
+                self._idle.set()
+                await self._sleep(None)
+                continue
+            now_ns = self._clock.monotonic_ns()
+            wake_ns = now_ns + NS_PER_S
+            if self._jobs:
+                job, wake_ns = self._next_job(client, now_ns)
+                if job is not None:
+                    await self._run_job(job)
+                    continue
+            seen_ns, timeout_s = self.latency.recent_longest_ns, self.config.timeout_s
+            device, group, at_ns = self._turns.next(client.spaced_ns, now_ns, seen_ns, timeout_s)
+            due = at_ns <= now_ns
+            if self.guests.size and not (due and self._guest_was_last) and await self._carry_guest():
+                backoff.reset()
+            elif due and device is not None:
+                self._guest_was_last = False
+                await self._poll(client, device, group)
+                backoff.reset()
+            else:
+                await self._sleep(min(at_ns, wake_ns))
+
+    def _next_job(self, client: ModbusClient, now_ns: int) -> tuple[Job | None, int]:
+        """Return the first queued job whose unit has had its pause, or None, and the time at which to look again."""
+        wake_ns = now_ns + NS_PER_S
+        for place, job in enumerate(self._jobs):
+            ready_ns = client.spaced_ns(job.driver.config.address)
+            if ready_ns <= now_ns:
+                del self._jobs[place]
+                return job, now_ns
+            wake_ns = min(wake_ns, ready_ns)
+        return None, wake_ns
+
+    async def _carry_guest(self) -> bool:
+        """Carry out one request of a bridge client, if one waits. Return whether one did."""
+        client = self._client
+        guest = self.guests.take(self._clock.monotonic_ns()) if client is not None else None
+        if guest is None or client is None:
+            return False
+        self._guest_was_last = True
+        await self.guests.carry_out(guest, client, framing_of(self.config.endpoint) == "rtu")
+        return True
+
+    async def _sleep(self, until_ns: int | None) -> None:
+        """Sleep until `until_ns`, or until `_wake` is called; with None, only until `_wake` is called."""
+        if self._awake:
+            return
+        loop, end = asyncio.get_running_loop(), None
+        if until_ns is None:
+            self._sleeper = loop.create_future()
+        else:
+            left_s = (until_ns - self._clock.monotonic_ns()) / NS_PER_S
+            self._sleeper, end = alarm(loop, left_s if left_s > 0.0 else 0.0)
+        try:
+            await self._sleeper
+        finally:
+            self._sleeper = None
+            if end is not None:
+                end()
+
+    async def _poll(self, client: ModbusClient, device: DeviceState, group: str) -> None:
+        """Give a device one turn: one transaction of a group, or first contact."""
+        begun_ns = self._clock.monotonic_ns()
+        device.polls += not device.online or device.reading is None
+        unit, probed = device.driver.config.address, not device.online
+        try:
+            if probed:
+                device.tried, device.asked_ns = True, begun_ns
+                if device.timeout_ns:
+                    client.hurry(unit, device.timeout_ns / NS_PER_S)
+                group = await self._bring_online(device)
+            elif not device.alone:
+                client.hurry(unit, self._patience_s(device, begun_ns))
+            await self._turn(device, group)
+        except ConnectionLost:
+            raise
+        except ReplyTimeout as e:
+            self._silent(client, device, e, begun_ns, probed)
+        except (WireError, WrongDevice, Unreachable, GatewayRefusal) as e:
+            self._failed(client, device, e, begun_ns, probed)
+        except DeviceRefused as e:
+            self._refused(device, group, e)
+        else:
+            device.online, device.error = True, ""
+            device.last_cost_ns = device.silences = 0
+            device.answered_ns = self._clock.monotonic_ns()
+            device.backoff.reset()
+        finally:
+            if client.hurried(unit):
+                client.relax(unit)
+
+    def _patience_s(self, device: DeviceState, now_ns: int) -> float:
+        """Return how long, in seconds, to wait for a device that answers, when other devices also need the bus."""
+        if now_ns < self._alarm_until_ns:
+            return self._turns.short_s(device, self.latency.recent_longest_ns, self.config.timeout_s)
+        return self._own_s(device)
+
+    def _own_s(self, device: DeviceState) -> float:
+        stated_s = device.driver.config.timeout_s
+        return self.config.timeout_s if stated_s is None else stated_s
+
+    def _silent(
+        self, client: ModbusClient, device: DeviceState, error: ReplyTimeout, begun_ns: int, probed: bool
+    ) -> None:
+        """Handle a device that did not answer. A device that answered before keeps its turn while it has repetitions
+        left; the other devices are polled meanwhile.
+
+        Several devices often stop answering together, because of a cut cable. So for a while the other devices are
+        polled with shortened timeouts too. Otherwise each of them would cost its whole timeout, while the devices that
+        still answer wait.
+        """
+        if not probed and not device.alone:
+            shortened = self._patience_s(device, begun_ns) < self._own_s(device)
+            if begun_ns >= self._alarm_until_ns:
+                self._turns.doubt_ns = begun_ns
+            self._alarm_until_ns = self._clock.monotonic_ns() + ALARM_NS
+            # A shortened timeout proves nothing: a slow device gets another try, with more time once its late reply was
+            # received.
+            tries = max(self._retries_of(device), 1 if shortened else 0)
+            if device.reading is not None and device.silences < tries:
+                device.silences += 1
+                device.poll_errors += 1
+                return
+        self._failed(client, device, error, begun_ns, probed)
+
+    def _failed(
+        self, client: ModbusClient, device: DeviceState, error: FieldtwinError, begun_ns: int, probed: bool
+    ) -> None:
+        """Record that a device is away, or still away, and charge the time that this try took."""
+        device.poll_errors += 1
+        self._offline(device, error)
+        now_ns = self._clock.monotonic_ns()
+        clear_ns = max(now_ns, client.clear_ns)
+        answered_first = probed and not client.hurried(device.driver.config.address)
+        device.fits = device.fits and probed and not answered_first
+        device.last_cost_ns = clear_ns - begun_ns if answered_first else 0
+        self._turns.failed(device, begun_ns, now_ns, clear_ns)
+
+    def _heard_late(self, client: ModbusClient) -> None:
+        """Handle devices that answered after their shortened timeout but within their own: they are present, so they
+        are asked again at once, with more time."""
+        for device in self.devices:
+            late_ns = client.late_ns.get(device.driver.config.address)
+            if late_ns is not None and late_ns <= self._own_s(device) * NS_PER_S:
+                device.late_ns, device.next_try_ns = max(device.late_ns, late_ns), self._clock.monotonic_ns()
+        client.late_ns.clear()
+
+    async def _bring_online(self, device: DeviceState) -> str:
+        """Make first contact, or contact again: check the device's identity and where its mailboxes stand. Return the
+        group to read first.
+
+        Where the configuration states no identity to check, the device is online once it answers.
+        """
+        driver = device.driver
+        if driver.learnt.missing:
+            driver.ask_again()
+        await self._attempts(device, driver.identify)
+        if isinstance(driver, TransmitterDriver):
+            await self._attempts(device, driver.synchronise)
+        device.schedule.start(self._clock.monotonic_ns())
+        group = next(iter(device.schedule.due_ns), "")
+        # A device of which nothing is ever read counts as online, because no poll could tell.
+        device.online = bool(driver.config.expect) or isinstance(driver, TransmitterDriver) or not group
+        if device.online:
+            device.error = ""
+            return group
+        return group if device.alone else min(device.schedule.due_ns, key=driver.cost)
+
+    async def _turn(self, device: DeviceState, group: str) -> None:
+        """Carry out the next transaction of `group`: its trigger, its first read or a further read."""
+        if not group:
+            return
+        driver, reading = device.driver, device.reading
+        if reading is None:
+            now_ns = self._clock.monotonic_ns()
+            device.reading_due_ns = device.schedule.due_ns[group]
+            device.schedule.took(group, now_ns)
+            if driver.profile.form.trigger is not None and await self._trigger(device, group, now_ns):
+                return
+            reading = device.reading = driver.begin(group)
+        going = reading
+        if await self._attempts(device, lambda: driver.read_next(going), later=True):
+            device.reading = None
+            driver.finish(reading)
+
+    async def _trigger(self, device: DeviceState, group: str, now_ns: int) -> bool:
+        """Trigger a device that measures on request, and return True if its values have to be read later. The bus
+        serves other devices meanwhile."""
+        driver = device.driver
+        wait_ms = driver.trigger_wait_ms(group)
+        if not wait_ms or group in device.triggered:
+            device.triggered.discard(group)
+            return False
+        if driver.may_trigger:
+            await self._attempts(device, driver.trigger)
+            device.triggered.add(group)
+            device.schedule.defer(group, self._clock.monotonic_ns() + wait_ms * NS_PER_MS)
+        else:
+            names = [f"{driver.config.name}.{t.name}" for t in driver.profile.group(group)]
+            self._tags.put_bad(names, Reason.NOT_SAMPLING)
+        return True
+
+    def _refused(self, device: DeviceState, group: str, error: DeviceRefused) -> None:
+        """Handle a device that answers but refuses this group; its other groups go on.
+
+        Busy (06) and acknowledge (05: the request takes long) mean "later": the last value stays valid until it is
+        stale and is never replaced by 0, and the device is given time (MB-023, MB-024). That time belongs to the
+        device: other groups that are refused with "later" before it is over wait until the same moment. Only a refusal
+        after that moment makes the next pause longer.
+        """
+        device.poll_errors += 1
+        device.reading = None
+        if not group:  # it refused the request for its identity
+            self._offline(device, error)
+            return
+        device.online, device.error = True, str(error)
+        if isinstance(error, Acknowledged | ServerBusy):
+            now_ns = self._clock.monotonic_ns()
+            if now_ns >= device.busy_until_ns:
+                device.busy_until_ns = now_ns + int(device.backoff.next_s() * NS_PER_S)
+            device.schedule.defer(group, device.busy_until_ns)
+            return
+        names = [f"{device.driver.config.name}.{t.name}" for t in device.driver.profile.group(group)]
+        self._tags.put_bad(names, reason_of(error))
+
+    def _offline(self, device: DeviceState, error: FieldtwinError) -> None:
+        was_online = device.online
+        device.online, device.error = False, str(error)
+        device.reading = None
+        device.silences = 0
+        device.schedule.stop()
+        device.next_try_ns = self._clock.monotonic_ns() + int(device.backoff.next_s() * NS_PER_S)
+        self._tags.put_bad(device.driver.tag_names, reason_of(error))
+        if was_online:
+            self._on_offline(device.driver)
+
+    async def _run_job(self, job: Job) -> None:
+        device = next((d for d in self.devices if d.driver is job.driver), None)
+        if device is not None and device.tried and not device.online:
+            job.done(Unreachable(f"the device is away: {device.error}", where=job.driver.config.where))
+            return
+        try:
+            await self._attempts(device, job.run)
+        except ConnectionLost as e:
+            job.done(e)
+            raise
+        except FieldtwinError as e:
+            job.done(e)
+        else:
+            job.done(None)
+
+    def _retries_of(self, device: DeviceState) -> int:
+        stated = device.driver.config.retries
+        return self.config.retries if stated is None else stated
+
+    async def _attempts(
+        self, device: DeviceState | None, what: Callable[[], Awaitable[T]], *, later: bool = False
+    ) -> T:
+        """Try up to `1 + retries` times while the error is on the bus. A request that the device refuses is not
+        repeated, and a device that was away is asked only once.
+
+        With `later`, a timeout is raised without a repetition if other devices wait for the bus.
+        """
+        retries = self.config.retries
+        if device is not None:
+            retries = self._retries_of(device) if device.retries_left else 0
+        while True:
+            try:
+                return await what()
+            except WireError as e:
+                wait = later and isinstance(e, ReplyTimeout) and device is not None and not device.alone
+                if not retries or wait:
+                    raise
+                retries -= 1

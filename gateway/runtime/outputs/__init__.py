@@ -1,0 +1,1 @@
+"""Outputs: what the PLC commands, what a device holds, and what was refused."""

@@ -1,0 +1,112 @@
+"""One output: its tag, its device, its wanted value and how far the last write got. It makes no decisions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from fieldtwin.gateway.core.errors import FieldtwinError, NotAllowed
+from fieldtwin.gateway.core.values import COMMAND, TagValue
+from fieldtwin.gateway.devices.canopen_device import CanopenDriver
+from fieldtwin.gateway.devices.register_device import RegisterDriver
+from fieldtwin.gateway.runtime.buses.canopen_bus import CanopenBus
+from fieldtwin.gateway.runtime.buses.modbus_bus import Job, ModbusBus
+
+SAFE = "safe: "
+
+
+@dataclass
+class Output:
+    """One output: its tag, its device, and how far the last write got."""
+
+    tag: str
+    local: str
+    driver: RegisterDriver | CanopenDriver
+    bus: ModbusBus | CanopenBus
+    safe: float | None
+    wanted: float | None = None
+    by: str = ""
+    held: float | None = None
+    held_since_ns: int = 0
+    compared: TagValue | None = None
+    """The last value read from the device that was compared with the sent value and found equal."""
+    pending: bool = False
+    refused: tuple[float, str] | None = None
+    not_a_number: bool = False
+    """The program's newest value is not a number, so `wanted` is an older value."""
+    waits_since_ns: int | None = None
+    """Since when the output waits for a device that does not answer; `AWAY_REPORTED` once the journal has it."""
+    next_try_ns: int = 0
+    commanded: bool = False
+    """Whether a program writes it. If not, the gateway writes only its safe value and what a client requests."""
+    untouched: bool = True
+    """No value was written to it yet, and its device was not lost: the device may already hold the wanted value."""
+    due_since_ns: int | None = None
+    """Since when (monotonic) the first write has been due while the device was online."""
+    asked: Callable[[FieldtwinError | None], None] | None = None
+    """The callback of the client that requested one write; None for what the PLC or the safe state commands."""
+
+    @property
+    def ready(self) -> bool:
+        """Whether the device accepts a write now."""
+        if isinstance(self.driver, CanopenDriver):
+            assert isinstance(self.bus, CanopenBus)
+            return self.bus.takes(self.driver, self.local)
+        assert isinstance(self.bus, ModbusBus)
+        return self.bus.online(self.driver)
+
+    @property
+    def frame(self) -> object | None:
+        """The frame that carries this output: the same object for each output that shares it, None for one that is
+        written by itself."""
+        if isinstance(self.bus, CanopenBus) and isinstance(self.driver, CanopenDriver):
+            return self.bus.frame_of(self.driver, self.local)
+        return None
+
+    @property
+    def settle_ns(self) -> int:
+        """How many nanoseconds after a write the device may still report the value before it."""
+        if isinstance(self.bus, CanopenBus) and isinstance(self.driver, CanopenDriver):
+            return self.bus.settle_ns(self.driver, self.local)
+        return 0
+
+    @property
+    def read_back(self) -> bool:
+        """Whether the gateway reads it cyclically: by polls, or by process data that the node sends."""
+        driver, tag = self.driver, self.driver.profile.tags[self.local]
+        if not tag.readable:
+            return False
+        if isinstance(driver, CanopenDriver) and self.tag in driver.pdo_tags:
+            return True
+        return any(tag in driver.profile.group(group) for group in driver.config.poll)
+
+    def submit(self, command: COMMAND, done: Callable[[FieldtwinError | None], None]) -> None:
+        """Start the write."""
+        if isinstance(self.driver, CanopenDriver):
+            assert isinstance(self.bus, CanopenBus)
+            self.bus.write(self.driver, self.local, command, done)
+        else:
+            assert isinstance(self.bus, ModbusBus)
+            self.driver.consumer.observe(command)
+            self.bus.submit(Job(self.driver, self.driver.send, done))
+
+    def shown(self, value: object) -> object:
+        """Return `value` as the audit log may show it: a secret is not written down."""
+        return "(secret)" if self.driver.profile.tags[self.local].secret else value
+
+    def answer(self, error: FieldtwinError | None) -> None:
+        """Report the result to the client that requested the write. The request was for one write, so the gateway does
+        not write the value again later."""
+        asked, self.asked = self.asked, None
+        if asked is not None:
+            if not self.by.startswith(SAFE):
+                self.wanted = None
+            asked(error)
+
+
+def as_sent(output: Output) -> bytes:
+    """Return the bytes that `output` would send now for the value it holds; empty if it may no longer be sent."""
+    try:
+        return output.driver.command(output.local, output.held).data if output.held is not None else b""
+    except NotAllowed:
+        return b""

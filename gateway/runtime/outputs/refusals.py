@@ -1,0 +1,278 @@
+"""The journal of writes that did not reach their device: tag, value, cause, source and number of repetitions.
+
+An entry is an event for live views, traces, summaries and scenarios. A repetition is counted in the entry that it
+repeats, so a program that commands the same impossible value in every scan makes one entry. The journal is limited: it
+keeps the newest `KEPT` entries and counts all. It also writes the refusals of commands into the audit log, at most one
+line per second and tag; a line gives the number of refusals that it covers.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any
+
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.errors import (
+    DeviceRefused,
+    FieldtwinError,
+    ModbusExceptionReply,
+    NotAllowed,
+    Unreachable,
+    WrongDevice,
+)
+from fieldtwin.gateway.runtime.audit_log import AuditLog
+
+KEPT = 256
+"""How many entries are kept."""
+MERGE_NS = NS_PER_S
+"""A refusal of the same tag for the same cause within this time repeats the previous entry, whatever its value."""
+MERGE_AT_MOST_NS = 10 * NS_PER_S
+"""After this time a refusal of a different value makes a new entry, so that a later reader sees that refusals
+continue."""
+AUDIT_EVERY_NS = NS_PER_S
+"""The shortest time between two audit-log lines about the same tag, cause and client."""
+MOST_AUDITED = 1024
+"""For how many combinations of tag, cause and client the last audit-log line is remembered."""
+LATER = frozenset({5, 6, 10, 11})
+"""Modbus exception codes that mean "not now" or come from a gateway on the path: the same write may succeed later."""
+
+
+class Cause(Enum):
+    """Why a write did not reach its device."""
+
+    LIMIT = "limit"
+    """The value is outside the limits of the tag, or its type cannot hold it, or it is not a number."""
+    NOT_WRITABLE = "not writable"
+    """The configuration does not allow writing this tag."""
+    READ_ONLY = "read-only"
+    """The plant runs without permission to write."""
+    WRONG_DEVICE = "wrong device"
+    """The device that answers is not the one that the system file expects."""
+    DEVICE = "device"
+    """The device answered and refused the value, or acknowledged it and holds a different one."""
+    GROUP = "group"
+    """Another member of the tag's group was refused, so the whole group is held back."""
+    AWAY = "away"
+    """The device does not answer. The value is written when it is back."""
+    FAILED = "failed"
+    """The write was sent and not confirmed (no reply, a corrupted reply, a busy device). The gateway tries again."""
+    LOCAL = "local"
+    """The topside controller sent a command to a plant whose switch is set to `local`."""
+    NOT_NOW = "not now"
+    """A client requested a write while another was under way or the outputs were in their safe state."""
+
+
+OF_PROGRAM = frozenset({Cause.LIMIT, Cause.NOT_WRITABLE})
+"""Causes that require a change to the program or the configuration, whatever happens in the plant."""
+OF_DEVICE = frozenset({Cause.WRONG_DEVICE, Cause.DEVICE})
+"""Causes that a disturbed device may also produce."""
+
+
+class HeldBack(NotAllowed):
+    """A member of a group was not sent because of another member."""
+
+
+def cause_of(error: FieldtwinError) -> Cause:
+    """Return the cause of a write that a driver or a bus ended with `error`."""
+    if isinstance(error, HeldBack):
+        return Cause.GROUP
+    if isinstance(error, WrongDevice):
+        return Cause.WRONG_DEVICE
+    if isinstance(error, ModbusExceptionReply) and error.code in LATER:
+        return Cause.FAILED
+    if isinstance(error, DeviceRefused):
+        return Cause.DEVICE
+    return Cause.WRONG_DEVICE if isinstance(error, NotAllowed) else Cause.FAILED
+
+
+@dataclass(slots=True)
+class Refusal:
+    """One entry. `first` is the value of the first refusal, `value` that of the newest; `t_ns` and `last_ns` are
+    monotonic.
+
+    `place` is the line of the program that set the value (``pump.st:14``), "" if it is not known. Another process looks
+    it up after the entry was made; until then `known` is False.
+    """
+
+    number: int
+    tag: str
+    first: object
+    value: object
+    cause: Cause
+    reason: str
+    by: str
+    t_ns: int
+    last_ns: int
+    count: int = 1
+    program: str = ""
+    place: str = ""
+    known: bool = True
+    standing: bool = True
+    """False once a different value was wanted, or the value was written."""
+
+    @property
+    def of_program(self) -> bool:
+        """Whether a program or the safe state requested the write, and not a client."""
+        return self.by == "plc" or self.by.startswith("safe: ")
+
+    @property
+    def fault(self) -> str:
+        """What has to be changed: "program" if the program or the configuration is wrong, "device" if a device refused.
+        "" for a write that is refused by design, is tried again, or was requested by a client."""
+        if not self.of_program:
+            return ""
+        return "program" if self.cause in OF_PROGRAM else "device" if self.cause in OF_DEVICE else ""
+
+    def describe(self) -> dict[str, Any]:
+        """Return the entry as plain data."""
+        return {
+            "number": self.number,
+            "tag": self.tag,
+            "first": self.first,
+            "value": self.value,
+            "cause": self.cause.value,
+            "reason": self.reason,
+            "by": self.by,
+            "t_ns": self.t_ns,
+            "last_ns": self.last_ns,
+            "count": self.count,
+            "program": self.program,
+            "place": self.place,
+            "fault": self.fault,
+            "standing": self.standing,
+        }
+
+
+class Refusals:
+    """The journal of one gateway. `on_new` is called with each new entry; it must not raise."""
+
+    def __init__(self, audit: AuditLog) -> None:
+        self.counts: Counter[Cause] = Counter()
+        self.faults: Counter[str] = Counter()
+        """How many entries of programs there were by `Refusal.fault`, including those that are no longer kept."""
+        self.on_new: Callable[[Refusal], None] | None = None
+        self.looks_up = False
+        """Whether the place of each entry of a program is being looked up and reported with `placed`."""
+        self.unrecorded = 0
+        """How many refusals could not be written into the audit log."""
+        self._audit = audit
+        self._entries: deque[Refusal] = deque(maxlen=KEPT)
+        self._newest: dict[str, Refusal] = {}
+        self._number = 0
+        self._audited: dict[tuple[str, str, Cause], tuple[int, int]] = {}
+        """By tag, client and cause: when the last line was written, and how many refusals came since."""
+
+    @property
+    def total(self) -> int:
+        """The number of refusals, repetitions included."""
+        return sum(self.counts.values())
+
+    def note(
+        self,
+        device: str,
+        tag: str,
+        value: object,
+        cause: Cause,
+        reason: str,
+        by: str,
+        now_ns: int,
+        *,
+        old: object = None,
+        audit: bool = True,
+    ) -> None:
+        """Note that a write of `value` did not reach the device. With `audit` it also gets a line in the audit log."""
+        self.counts[cause] += 1
+        if audit:
+            self._record(device, tag, value, cause, reason, by, now_ns, old)
+        before = self._newest.get(tag)
+        if before is not None and (before.cause, before.by) == (cause, by):
+            same = before.standing and before.value == value
+            if same or (now_ns - before.last_ns <= MERGE_NS and now_ns - before.t_ns <= MERGE_AT_MOST_NS):
+                before.standing = before.of_program
+                before.count += 1
+                before.value, before.reason, before.last_ns = value, reason, now_ns
+                return
+        if before is not None:
+            before.standing = False
+        self._number += 1
+        entry = Refusal(self._number, tag, value, value, cause, reason, by, now_ns, now_ns)
+        entry.standing = entry.of_program  # a client's request was for one write, so it does not stand
+        entry.known = not (self.looks_up and by == "plc")
+        if entry.of_program:
+            self.faults[entry.fault] += 1
+        self._newest[tag] = entry
+        self._entries.append(entry)
+        if self.on_new is not None:
+            self.on_new(entry)
+
+    def settle(self, tag: str) -> None:
+        """End the standing refusal of a tag, because the tag was written or a value is wanted that may be written."""
+        if tag in self._newest:
+            self._newest[tag].standing = False
+
+    def _record(
+        self, device: str, tag: str, value: object, cause: Cause, reason: str, by: str, now_ns: int, old: object
+    ) -> None:
+        key = (tag, by.partition(" (")[0].rpartition(":")[0] or by, cause)
+        last_ns, more = self._audited.pop(key, (None, 0))
+        if last_ns is not None and now_ns - last_ns < AUDIT_EVERY_NS:
+            self._audited[key] = (last_ns, more + 1)
+            return
+        self._audited[key] = (now_ns, 0)
+        if len(self._audited) > MOST_AUDITED:
+            oldest = next(iter(self._audited))
+            self._write_rest(oldest, self._audited.pop(oldest)[1])
+        details = {"more_refused_since": more} if more else {}
+        self._write(device, by, reason, tag=tag, old=old, new=value, cause=cause.value, **details)
+
+    def _write_rest(self, key: tuple[str, str, Cause], more: int) -> None:
+        if more:
+            tag, by, cause = key
+            self._write(
+                tag.partition(".")[0], by, "the same again", tag=tag, cause=cause.value, more_refused_since=more
+            )
+
+    def _write(self, device: str, by: str, reason: str, **details: object) -> None:
+        try:
+            self._audit.note("refuse", device, by=by, result=reason, **details)
+        except Unreachable:
+            self.unrecorded += 1  # counted; the write is refused with or without a record
+
+    def flush(self) -> None:
+        """Write into the audit log how many refusals came since the last line about their tag. Called when the gateway
+        stops."""
+        for key, (last_ns, more) in list(self._audited.items()):
+            self._write_rest(key, more)
+            self._audited[key] = (last_ns, 0)
+
+    def placed(self, number: int, program: str, place: str) -> None:
+        """Set the line of the program that set the value of entry `number`; "" if it is not known."""
+        for entry in reversed(self._entries):
+            if entry.number == number:
+                entry.program, entry.place, entry.known = program, place, True
+                return
+
+    def since(self, number: int) -> list[Refusal]:
+        """Return the entries after `number` that are kept, the oldest first, up to the first whose place is still
+        looked up."""
+        found: list[Refusal] = []
+        for entry in self._entries:
+            if entry.number > number:
+                if not entry.known:
+                    break
+                found.append(entry)
+        return found
+
+    def describe(self) -> dict[str, Any]:
+        """Return the journal's part of the status: counts by cause, and the entries that are kept."""
+        return {
+            "total": self.total,
+            "entries_made": self._number,
+            "unrecorded": self.unrecorded,
+            "faults": {"program": self.faults["program"], "device": self.faults["device"]},
+            "counts": {cause.value: n for cause, n in sorted(self.counts.items(), key=lambda item: item[0].value)},
+            "entries": [entry.describe() for entry in self._entries],
+        }

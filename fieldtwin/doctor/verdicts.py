@@ -1,4 +1,4 @@
-"""Judge a computer's properties for a plant's controller, with remedies. Pure: `health` reads the computer."""
+"""Judge a computer's properties for a plant's controller, with remedies. Pure: `checks` reads the computer."""
 
 from __future__ import annotations
 

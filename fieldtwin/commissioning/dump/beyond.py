@@ -2,7 +2,7 @@
 
 Every question in a silent area costs a timeout, so the addresses are sampled, the roundest first, until the time budget
 is used up. Among refusals a device may hold values that can only be read whole, so reads of two and more registers are
-tried there. Pure, as `dump_sweep` is.
+tried there. Pure, as `sweep` is.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Explore a node's object dictionary over SDO: index by index, or entry by entry of an EDS.
 
-Pure, and a generator as `dump_sweep` is. Nothing is written; a write-only object is never requested.
+Pure, and a generator as `sweep` is. Nothing is written; a write-only object is never requested.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Read the tags of a profile in the fewest requests that the limits of the profile and of the device allow.
 
-A generator as `dump_sweep` is, over the planner that runs the plant (`fieldtwin.gateway.devices.read_plan`): a refused
+A generator as `sweep` is, over the planner that runs the plant (`fieldtwin.gateway.devices.read_plan`): a refused
 read is halved, and limits learnt on the way are used from the next pass on.
 """
 

@@ -6,7 +6,7 @@ questions. This is how an interrupted dump continues: recorded answers are repla
 A read that is refused contains a hole or is too long, and the exception code does not show which (devices disagree).
 Therefore a single register decides; after a readable prefix the next register decides again, and a short read across
 the border. In an area that cannot be read only some addresses are tried (`Sweep.stride`). Where the device is silent
-`asking` stops early, because each question costs a timeout; `dump_beyond` continues from there within a time budget.
+`asking` stops early, because each question costs a timeout; `beyond` continues from there within a time budget.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Find the registers that belong together, their type and order, by weighing all readings of a run against each other.
 
-Each reading of a stretch of registers has a cost (`infer_costs`); a run of registers is tiled by readings. A reading's
+Each reading of a stretch of registers has a cost (`costs`); a run of registers is tiled by readings. A reading's
 probability is the share of all tilings, weighed by their costs, that contain it (forward and backward sums, as in a
 hidden Markov model). So a word that fits both of its neighbours is doubtful, and is reported as such.
 """
@@ -51,7 +51,7 @@ class Level(Enum):
 class Reading:
     """A stretch of registers read as one value. `probability` against all others; `rivals` the next best, best first.
 
-    `model` is the probability before calibration (`infer_calibration`), None if not calibrated. `sign_open`: no value
+    `model` is the probability before calibration (`calibration`), None if not calibrated. `sign_open`: no value
     was seen that distinguishes a signed integer from an unsigned one; `probability` is then that of both. `capped` is
     the reason why it is not certain, however probable.
     """

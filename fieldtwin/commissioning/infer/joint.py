@@ -1,6 +1,6 @@
 """Evidence that only neighbouring registers show together: a carry from the low into the high word, and single bits.
 
-Pure arithmetic in nats, as `infer_costs` is.
+Pure arithmetic in nats, as `costs` is.
 """
 
 from __future__ import annotations

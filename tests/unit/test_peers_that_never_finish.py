@@ -44,7 +44,7 @@ from fieldtwin.gateway.protocols.canopen.sdo import (
 )
 from fieldtwin.gateway.protocols.canopen.sdo_block import SdoBlockDownload, SdoBlockUpload
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient
-from fieldtwin.gateway.runtime.bridge.bridge import tcp as bridge_tcp
+from fieldtwin.gateway.runtime.bridge import tcp as bridge_tcp
 from fieldtwin.gateway.runtime.tags import TagTable
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.service import metrics_server

@@ -25,8 +25,8 @@ sys.platform = "win32"
 from fieldtwin.gateway.connections.os_connector import OsConnector
 from fieldtwin.gateway.connections.serial_threads import ThreadedSerialConnection
 from fieldtwin.gateway.core.endpoint import Endpoint
-for verb in ("line", "scan", "identify"):
-    __import__(f"fieldtwin.cli.{verb}_command")
+for command in ("line", "scan", "identify"):
+    __import__(f"fieldtwin.cli.device.{command}_command")
 async def main():
     port = await OsConnector().open_bytes(Endpoint.parse("rtu:" + sys.argv[1]))
     assert type(port) is ThreadedSerialConnection

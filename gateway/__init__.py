@@ -1,0 +1,1 @@
+"""The gateway: protocols, device drivers, the process image, and the runtime that polls and writes."""

@@ -1,1 +1,1 @@
-"""The soft PLC. It depends only on fieldtwin.gateway.core and does not know a bus, a driver, an emulator or a twin."""
+"""The soft PLC: scan cycle, tasks, programs in Python and Structured Text. It knows no bus, driver, emulator or twin."""

@@ -1,1 +1,1 @@
-"""The command line. Each module `*_command` holds one command; it parses and prints, and other packages do the work."""
+"""The command line, one module for each command: it parses and prints, and other packages do the work."""

@@ -1,1 +1,4 @@
-"""Commissioning: the commands for a real device. Each listens before it sends, and confirms before it writes."""
+"""Commissioning of one real device: scan, identify, read, write, dump, infer, record.
+
+Each command listens before it sends, and confirms before it writes.
+"""

@@ -1,1 +1,1 @@
-"""A run as a service: what watches it (metrics, systemd, the journal) and what it is told (reload)."""
+"""A run as a system service: metrics, systemd notifications, journal events and reloading."""

@@ -1,0 +1,1 @@
+"""Open connections of the operating system: serial ports, TCP, TLS, UDP, CAN."""

@@ -1,0 +1,1 @@
+"""The vocabulary of all packages: values, errors, endpoints, connections, clocks. Pure: no I/O."""

@@ -1,0 +1,1 @@
+"""Device drivers: a profile and a protocol client become tags."""

@@ -1,0 +1,1 @@
+"""The running gateway: buses, polls, outputs, the bridge, the mailboxes and the image."""

@@ -1,0 +1,1 @@
+"""Databases of exchanges and knowledge: SQLite and PostgreSQL."""

@@ -1,0 +1,1 @@
+"""Properties of devices that a profile cannot express."""

@@ -21,7 +21,8 @@ class _Console(Console):
         """As rich does, but control characters in a text are shown and never sent: a name in a stranger's file could otherwise
         clear the screen or retitle the terminal."""
         for segment in super().render(renderable, options):
-            yield segment if segment.control is not None else Segment(visible(segment.text), segment.style)
+            text = segment.text if segment.control is not None else visible(segment.text)
+            yield segment if text is segment.text else Segment(text, segment.style)
 
 
 # emoji=False: `model.py:Boom:` in a text is a user's class, and no picture of an explosion.

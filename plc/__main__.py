@@ -1,4 +1,4 @@
-"""``python -m plc CONFIG.json``: one PLC process. Exit codes as in DESIGN.md; diagnostics go to stderr."""
+"""``python -m fieldtwin.plc CONFIG.json``: one PLC process. Exit codes as in DESIGN.md; diagnostics go to stderr."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from fieldtwin.plc.process import plc_main
 def main() -> int:
     """Read the configuration named on the command line and run it."""
     if len(sys.argv) != 2:
-        print("usage: python -m plc CONFIG.json", file=sys.stderr)
+        print("usage: python -m fieldtwin.plc CONFIG.json", file=sys.stderr)
         return 2
     try:
         return plc_main(PlcConfig.load(Path(sys.argv[1])))

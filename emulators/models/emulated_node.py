@@ -88,8 +88,8 @@ def emulated_node(
         if objects is not None:
             context = replace(context, factory={**objects.initial, **own}, refusals=objects.refusals)
         distorted = DistortedObjects(tags, dictionary, objects, has_model=model is not None)
-    context = replace(context, source=distorted, distort=distorted.over if model is not None else None)
-    context = replace(context, given=distorted.given)
+    over = distorted.over if model is not None else None
+    context = replace(context, source=distorted, distort=over, given=distorted.given)
     node = CanopenNode(dictionary, node_id, context)
     distorted.data = node.data
     for tag in tags:  # values of the data sheet, for tags that no source provides, are journalled too

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import asyncio
 import os
-import signal
 import sys
 from contextlib import suppress
 from datetime import UTC, datetime
@@ -22,9 +21,10 @@ import msgspec
 from fieldtwin.gateway.connections.os_connector import OsConnector
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
+from fieldtwin.gateway.core.concurrency.stop_signal import on_stop_signal
 from fieldtwin.gateway.core.connection import Connector
 from fieldtwin.gateway.core.control import ControlServer
-from fieldtwin.gateway.core.errors import FieldtwinError, Unreachable, UsageError
+from fieldtwin.gateway.core.errors import Unreachable, UsageError
 from fieldtwin.gateway.devices.register_device import RegisterDriver
 from fieldtwin.gateway.runtime.audit_log import AuditLog
 from fieldtwin.gateway.runtime.buses.learnt_gaps import LearntFile, describe_learnt
@@ -32,7 +32,8 @@ from fieldtwin.gateway.runtime.mailboxes.acked_commands import TakenFile
 from fieldtwin.gateway.runtime.reconfigure import reconfigure
 from fieldtwin.gateway.runtime.status import describe
 from fieldtwin.gateway.store.exchange_log import ExchangeLog
-from fieldtwin.gateway.wallclock import WallClock, run
+from fieldtwin.gateway.wallclock import WallClock
+from fieldtwin.twin.plant.child_main import child_main
 from fieldtwin.twin.plant.mapping import MappedConnector, mapping_from_json
 from fieldtwin.twin.plant.physical import EmbeddedControlSystem, attached, gateway_config
 from fieldtwin.twin.plant.refusal_places import RefusalPlaces
@@ -143,9 +144,7 @@ class GatewayProcess:
             }
         )
         await server.listen_unix(socket)
-        loop = asyncio.get_running_loop()
-        for number in (signal.SIGTERM, signal.SIGINT):
-            loop.add_signal_handler(number, self._stop.set)
+        on_stop_signal(self._stop.set)
         try:
             async with Nursery() as nursery:
                 running = nursery.start(self._gateway.run(), "gateway")
@@ -287,12 +286,7 @@ def _plain(value: object) -> object:
 
 def main(argv: list[str]) -> int:
     """Run the process; an error is printed to stderr as one line."""
-    try:
-        config = msgspec.json.decode(Path(argv[0]).read_bytes(), type=ControllerConfig)
-        return run(GatewayProcess(config).run())
-    except FieldtwinError as e:
-        print(e, file=sys.stderr)
-        return e.exit_code
+    return child_main(argv, ControllerConfig, lambda config: GatewayProcess(config).run())
 
 
 if __name__ == "__main__":

@@ -17,7 +17,6 @@ from __future__ import annotations
 import asyncio
 import os
 import secrets
-import signal
 import sys
 from collections.abc import Callable
 from contextlib import AsyncExitStack
@@ -30,10 +29,12 @@ import msgspec
 from fieldtwin.emulators.endpoints.acoustic_end import AcousticEnd
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
+from fieldtwin.gateway.core.concurrency.stop_signal import on_stop_signal
 from fieldtwin.gateway.core.control import ControlServer
 from fieldtwin.gateway.core.endpoint import Endpoint
-from fieldtwin.gateway.core.errors import FieldtwinError, UsageError
-from fieldtwin.gateway.wallclock import WallClock, run
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.wallclock import WallClock
+from fieldtwin.twin.plant.child_main import child_main
 from fieldtwin.twin.prototype.field import FieldSide
 from fieldtwin.twin.prototype.field_leases import LEASE_S, FieldLeases
 from fieldtwin.twin.prototype.file import Prototype, load_prototype
@@ -144,9 +145,7 @@ class FieldProcess:
                 if not port.isdigit():
                     raise UsageError("the control channel's address", expected="HOST:PORT", got=self._config.control)
                 self.control_port = await server.listen_tcp(host or "127.0.0.1", int(port))
-            loop = asyncio.get_running_loop()
-            for number in (signal.SIGTERM, signal.SIGINT):
-                loop.add_signal_handler(number, self._stop.set)
+            on_stop_signal(self._stop.set)
             if on_ready is not None:
                 on_ready(self._field)
             await self._serve()
@@ -311,12 +310,7 @@ def _listening_as(prototype: Prototype, field: FieldSide) -> Prototype:
 
 def main(argv: list[str]) -> int:
     """Run the process; an error is printed to stderr as one line."""
-    try:
-        config = msgspec.json.decode(Path(argv[0]).read_bytes(), type=FieldConfig)
-        return run(FieldProcess(config).run())
-    except FieldtwinError as e:
-        print(e, file=sys.stderr)
-        return e.exit_code
+    return child_main(argv, FieldConfig, lambda config: FieldProcess(config).run())
 
 
 if __name__ == "__main__":

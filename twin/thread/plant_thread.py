@@ -11,7 +11,6 @@ from __future__ import annotations
 import asyncio
 import os
 import secrets
-import signal
 import sys
 from collections.abc import Sequence
 from contextlib import AsyncExitStack
@@ -24,6 +23,7 @@ from msgspec.structs import replace
 from fieldtwin.gateway.connections.os_connector import OsConnector
 from fieldtwin.gateway.core.clock import NS_PER_MS, Clock
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
+from fieldtwin.gateway.core.concurrency.stop_signal import on_stop_signal
 from fieldtwin.gateway.core.connection import Connector
 from fieldtwin.gateway.core.control import ControlClient, ControlServer
 from fieldtwin.gateway.core.errors import FieldtwinError
@@ -34,11 +34,12 @@ from fieldtwin.gateway.core.values import COMMAND, RESPONSE, Quality, Reason, Ta
 from fieldtwin.gateway.runtime.audit_log import AuditLog
 from fieldtwin.gateway.store.event import Event, Kind, KnowledgeStore
 from fieldtwin.gateway.store.knowledge import open_knowledge
-from fieldtwin.gateway.wallclock import WallClock, run
+from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.twin.model.knowledge import KnowledgeWriter
 from fieldtwin.twin.model.mape.execute import Bounds
 from fieldtwin.twin.model.status import encode_status
 from fieldtwin.twin.model.thread_process import PTDigitalThreadProcess
+from fieldtwin.twin.plant.child_main import child_main
 from fieldtwin.twin.plant.command_gate import CommandGate
 from fieldtwin.twin.plant.mapping import MappedConnector, mapping_from_json
 from fieldtwin.twin.plant.physical import attached, gateway_lost_ms, image_layout, plc_lost_ms
@@ -266,8 +267,7 @@ class PlantThread:
         socket = Path(self._config.run_dir) / "thread.sock"
         server = ControlServer({"ready": self._ready, "get": self._get, "stop": self._request_stop})
         await server.listen_unix(socket)
-        for number in (signal.SIGTERM, signal.SIGINT):
-            asyncio.get_running_loop().add_signal_handler(number, self._stop.set)
+        on_stop_signal(self._stop.set)
         failing = asyncio.ensure_future(nursery.wait())
         stopping = asyncio.ensure_future(self._stop.wait())
         try:
@@ -302,12 +302,7 @@ class PlantThread:
 
 def main(argv: list[str]) -> int:
     """Run the process; an error is printed to stderr as one line."""
-    try:
-        config = msgspec.json.decode(Path(argv[0]).read_bytes(), type=PlantThreadConfig)
-        return run(PlantThread(config).run())
-    except FieldtwinError as e:
-        print(e, file=sys.stderr)
-        return e.exit_code
+    return child_main(argv, PlantThreadConfig, lambda config: PlantThread(config).run())
 
 
 if __name__ == "__main__":

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import signal
 from contextlib import AsyncExitStack
 from typing import Any
 
@@ -14,6 +13,7 @@ from fieldtwin.emulators.endpoints.bus_bridge import CanBridge
 from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
 from fieldtwin.emulators.endpoints.can_end import open_can_end
 from fieldtwin.emulators.endpoints.slcan_port import SlcanPort
+from fieldtwin.gateway.core.concurrency.stop_signal import stop_signal
 from fieldtwin.gateway.core.endpoint import Endpoint
 
 
@@ -70,9 +70,7 @@ async def _run(
     paced: bool,
     monitored: bool,
 ) -> int:
-    stop, (bitrate, data_bitrate) = asyncio.Event(), rates
-    for number in (signal.SIGINT, signal.SIGTERM):
-        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    stop, (bitrate, data_bitrate) = stop_signal(), rates
     async with AsyncExitStack() as closing:
         bus = await SoftBusServer.open(endpoint, bitrate, paced=paced, monitored=monitored, data_bitrate=data_bitrate)
         closing.push_async_callback(bus.aclose)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import signal
 from collections.abc import Callable
 from contextlib import AsyncExitStack
 from pathlib import Path
@@ -21,6 +20,7 @@ from fieldtwin.emulators.faults.on_link import check_can_link, check_link, wire_
 from fieldtwin.emulators.faults.schema import FaultSpec, load_faults
 from fieldtwin.emulators.link import run_link
 from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.concurrency.stop_signal import stop_signal
 from fieldtwin.gateway.core.connection import CanConnection
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import UsageError
@@ -89,9 +89,7 @@ async def _run(
     loop = asyncio.get_running_loop()
     faults = wire_faults(said, framing, seed, round(loop.time() * NS_PER_S), check) if said else None
     put_in = tuple(faults.active.values()) if faults is not None else ()
-    stop = asyncio.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, stop.set)
+    stop = stop_signal()
     linking = asyncio.create_task(_can(near, far, faults) if near.is_can and faults else _bytes(near, far, faults))
     stopping = asyncio.create_task(stop.wait())
     try:

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import json
-import signal
 import sys
 from collections.abc import Callable, Coroutine
-from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -24,6 +22,7 @@ from fieldtwin.cli.options import Duration, json_option, pairs
 from fieldtwin.commissioning.record.asking import asker_at, changes, frame_for
 from fieldtwin.commissioning.record.comparing import compare_device, compare_node, uploads_of
 from fieldtwin.console import data, talk
+from fieldtwin.gateway.core.concurrency.stop_signal import stop_signal
 from fieldtwin.gateway.core.endpoint import SCHEMES
 from fieldtwin.gateway.core.errors import FileInvalid, NotAllowed, UsageError
 from fieldtwin.gateway.core.files.profile import DeviceProfile, load_profile
@@ -292,10 +291,7 @@ def _run(work: Callable[[asyncio.Event, Callable[[int], None]], Coroutine[Any, A
     """Until it is done, or a signal ends it: then what was compared so far counts."""
 
     async def main() -> None:
-        stop = asyncio.Event()
-        for number in (signal.SIGINT, signal.SIGTERM):
-            with suppress(NotImplementedError):  # Windows
-                asyncio.get_running_loop().add_signal_handler(number, stop.set)
+        stop = stop_signal()
         if not talk.is_terminal:
             await work(stop, lambda done: None)
             return

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import json
-import signal
 import sys
 from collections.abc import Callable, Coroutine, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -36,6 +35,7 @@ from fieldtwin.commissioning.record.sniffing import LineSniffer
 from fieldtwin.commissioning.record.tapping import LineTap
 from fieldtwin.console import data, talk
 from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.concurrency.stop_signal import stop_signal
 from fieldtwin.gateway.core.connection import Direction
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import UsageError
@@ -303,12 +303,8 @@ class _Job:
         """Until it ends, a signal, or --for."""
 
         async def main() -> None:
-            stop = asyncio.Event()
-            loop = asyncio.get_running_loop()
-            for number in (signal.SIGINT, signal.SIGTERM):
-                with suppress(NotImplementedError):  # Windows
-                    loop.add_signal_handler(number, stop.set)
-            timer = loop.call_later(self._for_s, stop.set) if self._for_s is not None else None
+            stop = stop_signal()
+            timer = asyncio.get_running_loop().call_later(self._for_s, stop.set) if self._for_s is not None else None
             showing = asyncio.ensure_future(_shown(shown, status)) if shown is not None else None
             try:
                 await work(stop)

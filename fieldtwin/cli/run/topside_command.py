@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import signal
 import sys
 from pathlib import Path
 
@@ -12,6 +11,7 @@ import click
 
 from fieldtwin.cli.options import Duration, Secret, json_option, profiles_option
 from fieldtwin.console import talk
+from fieldtwin.gateway.core.concurrency.stop_signal import stop_signal
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.wallclock import WallClock
@@ -84,9 +84,7 @@ async def _run(
     duration_s: float,
     as_json: bool,
 ) -> int:
-    stop = asyncio.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    stop = stop_signal()
     endpoint = Endpoint.parse(far) if far else await _ask_field(device, field_host, token)
     shore = Shore(system, device, endpoint, WallClock())
     talk.print(f"far end of {device} at {endpoint}", soft_wrap=True)

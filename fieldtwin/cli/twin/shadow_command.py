@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import signal
 import sys
 from datetime import UTC, datetime
 from pathlib import Path
@@ -15,6 +14,7 @@ from rich.markup import escape
 
 from fieldtwin.cli.options import Duration, json_option, profiles_option
 from fieldtwin.console import talk
+from fieldtwin.gateway.core.concurrency.stop_signal import stop_signal
 from fieldtwin.gateway.core.errors import Unreachable
 from fieldtwin.run.shadow.shadow import Shadowing
 from fieldtwin.run.template import system_file
@@ -102,9 +102,7 @@ def command(
 async def _run(
     system: System, place: str, instance: Instance, store: str, duration_s: float, as_json: bool
 ) -> dict[str, Any]:
-    stop = asyncio.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    stop = stop_signal()
     talks = ShadowTalk(quiet=as_json)
     shadowing = Shadowing(system, place, instance, store=store, on_verdict=talks)
     shadowing.on_trouble = talks.trouble

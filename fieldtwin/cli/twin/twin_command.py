@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import signal
 import sys
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from fieldtwin.cli.options import Duration, json_option, profiles_option
 from fieldtwin.cli.template_question import consent, trust_option
 from fieldtwin.cli.twin.shadow_command import ShadowTalk, print_shadow, why_nothing
 from fieldtwin.console import talk
+from fieldtwin.gateway.core.concurrency.stop_signal import stop_signal
 from fieldtwin.gateway.core.errors import Unreachable, UsageError
 from fieldtwin.gateway.core.statemachine import decode_period, encode_period
 from fieldtwin.gateway.core.values import COMMAND
@@ -165,9 +165,7 @@ async def _run(
 ) -> dict[str, Any]:
     if asking is not None:
         await asking.check(questions)
-    stop = asyncio.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    stop = stop_signal()
     if not as_json:
         talk.print(f"[bold]twin[/bold] of {system.name}, opposite {place}", soft_wrap=True, markup=True)
     await twinning.run(stop, duration_s)

@@ -21,12 +21,13 @@ from fieldtwin.emulators.replay.can_log import CanLog
 from fieldtwin.emulators.replay.objects import recorded_objects
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
+from fieldtwin.gateway.core.concurrency.stop_signal import stop_signal
 from fieldtwin.gateway.core.connection import CanConnection
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.run.emulate.can_bus import only_bus, stand_on_bus
-from fieldtwin.run.processes.until_stopped import stop_signal, until_stopped
+from fieldtwin.run.processes.until_stopped import until_stopped
 
 DEFAULT_NODE_ID = 1
 

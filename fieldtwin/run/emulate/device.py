@@ -46,6 +46,7 @@ from fieldtwin.emulators.stated import parts_of
 from fieldtwin.gateway.connections.os_connector import OsConnector
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
+from fieldtwin.gateway.core.concurrency.stop_signal import stop_signal
 from fieldtwin.gateway.core.connection import ByteConnection, CanConnection
 from fieldtwin.gateway.core.endpoint import SERIAL_SCHEMES, Endpoint
 from fieldtwin.gateway.core.errors import UsageError
@@ -55,7 +56,7 @@ from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.run.emulate.can_bus import only_bus, stand_on_bus
 from fieldtwin.run.emulate.data_sheet import print_remarks
 from fieldtwin.run.emulate.fault_counts import struck
-from fieldtwin.run.processes.until_stopped import stop_signal, until_stopped
+from fieldtwin.run.processes.until_stopped import until_stopped
 from fieldtwin.twin.prototype.field import unit_limits
 from fieldtwin.twin.site.data_files import find_recording
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 import asyncio
 import os
 import re
-import signal
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -16,6 +15,7 @@ from typing import Any
 from fieldtwin.gateway.connections.os_connector import OsConnector
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
+from fieldtwin.gateway.core.concurrency.stop_signal import stop_signal
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.devices.config import BusConfig
@@ -98,9 +98,7 @@ async def run_bridge(options: BridgeOptions, say: Callable[[str], None]) -> dict
     framing_of(options.target)
     if options.listen == options.target:
         raise UsageError("a bridge has two ends", got=f"{options.listen} twice")
-    stop = asyncio.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    stop = stop_signal()
     clock, connector = WallClock(), OsConnector()
     with Instance(instance_name(options)) as instance:
         audit = AuditLog(instance.path("audit.jsonl"), clock)

@@ -43,8 +43,8 @@ def _accepts(path: Path) -> bool:
 
 def choose(instance: str) -> Path:
     """Return the PLC socket of an instance, or of the only one without a name. Raises `UsageError`, `Unreachable`."""
-    found = running_instances()
     if not instance:
+        found = running_instances()
         if len(found) > 1:
             raise UsageError("several instances are running", expected="--instance NAME", got=", ".join(found))
         if not found:
@@ -52,6 +52,7 @@ def choose(instance: str) -> Path:
         instance = found[0]
     path = runtime_root() / instance / "plc.sock"
     if not path.exists():
+        found = running_instances()
         running = f"one of {', '.join(found)}" if found else "one that is running"
         raise Unreachable(f"no instance {instance!r} is running here", expected=running)
     return path

@@ -3,20 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-import signal
 
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
-
-
-def stop_signal() -> asyncio.Event:
-    """Return an event that SIGINT and SIGTERM set from now on.
-
-    Call this before the program announces where it serves: a caller that reads the announcement may send the signal at once.
-    """
-    stop = asyncio.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        asyncio.get_running_loop().add_signal_handler(number, stop.set)
-    return stop
 
 
 async def until_stopped(nursery: Nursery, stop: asyncio.Event) -> None:

@@ -1,4 +1,4 @@
-"""Output where the locale knows no arrows: they are drawn with the letters that there are, and nothing fails for them."""
+"""Output for terminals whose encoding has no arrows: they are replaced by ASCII letters, so printing never fails."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _PLAIN = {"→": "->", "←": "<-", "⇄": "<->", "⇅": "<->", "…": "...", "�
 
 
 def write_plainly() -> None:
-    """From now on stdout and stderr put what their encoding lacks into plain letters, unless they are UTF-8."""
+    """Make stdout and stderr replace characters that their encoding lacks, unless they use UTF-8."""
     codecs.register_error("fieldtwin-plain", _in_plain_letters)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper) and not stream.encoding.lower().startswith("utf"):

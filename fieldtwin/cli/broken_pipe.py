@@ -1,7 +1,7 @@
-"""What becomes of a command whose reader is gone: `fieldtwin ... | head`, or a service's log that was started again.
+"""Broken pipes: the reader of our output has gone, as in `fieldtwin ... | head`, or a service's log was restarted.
 
-Who stops reading the talk on stderr ends nothing by that: a run goes on, and its exit code is its own. Who stops reading stdout
-changes no verdict. Only a listing is over when its reader has what it wanted.
+A run continues when the reader of stderr goes away, and keeps its exit code. The loss of stdout's reader does not change a
+verdict either. Only a command that lists something ends when its reader goes away.
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ import os
 import sys
 
 VERDICTS = frozenset({"run", "test", "check", "compare", "doctor", "template", "what-if", "with"})
-"""Commands that end by themselves, and whose exit code says more than that they did."""
+"""Commands that end by themselves and whose exit code is a verdict."""
 
 
 class _Pipe(io.FileIO):
-    """One of our two streams: what is written behind its reader's end goes nowhere."""
+    """stdout or stderr: output is dropped after the reader has closed its end."""
 
     def write(self, data: object) -> int:
         try:
@@ -26,7 +26,7 @@ class _Pipe(io.FileIO):
 
 
 def to_nowhere(*numbers: int) -> None:
-    """From now on what is written to these files of ours is dropped."""
+    """Drop everything that is written to these file descriptors from now on."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     for number in numbers:
         os.dup2(nowhere, number)
@@ -34,19 +34,19 @@ def to_nowhere(*numbers: int) -> None:
 
 
 def talk_unheard() -> None:
-    """From now on the end of who reads stderr is nothing to us."""
+    """Continue without stderr when its reader goes away."""
     if (wrapped := _wrapped(sys.stderr, 2)) is not None:
         sys.stderr = wrapped
 
 
 def verdict_unheard() -> None:
-    """From now on the end of who reads stdout is nothing to us either: the exit code tells."""
+    """Continue without stdout when its reader goes away: the exit code carries the verdict."""
     if (wrapped := _wrapped(sys.stdout, 1)) is not None:
         sys.stdout = wrapped
 
 
 def _wrapped(stream: object, number: int) -> io.TextIOWrapper | None:
-    """None where the stream is not the process's own: a test's, or of somebody who imports us."""
+    """Return None if the stream does not belong to the process: in tests, or in a program that imports fieldtwin."""
     try:
         if not isinstance(stream, io.TextIOWrapper) or stream.fileno() != number:
             return None

@@ -61,28 +61,31 @@ _CAMPAIGN = (
 
 
 class Choice(NamedTuple):
-    """What the command line says of random faults. `every_s` None: the default."""
+    """The options for random faults. `every_s` None: the default interval."""
 
     every_s: float | None
     kinds: tuple[str, ...]
     aims: tuple[str, ...]
 
     def of(self, faults: str | None) -> RandomFaults | None:
-        """Return what seeds may choose from; None without random faults. Raise `UsageError` for options without effect."""
+        """Return the faults that seeds may choose; None without random faults.
+
+        Raise `UsageError` for options without effect.
+        """
         if faults != "random":
             if self.every_s is not None or self.kinds or self.aims:
                 raise UsageError(
                     "--fault-every, --fault-kinds and --fault-aims choose random faults", expected="--faults random"
                 )
             return None
-        # Here, because it loads emulators, which a plant does not need.
+        # imported here, because it loads emulators, which a plant does not need
         from fieldtwin.run.virtual.fault_schedule import MEAN_S, RandomFaults
 
         return RandomFaults(MEAN_S if self.every_s is None else self.every_s, self.kinds, self.aims)
 
 
 class CampaignRequest(NamedTuple):
-    """What the command line says of a campaign. `seeds` empty: there is none."""
+    """The options of a campaign. `seeds` is empty if no campaign was requested."""
 
     seeds: str
     jobs: int
@@ -91,7 +94,7 @@ class CampaignRequest(NamedTuple):
     choice: Choice
 
     def check(self) -> None:
-        """Raise `UsageError` for options that say nothing without --seeds, or without random faults."""
+        """Raise `UsageError` for options that have no effect without --seeds, or without random faults."""
         self.choice.of(self.faults)
         if not self.seeds and (self.faults or self.jobs != 1 or self.duration_s):
             raise UsageError("--faults, --for and --jobs of scenarios go with --seeds", expected="--seeds 1..200")

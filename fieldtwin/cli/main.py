@@ -1,6 +1,6 @@
-"""The command line: parses, calls, prints, and turns every error into one line and an exit code.
+"""The command line: it parses, calls, prints, and turns every error into one line and an exit code.
 
-Commands are imported when they are called, so that `--version` and completion cost next to nothing.
+Each command is imported when it is called, so `--version` and completion stay fast.
 """
 
 from __future__ import annotations
@@ -98,19 +98,22 @@ SECTIONS = {
     "Test": ("test", "faults", "trace"),
     "Twins": ("template", "shadow", "twin", "what-if"),
 }
-"""How the commands are shown; what stands in none comes last."""
+"""The order of commands in `--help`; commands in no group come last."""
 INTERRUPTED = 130
 BUG = 70
 HOST_REFUSES = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.EIO, errno.EACCES, errno.EPERM)
-"""A disk that is full or broken, or a place that may not be written to: nobody's bug."""
+"""The disk is full or broken, or the user has no permission to write: not a bug of fieldtwin."""
 
 
 class LazyGroup(click.Group):
-    """Loads a command's module when the command is asked for."""
+    """A group that imports a command's module when the command is called."""
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Click's own answer to a closed pipe is exit code 1. `fieldtwin ... | head`: the reader has what it wanted. What
-        judges does so to its end all the same, and what it found is its exit code."""
+        """Run the command; a closed pipe ends a listing with exit code 0.
+
+        Click exits with code 1 when a pipe closes. In `fieldtwin ... | head` the reader has all that it wanted. Commands that
+        give a verdict run to their end, and exit with it.
+        """
         try:
             result = super().invoke(ctx)
             sys.stdout.flush()
@@ -132,7 +135,7 @@ class LazyGroup(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Click names the options that were nearly meant, and no commands."""
+        """Suggest similar command names: click suggests only options."""
         near = difflib.get_close_matches(args[0], COMMANDS, n=1)
         if args[0] not in COMMANDS and near:
             raise click.UsageError(f"No such command {args[0]!r}. Did you mean {near[0]!r}?", ctx)
@@ -164,7 +167,7 @@ def cli() -> None:
 
 
 def main() -> None:
-    """The console script. Never shows a traceback unless FIELDTWIN_TRACEBACK is set."""
+    """Run the console script. It shows no traceback unless FIELDTWIN_TRACEBACK is set."""
     from fieldtwin.cli.ascii_output import write_plainly
     from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid
 
@@ -190,19 +193,19 @@ def main() -> None:
         for other in e.others if isinstance(e, FileInvalid) else ():
             click.echo(f"fieldtwin: {other}", err=True)
         theirs = getattr(e, "child_exit_code", 0) or getattr(e, "remote_exit_code", 0)
-        sys.exit(theirs if theirs > 0 else e.exit_code)  # below zero: a signal ended it
+        sys.exit(theirs if theirs > 0 else e.exit_code)  # negative: a signal ended it
     except OSError as e:
         if os.environ.get("FIELDTWIN_TRACEBACK") or e.errno not in HOST_REFUSES:
             _bug(e)
         click.echo(f"fieldtwin: {e.filename or 'a file, or what we print to'}: {e.strerror}", err=True)
         _drop_what_is_unsaid()
         sys.exit(FileInvalid.exit_code)
-    except Exception as e:  # the last border: our bug, reported as such
+    except Exception as e:  # the outermost handler: any other exception is a bug of fieldtwin
         _bug(e)
 
 
 def _told_to_end(number: int, frame: object) -> NoReturn:
-    """SIGTERM where a command has no order of its own to end in: what it made in /tmp goes, as after Ctrl-C."""
+    """Handle SIGTERM for commands that do not handle it: delete temporary files, as after Ctrl-C."""
     sys.exit(128 + number)
 
 
@@ -217,6 +220,6 @@ def _bug(error: Exception) -> NoReturn:
 
 
 def _drop_what_is_unsaid() -> None:
-    """Else Python tries again to print it when it ends, and makes that exit code 120."""
+    """Discard buffered output: else Python tries to flush it at exit, fails, and exits with 120."""
     with contextlib.suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

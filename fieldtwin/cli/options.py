@@ -1,4 +1,4 @@
-"""Options that several commands share, and reading what they say."""
+"""Options that several commands share, and the parsing of their values."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ _UNIT_S = {"ms": 0.001, "s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}
 if TYPE_CHECKING:
     _OfFloat = click.ParamType[float]
     _OfText = click.ParamType[str]
-else:  # it takes a parameter since 8.4
+else:  # `ParamType` is generic since click 8.4
     _OfFloat = _OfText = click.ParamType
 
 
 class NegativeNumbers(click.Command):
-    """A command whose arguments may be negative numbers, anywhere among its options: ``force TAG -1 --yes``."""
+    """A command that takes negative numbers as arguments anywhere among its options: ``force TAG -1 --yes``."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         known = {option for param in self.params for option in (*param.opts, *param.secondary_opts)} | {"--", "--help"}
         words = [a for a in args if a.startswith("-") and a != "-" and not _NEGATIVE.fullmatch(a)]
-        if all(word.partition("=")[0] in known for word in words):  # an unknown option is still refused
+        if all(word.partition("=")[0] in known for word in words):  # an unknown option is still an error
             ctx.ignore_unknown_options = True
         return super().parse_args(ctx, args)
 
@@ -37,7 +37,7 @@ class NegativeNumbers(click.Command):
 class Duration(_OfFloat):
     """A number with its unit: ``500ms``, ``20s``, ``2m`` (or ``2min``), ``1h``. Only ``0`` needs no unit.
 
-    ``--timeout 500`` is refused: one user means milliseconds, and another one seconds.
+    ``--timeout 500`` is an error, because some users mean milliseconds and others seconds.
     """
 
     name = "duration"
@@ -64,8 +64,11 @@ junit_flavour_option = click.option(
 
 
 class Secret(_OfText):
-    """A secret: ``@FILE`` for the first line of a file, or the environment. A command line everybody on the computer can read:
-    one that stands there is refused, and not repeated in the message."""
+    """A secret: ``@FILE`` for the first line of a file, or an environment variable.
+
+    Every user of the computer can read a command line. So a secret on the command line is an error, and the message does not
+    repeat it.
+    """
 
     name = "secret"
 
@@ -86,7 +89,7 @@ class Secret(_OfText):
 
 
 def pairs(values: tuple[str, ...], what: str) -> dict[str, str]:
-    """``NAME=VALUE`` options as a dictionary. Raises `UsageError`."""
+    """Return ``NAME=VALUE`` options as a dictionary. Raises `UsageError`."""
     out: dict[str, str] = {}
     for value in values:
         name, equals, rest = value.partition("=")

@@ -1,4 +1,4 @@
-"""Files that a user named for output: a folder that is not there, or may not be written to, is theirs to mend, and named."""
+"""Write output files that the user named: the error for a missing folder or permission names the file."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from fieldtwin.gateway.core.errors import FileInvalid
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write `text` to `path`. Raises `FileInvalid` where that cannot be."""
+    """Write `text` to `path`. Raises `FileInvalid` if it cannot be written."""
     try:
         path.write_text(text, encoding="utf-8")
     except OSError as e:

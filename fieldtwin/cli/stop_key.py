@@ -1,4 +1,4 @@
-"""Stopping something long and keeping what it found: `q` on a terminal, or Ctrl-C once; a second Ctrl-C ends at once."""
+"""Stop a long command and keep its results: `q` on a terminal, or Ctrl-C once; a second Ctrl-C ends it at once."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from types import FrameType
 
 
 class StopKey:
-    """``with StopKey() as stop:`` inside a running loop; `pressed` says whether it was."""
+    """``with StopKey() as stop:`` inside a running loop; `pressed` becomes true on `q` or Ctrl-C."""
 
     def __init__(self) -> None:
         self._pressed = False
@@ -19,7 +19,7 @@ class StopKey:
 
     @property
     def listens(self) -> bool:
-        """Whether there is a keyboard to press `q` on."""
+        """Return whether there is a keyboard to press `q` on."""
         return sys.stdin is not None and sys.stdin.isatty()
 
     def pressed(self) -> bool:
@@ -45,7 +45,7 @@ class StopKey:
 
         try:
             signal.signal(signal.SIGINT, interrupted)
-        except ValueError:  # not in the main thread: then nobody presses Ctrl-C here
+        except ValueError:  # not in the main thread, which receives Ctrl-C
             yield
             return
         try:
@@ -55,7 +55,7 @@ class StopKey:
 
     @contextlib.contextmanager
     def _keys(self) -> Iterator[None]:
-        """Single keys without Enter, where the terminal can; elsewhere Ctrl-C alone."""
+        """Read single keys without Enter if the terminal supports it; else only Ctrl-C works."""
         try:
             import termios
             import tty

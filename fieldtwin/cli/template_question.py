@@ -1,4 +1,4 @@
-"""The question before anything of a template is run. A plant asks it too: nothing here knows emulators."""
+"""Ask before code from a template runs. A plant asks as well, so this module does not import emulators."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ trust_option = click.option(
 
 
 def shown(what: tuple[str, ...], between: str = ", ") -> str:
-    """The first few, and how many more."""
+    """Return the first few names, and the number of the rest."""
     more = f"{between}and {len(what) - SHOWN} more" if len(what) > SHOWN else ""
     return escape(between.join(what[:SHOWN])) + more
 
 
 def consent(*, trust: bool) -> Ask:
-    """Who is asked: somebody at the terminal, or nobody, since the answer was given beforehand."""
+    """How consent is given: by the user at the terminal, or beforehand with --trust."""
     return lambda template: trust or ask_about(template)
 
 
 def ask_about(template: Stranger) -> bool:
-    """Say what a template brings and ask whether it may run. Without a terminal the answer is no."""
+    """Print what a template contains and ask whether it may run. Without a terminal the answer is no."""
     if template.code:
         talk.print(
             f"{escape(str(template.path))} brings control logic in Python: {shown(template.code)}.\n"

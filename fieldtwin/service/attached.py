@@ -1,7 +1,7 @@
-"""A run's service side: its metrics page, what systemd hears, and its event log, all from statuses that are asked for anyway.
+"""A run as a service: its metrics page, systemd notifications and event log, all from statuses that the run polls anyway.
 
-The watchdog is fed only while the gateway and the PLC both have answered within the last half of its interval: a process that
-hangs is as bad as one that is gone, and systemd then stops all of it in order and starts it anew.
+The watchdog is fed only while both the gateway and the PLC have answered within the last half of its interval: a process that
+hangs is as bad as one that has ended, and systemd then stops all of them in order and restarts them.
 """
 
 from __future__ import annotations
@@ -29,20 +29,20 @@ NEEDED = ("gateway", "plc")
 
 @dataclass(frozen=True)
 class ServiceOptions:
-    """`metrics` is ``HOST:PORT`` or empty; `log` is how events are written, empty for not at all."""
+    """`metrics` is ``HOST:PORT`` or empty; `log` is the format of events, empty for no log."""
 
     metrics: str = ""
     log: Format | None = None
 
 
 def check(options: ServiceOptions) -> None:
-    """Raise `UsageError` for what makes no sense, before anything starts."""
+    """Raise `UsageError` for an invalid combination before anything starts."""
     if options.metrics:
         parse_place(options.metrics)
 
 
 def snapshot(session: RunSession) -> Snapshot:
-    """The session as it is known now."""
+    """Return the present state of the session."""
     now_ns = session.clock.monotonic_ns()
     asked = min((session.answered_ns.get(name, session.started_ns) for name in NEEDED), default=now_ns)
     return Snapshot(
@@ -58,7 +58,7 @@ def snapshot(session: RunSession) -> Snapshot:
 
 
 def short(seen: Snapshot) -> str:
-    """A line for `systemctl status`."""
+    """Return one line for `systemctl status`."""
     if seen.gateway is None or seen.plc is None:
         return f"{seen.system}: the {'gateway' if seen.gateway is None else 'PLC'} does not answer"
     devices = seen.gateway["devices"]
@@ -68,7 +68,7 @@ def short(seen: Snapshot) -> str:
 
 
 class Service:
-    """``async with Service(session, options)`` around the run's waiting; `url` is where the metrics are, or empty."""
+    """``async with Service(session, options)`` around the run's waiting; `url` is the address of the metrics, or empty."""
 
     def __init__(self, session: RunSession, options: ServiceOptions, notifier: Notifier) -> None:
         self._session = session
@@ -116,12 +116,12 @@ class Service:
             self._log.close()
 
     def note(self, event: Event) -> None:
-        """An event that is not seen in the statuses."""
+        """Log an event that the statuses do not show."""
         if self._log is not None:
             self._log.write(event)
 
     def hang_up(self) -> None:
-        """SIGHUP: read the files again. One that comes while another is carried out is carried out behind it."""
+        """Handle SIGHUP: read the files again. A signal during a reload starts another one after it."""
         self._hung_up.set()
 
     async def _reload(self) -> None:
@@ -137,7 +137,7 @@ class Service:
             self._notifier.ready(event.message if event is not None else "read again")
 
     async def _reloaded(self) -> Event | None:
-        """What a reload came to; None where something was taken over, which the statuses tell."""
+        """Return the result of a failed reload; None if something was applied, which the statuses show."""
         try:
             done = await self._session.reload("SIGHUP")
         except FieldtwinError as e:
@@ -158,7 +158,7 @@ class Service:
         return Event(Priority.NOTICE, "reloaded", what, {"count": len(done.changes)})
 
     def healthy(self, seen: Snapshot, patience_s: float) -> bool:
-        """Whether gateway and PLC both answered within `patience_s` seconds."""
+        """Return whether gateway and PLC both answered within `patience_s` seconds."""
         return seen.gateway is not None and seen.plc is not None and seen.asked_ago_s <= patience_s
 
     def _started(self) -> Event:
@@ -169,7 +169,7 @@ class Service:
         return Event(Priority.NOTICE, "started", f"{mode} {self._session.system.name}: started, {writes}", fields)
 
     async def _feed(self) -> None:
-        """Half as often again as systemd wants it; a line of status in any case."""
+        """Feed the watchdog every third of its timeout; update the status line in any case."""
         pause_s = min(STATUS_S, self._notifier.watchdog_s / 3) if self._notifier.watchdog_s else STATUS_S
         while True:
             await asyncio.sleep(pause_s)

@@ -1,6 +1,6 @@
-"""What changed between two looks at a run, as events for a log that is read by programs. It writes nothing and asks nobody.
+"""Events between two snapshots of a run, for a log that programs read.
 
-Values of tags are never among them, as in everything that people read.
+Pure: it writes nothing and sends no requests. Events never contain values of tags, like all texts for people.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ Status = Mapping[str, Any]
 
 
 class Priority(IntEnum):
-    """syslog's (RFC 5424, 6.2.1), as far as we use them."""
+    """The syslog priorities (RFC 5424, 6.2.1) that are used here."""
 
     ERROR = 3
     WARNING = 4
@@ -26,7 +26,7 @@ class Priority(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Something that happened. `fields` are short names with text or numbers: device, bus, error..."""
+    """An event. `fields` are short names with text or numbers: device, bus, error..."""
 
     priority: Priority
     name: str
@@ -35,7 +35,7 @@ class Event:
 
 
 def changes(before: Snapshot | None, now: Snapshot) -> list[Event]:
-    """Events between two looks; without one before, everything that is not well is an event."""
+    """Yield the events between two snapshots. Without an earlier snapshot, everything that is not well is an event."""
     return [
         *_children(before, now),
         *_buses(_part(before, "buses"), _part(now, "buses")),
@@ -107,7 +107,7 @@ def _plc(before: Status | None, now: Status | None) -> list[Event]:
 
 
 def _reloaded(before: Status | None, now: Status | None) -> list[Event]:
-    """Whoever asked for it."""
+    """Return the event of a reload, regardless of its origin."""
     if before is None or now is None or before["config"]["reloads"] == now["config"]["reloads"]:
         return []
     text = "reloaded: " + "; ".join(now["config"]["changed"])
@@ -115,7 +115,7 @@ def _reloaded(before: Status | None, now: Status | None) -> list[Event]:
 
 
 def _thread(before: Status | None, now: Status | None) -> list[Event]:
-    """The digital thread's carrier, and the store of its log: what is wrong, and that it is over."""
+    """Yield the events of the digital thread: trouble of its carrier and of its log's store, and the end of the trouble."""
     found = []
     for key, what in (("trouble", "thread"), ("store_trouble", "store of the thread")):
         text, was = (now or {}).get(key, ""), (before or {}).get(key, "")
@@ -126,7 +126,7 @@ def _thread(before: Status | None, now: Status | None) -> list[Event]:
 
 
 def _refused(before: Status | None, now: Status | None) -> list[Event]:
-    """Writes that did not reach their device. A value is not among the fields, as nowhere here."""
+    """Yield writes that did not reach their device. As everywhere here, the fields contain no value."""
     last = max((e["number"] for e in (before or {}).get("refusals", {}).get("entries", [])), default=0)
     found = []
     for entry in (now or {}).get("refusals", {}).get("entries", []):

@@ -1,4 +1,4 @@
-"""The text that Prometheus reads: exposition format 0.0.4. It never knows what is measured.
+"""Prometheus exposition format 0.0.4, as text. It does not know what is measured.
 
 Source: https://prometheus.io/docs/instrumenting/exposition_formats/ (text-based format).
 """
@@ -18,7 +18,7 @@ Labels = Mapping[str, str]
 
 @dataclass(slots=True)
 class Family:
-    """A metric by name with its samples; `samples` are name, labels and value, as they are written."""
+    """A metric with its samples; `samples` are name, labels and value as they are written."""
 
     name: str
     kind: Kind
@@ -26,12 +26,12 @@ class Family:
     samples: list[tuple[str, Labels, float]] = field(default_factory=list)
 
     def add(self, value: float | None, **labels: str) -> None:
-        """One sample; None is none: where nothing is known, nothing is said."""
+        """Add one sample; None adds nothing, so an unknown value has no sample."""
         if value is not None:
             self.samples.append((self.name, labels, value))
 
     def add_histogram(self, bounds: Sequence[float], counts: Sequence[int], total: float, **labels: str) -> None:
-        """Buckets with their upper ends `bounds`, the last of `counts` being above all of them; each count its own bucket's."""
+        """Add a histogram: `bounds` are upper ends, the last of `counts` is above all; counts are not cumulative."""
         seen = 0
         for bound, count in zip((*bounds, float("inf")), counts, strict=True):
             seen += count
@@ -41,7 +41,7 @@ class Family:
 
 
 def render(families: Sequence[Family]) -> str:
-    """All families that have samples."""
+    """Return the text of all families that have samples."""
     lines: list[str] = []
     for family in families:
         if family.samples:

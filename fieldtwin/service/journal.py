@@ -1,6 +1,6 @@
-"""Where a service's events go: lines of text, lines of JSON, or the journal with fields of its own (systemd.journal-fields(7)).
+"""Write a service's events as lines of text, lines of JSON, or journal entries with fields (systemd.journal-fields(7)).
 
-The journal's native protocol is a datagram of ``NAME=value`` lines to its socket; a value that has a line feed in it is written
+The journal's native protocol is a datagram of ``NAME=value`` lines to its socket; a value that contains a line feed is written
 as its length and its bytes (https://systemd.io/JOURNAL_NATIVE_PROTOCOL/).
 """
 
@@ -23,7 +23,7 @@ _FIELD = re.compile(r"[^A-Z0-9_]")
 
 
 class EventLog:
-    """`write` an event. Where the journal is not there, it is a line of JSON on stderr, and `lost` counts it."""
+    """The event log. If the journal is missing, an event becomes a line of JSON on stderr, and `lost` counts it."""
 
     def __init__(
         self,
@@ -45,14 +45,14 @@ class EventLog:
             self._socket.setblocking(False)
 
     def write(self, event: Event) -> None:
-        """One event. Never waits."""
+        """Write one event. Never waits."""
         if self._format == "text":
             print(event.message, file=self._out, flush=True)
         elif self._socket is None or not self._to_journal(event):
             print(self._json(event), file=self._out, flush=True)
 
     def close(self) -> None:
-        """Give back the socket."""
+        """Close the socket."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None
@@ -81,7 +81,7 @@ class EventLog:
 
 
 def datagram(fields: Mapping[str, str]) -> bytes:
-    """One entry of the journal's native protocol."""
+    """Return one entry of the journal's native protocol."""
     parts = []
     for name, value in fields.items():
         data = value.encode(errors="replace")

@@ -1,8 +1,8 @@
-"""What a run tells a maintainer's monitoring: the latest statuses of gateway and PLC as metrics.
+"""A run's metrics for monitoring: the latest statuses of gateway and PLC.
 
-No value of a tag is among them, and no name of a tag: what may be secret stays inside, and a plant with 100,000 tags has no more
-series than one with ten. Per device there are a few, for `MOST_DEVICES` at most; the rest is counted as left out. It asks
-nobody: it is given what was asked anyway.
+Neither values nor names of tags are among them: they may be confidential, and so a plant with 100,000 tags has no more series
+than one with ten. Each device has a few series, up to `MOST_DEVICES` devices; the rest is counted as left out. It sends no
+requests: it is given statuses that were polled anyway.
 """
 
 from __future__ import annotations
@@ -20,20 +20,23 @@ from fieldtwin.gateway.protocols.modbus.client import ClientCounters
 from fieldtwin.service.exposition import Family
 
 MOST_DEVICES = 1000
-"""Devices with series of their own."""
+"""Devices that have series; the others are only counted."""
 
 MOST_NAMED = 256
-"""Buses, servers, bridges, tasks: of each kind so many."""
+"""Limit for each of buses, servers, bridges and tasks."""
 
 ALWAYS = {"modbus": ("missed_polls", *asdict(ClientCounters())), "canopen": tuple(asdict(CanopenCounters()))}
-"""Counters that a bus has even before they first count: a rate over them needs the 0."""
+"""Counters that a bus exports before they first count, because a rate needs the 0."""
 
 Status = Mapping[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """A run as it was last seen. A status is None while its process does not answer. `states` of children: whether each runs."""
+    """The latest known state of a run.
+
+    A status is None while its process does not answer. `states`: whether each child runs.
+    """
 
     system: str
     mode: str
@@ -46,7 +49,7 @@ class Snapshot:
 
 
 class Page:
-    """The families, made as they are needed, in the order in which they were."""
+    """The families in the order in which they were first used."""
 
     def __init__(self) -> None:
         self.families: dict[str, Family] = {}
@@ -65,7 +68,7 @@ class Page:
 
 
 def families(seen: Snapshot) -> list[Family]:
-    """All metrics of `seen`. What a process that does not answer would have said is missing, and `fieldtwin_up` is 0."""
+    """Return all metrics of `seen`. Without an answering process its metrics are missing, and `fieldtwin_up` is 0."""
     page = Page()
     page.gauge("info", "Version, system, and whether it is a plant or its prototype.").add(
         1, version=__version__, system=seen.system, mode=seen.mode
@@ -178,7 +181,7 @@ def _mailboxes(page: Page, gateway: Status) -> None:
 
 
 def _masters(page: Page, gateway: Status) -> None:
-    """Those who ask us: servers and bridges."""
+    """Add the clients' requests: servers and bridges."""
     counted = page.counter("server_events", "What a server or a bridge counted, by event.")
     for kind in ("serve", "bridge"):
         for name, server in _some(gateway[kind]):
@@ -188,7 +191,7 @@ def _masters(page: Page, gateway: Status) -> None:
 
 
 def _watchers(page: Page, gateway: Status) -> None:
-    """Devices by what is wrong with them, so that an alert needs no text."""
+    """Count devices by their problem, so that an alert needs no text matching."""
     page.gauge("devices_wrong", "Devices that are others than the system file says.").add(
         sum(bool(d["identity_error"]) for d in gateway["devices"].values())
     )

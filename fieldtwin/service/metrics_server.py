@@ -1,7 +1,7 @@
-"""A small HTTP server for one page: ``GET /metrics``. It reads no body, keeps no connection and knows nothing of the page.
+"""A small HTTP server for one page, ``GET /metrics``. It reads no body, keeps no connection and does not know the page's content.
 
-Bounded in every way: `MOST_CLIENTS` at once, `MOST_HEAD` bytes of request, `PATIENCE_S` for all of it. Without authentication and
-without TLS, as Prometheus expects of what it scrapes on a network of its own: hence on loopback unless it is told otherwise.
+Limits: `MOST_CLIENTS` at a time, `MOST_HEAD` bytes of request, `PATIENCE_S` for all of it. It has no authentication and no TLS,
+since Prometheus scrapes a separate network; so it listens on loopback by default.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _PLACE = re.compile(r"^(?:(?P<host>\[[0-9A-Fa-f:.]+\]|[^\s:\[\]]*):)?(?P<port>[0
 
 
 def parse_place(text: str) -> tuple[str, int]:
-    """``HOST:PORT``, ``:PORT`` or ``PORT``; without a host it is 127.0.0.1. Port 0 is any that is free."""
+    """Parse ``HOST:PORT``, ``:PORT`` or ``PORT``; the default host is 127.0.0.1. Port 0 is any free port."""
     found = _PLACE.match(text)
     if found is None or int(found["port"]) > 65535:
         raise UsageError("where metrics are served", expected="HOST:PORT such as 127.0.0.1:9464", got=text)
@@ -30,7 +30,7 @@ def parse_place(text: str) -> tuple[str, int]:
 
 
 class MetricsServer:
-    """Serves what `page` returns. `await open(host, port)`, `aclose()` in the end; `served` and `refused` are counted."""
+    """Serves the result of `page`. `await open(host, port)`, `aclose()` in the end; `served` and `refused` are counted."""
 
     def __init__(self, page: Callable[[], str]) -> None:
         self._page = page
@@ -40,7 +40,7 @@ class MetricsServer:
         self.refused = 0
 
     async def open(self, host: str, port: int) -> str:
-        """Listen; return the URL. Raises `EndpointBusy` where somebody listens, `Unreachable` where nobody can."""
+        """Listen; return the URL. Raises `EndpointBusy` if the address is in use, `Unreachable` if it cannot be bound."""
         try:
             self._server = await asyncio.start_server(self._serve, host, port, limit=MOST_HEAD)
         except OSError as e:
@@ -50,7 +50,7 @@ class MetricsServer:
         return f"http://{f'[{at[0]}]' if ':' in at[0] else at[0]}:{at[1]}/metrics"
 
     async def aclose(self) -> None:
-        """Stop listening and drop whoever is being served."""
+        """Stop listening and close the connections that are being served."""
         if self._server is None:
             return
         self._server.close()
@@ -73,7 +73,7 @@ class MetricsServer:
                 writer.write(self._answer(head))
                 await writer.drain()
         except (OSError, TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
-            self.refused += 1  # gone, too slow, or no HTTP: nothing can be said to it
+            self.refused += 1  # the client has gone, is too slow, or does not speak HTTP: no reply is possible
         except asyncio.CancelledError:
             pass  # we are closing
         finally:

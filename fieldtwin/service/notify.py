@@ -1,7 +1,7 @@
-"""What a service says to systemd: READY, WATCHDOG, RELOADING, STOPPING and a line of status, as datagrams (sd_notify(3)).
+"""Notify systemd: READY, WATCHDOG, RELOADING, STOPPING and a status line, as datagrams (sd_notify(3)).
 
-No library is needed for that: text lines to the Unix datagram socket in NOTIFY_SOCKET. A datagram that cannot be delivered is
-counted and forgotten: a service does not fail because nobody listens.
+No library is needed: the messages are text lines to the Unix datagram socket in NOTIFY_SOCKET. A datagram that cannot be
+delivered is counted and dropped: a service must not fail because its notifications are not received.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ USEC_PER_S = 1_000_000
 
 
 class Notifier:
-    """`watchdog_s` is how often systemd wants to hear of us, 0 for never. Without a socket everything is for nothing."""
+    """`watchdog_s` is the watchdog timeout of the unit, 0 for none. Without a socket nothing is sent."""
 
     def __init__(self, address: str = "", watchdog_s: float = 0.0) -> None:
         self.watchdog_s = watchdog_s
@@ -28,7 +28,7 @@ class Notifier:
 
     @classmethod
     def from_environment(cls, environment: MutableMapping[str, str] = os.environ) -> Notifier:
-        """What systemd says in the environment, and taken out of it: processes that we start are not to notify in our name."""
+        """Read systemd's environment variables and remove them, so that child processes do not notify in our name."""
         address = environment.pop("NOTIFY_SOCKET", "")
         interval = environment.pop("WATCHDOG_USEC", "")
         meant_for = environment.pop("WATCHDOG_PID", "")
@@ -38,31 +38,31 @@ class Notifier:
 
     @property
     def wanted(self) -> bool:
-        """Whether somebody listens."""
+        """Return whether systemd gave a socket."""
         return self._socket is not None
 
     def ready(self, status: str) -> None:
-        """Started; also after a reload."""
+        """Notify that the start is complete; also after a reload."""
         self._send("READY=1", _status(status))
 
     def alive(self, status: str) -> None:
-        """All is well: keep the watchdog quiet."""
+        """Feed the watchdog."""
         self._send("WATCHDOG=1", _status(status))
 
     def status(self, status: str) -> None:
-        """A line for `systemctl status`."""
+        """Send a line for `systemctl status`."""
         self._send(_status(status))
 
     def reloading(self, now_ns: int) -> None:
-        """A reload has begun, at `now_ns` of CLOCK_MONOTONIC, which Type=notify-reload asks for; `ready` ends it."""
+        """Notify that a reload began at `now_ns` of CLOCK_MONOTONIC, which Type=notify-reload requires; `ready` ends it."""
         self._send("RELOADING=1", f"MONOTONIC_USEC={now_ns // 1000}")
 
     def stopping(self) -> None:
-        """Ending in order."""
+        """Notify that an orderly shutdown has begun."""
         self._send("STOPPING=1")
 
     def close(self) -> None:
-        """Say nothing more."""
+        """Close the socket; nothing more is sent."""
         if self._socket is not None:
             with suppress(OSError):
                 self._socket.close()
@@ -78,5 +78,5 @@ class Notifier:
 
 
 def _status(text: str) -> str:
-    """One line, whatever it says."""
+    """Return the text as one line."""
     return "STATUS=" + " ".join(text.split())[:512]

@@ -1,4 +1,4 @@
-"""The options of the verbs that ask one device: where it is, what is known of it, and the log of what is sent."""
+"""The options of commands that query one device: its endpoint, its profile, and the log of sent frames."""
 
 from __future__ import annotations
 
@@ -45,21 +45,21 @@ _RAW = (
 
 
 def device_options(command: F) -> F:
-    """ENDPOINT's device: --unit, --node, --profile, --eds, --bitrate, --timeout, --echo, --log, --profiles."""
+    """Add the options for ENDPOINT's device: its unit or node ID, profile, bit rate, timeout and log."""
     for option in reversed(_DEVICE):
         command = option(command)
     return command
 
 
 def raw_options(command: F) -> F:
-    """How raw addresses are read: --type, --order, --count, --registers."""
+    """Add the options that decode raw addresses: --type, --order, --count, --registers."""
     for option in reversed(_RAW):
         command = option(command)
     return command
 
 
 def target_from(endpoint: str, options: dict[str, Any]) -> Target:
-    """The device that the options mean. Raises `UsageError`, `FileInvalid`."""
+    """Return the device that the options describe. Raises `UsageError`, `FileInvalid`."""
     unit, node = options["unit"], options["node"]
     if endpoint.lower().startswith("can:"):
         if unit is not None:
@@ -79,18 +79,18 @@ def target_from(endpoint: str, options: dict[str, Any]) -> Target:
 
 
 def raw_form(options: dict[str, Any]) -> RawForm:
-    """How raw addresses are read."""
+    """Return how raw addresses are decoded."""
     return RawForm(options["kind"], options["order"].upper(), options["count"], options["registers"])
 
 
 def words() -> str:
-    """This command line, for a log."""
+    """Return this command line, for a log."""
     return shlex.join(["fieldtwin", *sys.argv[1:]])
 
 
 @contextmanager
 def logged(path: Path | None) -> Iterator[list[Tap]]:
-    """The taps of a verb: the log at `path`, or none."""
+    """Return the taps of a command: the log at `path`, or none."""
     if path is None:
         yield []
         return

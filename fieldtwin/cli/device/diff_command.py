@@ -1,4 +1,4 @@
-"""`fieldtwin diff`: two dumps, or a dump and a profile, by named field. Parses and prints, no more."""
+"""`fieldtwin diff`: compare two dumps, or a dump and a profile, field by field."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def command(
         click.echo(json.dumps(head | asdict(found)))
     else:
         _show(found, left.name, Path(right).name)
-    return DIFFERENT if found.found or not found.compared else 0  # of nothing compared, nothing is known
+    return DIFFERENT if found.found or not found.compared else 0  # without a compared field there is no result
 
 
 def _against(one: Dump, right: str, folders: list[Path], leave: Leave) -> Differences:
@@ -102,7 +102,7 @@ def _is_dump(path: Path) -> bool:
 
 
 def _named(dump: Dump, name: str, folders: list[Path]) -> DeviceProfile | None:
-    """The profile that is asked for, else the one that the dump was made with, if it is here."""
+    """Return the requested profile, else the profile that the dump was made with, if it is installed."""
     if name:
         return load_profile(find("devices", name, extra=folders))
     known = dump.header.get("profile")

@@ -1,4 +1,4 @@
-"""`fieldtwin dump`: what a device holds, where its holes are, how much it takes at once. Parses and prints, no more."""
+"""`fieldtwin dump`: record a device's values, its unreadable ranges, and the longest read that it accepts."""
 
 from __future__ import annotations
 
@@ -151,7 +151,7 @@ def _described(found: Dump, out: Path) -> dict[str, Any]:
 
 @contextmanager
 def _bar(name: str) -> Iterator[Told]:
-    """A progress bar on a terminal, nothing elsewhere."""
+    """Show a progress bar on a terminal; elsewhere nothing."""
     with Progress(
         TextColumn("{task.description}"),
         BarColumn(),

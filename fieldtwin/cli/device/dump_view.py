@@ -1,4 +1,4 @@
-"""What a person sees of a dump: what it will take, how far it is, what was found."""
+"""A dump on the terminal: the estimate, the progress and the result."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ FUNCTION_NAMES = {
 
 
 def estimate_text(estimate: Estimate, passes: int, rate: float) -> str:
-    """One line before anything is sent."""
+    """Return one line that estimates the dump before anything is sent."""
     low, high = estimate.least_requests, estimate.most_requests
     requests = f"{low}" if low == high else f"{low} to {high}"
     text = f"{requests} requests, {_time(estimate.least_s)}"
@@ -41,7 +41,7 @@ def _time(seconds: float) -> str:
 
 
 def summary(dump: Dump) -> list[Table | Text]:
-    """The tables of a dump that is there."""
+    """Print the tables of a finished dump."""
     shown: list[Table | Text] = []
     if dump.protocol == "modbus":
         shown += [_maps(dump), _functions(dump)]
@@ -54,7 +54,7 @@ def summary(dump: Dump) -> list[Table | Text]:
 
 
 def notes(dump: Dump) -> list[str]:
-    """What is worth saying besides, for people and the profile."""
+    """Return notes for the user and for the profile."""
     lines: list[str] = []
     gaps = profile_gaps(dump)
     if gaps:
@@ -78,7 +78,7 @@ def notes(dump: Dump) -> list[str]:
 
 
 def unknown_text(dump: Dump) -> str:
-    """One line about what the dump does not know."""
+    """Return one line about what the dump leaves unknown."""
     unknown, asked_for = dump.unknown
     what = "addresses" if dump.protocol == "modbus" else "objects"
     where = [text for m in dump.maps.values() for text in m.get("unknown", [])]
@@ -87,7 +87,7 @@ def unknown_text(dump: Dump) -> str:
 
 
 def _lengths_text(line: dict[str, Any]) -> str:
-    """What the dump cannot promise about a register table with samples, "" if nothing."""
+    """Return what a sampled dump cannot guarantee for a register table; "" if nothing."""
     if line["map"] not in ("holding", "input") or line.get("function_refused") or not line.get("sampled"):
         return ""
     missing = [n for n in (1, 2) if n not in line.get("lengths", [])]
@@ -98,7 +98,7 @@ def _lengths_text(line: dict[str, Any]) -> str:
 
 
 def _objects(dump: Dump) -> str:
-    """How many objects are in each state."""
+    """Return how many objects are in each state."""
     if (line := dump.maps.get("objects")) is None:
         last = dump.passes[-1]
         return f"{len(last.cells)} objects read, {len(set(last.refused) - set(last.cells))} refused"
@@ -109,7 +109,7 @@ def _objects(dump: Dump) -> str:
 
 
 def profile_gaps(dump: Dump) -> list[str]:
-    """The ranges between readable registers that no read may go over, as a profile has them."""
+    """Return the ranges between readable registers that a read must not include, in the form of a profile."""
     gaps = []
     for line in dump.maps.values():
         readable = [resolve_gap(text, "sent") for text in line.get("readable", [])]
@@ -120,7 +120,7 @@ def profile_gaps(dump: Dump) -> list[str]:
 
 
 def mirrored(dump: Dump) -> int | None:
-    """How many addresses hold the same in both register tables, if all that both have do and something is in them."""
+    """Return how many addresses are equal in both register tables, if all common addresses are and one is not 0."""
     cells = dump.passes[0].cells if dump.passes else {}
     both = [(v, cells[("input", a)]) for (t, a), v in cells.items() if t == "holding" and ("input", a) in cells]
     if len(both) < 8 or not any(any(v) for v, _ in both) or any(v != w for v, w in both):
@@ -142,13 +142,13 @@ def _maps(dump: Dump) -> Table:
 
 
 def longest_text(line: dict[str, Any]) -> str:
-    """The longest read that the device took, and whether a longer one was refused."""
+    """Return the longest read that the device accepted, and whether it refused a longer one."""
     text = str(line["max_read"]) if line["limit_proved"] else f"{line['max_read']} or more"
     return text + (", pairs only" if line.get("pairs") else "")
 
 
 def state_rows(line: dict[str, Any]) -> list[tuple[str, str]]:
-    """``(state, where)`` for each state in which addresses of a table are. Of a sampled stretch it says how many were asked."""
+    """Return ``(state, where)`` for each state of addresses; for a sampled range, also the number of samples."""
     rows = []
     for key, name in ((key, STATE_NAMES[STATE_KEYS.index(key)]) for key in (*STATE_KEYS[1:], STATE_KEYS[0])):
         sampled = [s for s in line.get("sampled", []) if key in (s["state"], "not_asked")]
@@ -169,7 +169,7 @@ def state_rows(line: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 def short(text: str) -> str:
-    """A range without the table's name."""
+    """Return a range without the table's name."""
     return text.partition(":")[2]
 
 
@@ -188,7 +188,7 @@ def _functions(dump: Dump) -> Table:
 
 
 def _table_access(line: dict[str, Any]) -> str:
-    """What the function that reads a table came to."""
+    """Return the result of the function that reads a table."""
     if line["readable"]:
         return "answers"
     if line["codes"]:
@@ -222,7 +222,7 @@ def _latency(latency: dict[str, Any]) -> Table:
 
 
 def _bars(buckets: list[tuple[int | None, int]], width: int = 35) -> str:
-    """A histogram in `width` characters, two buckets each."""
+    """Draw a histogram with `width` characters of two buckets each."""
     heights = [0] * (width + 1)
     for bound, count in buckets:
         place = width if bound is None else min(width, round((len(str(bound)) - 2) * 5 + _fifth(bound)))
@@ -233,6 +233,6 @@ def _bars(buckets: list[tuple[int | None, int]], width: int = 35) -> str:
 
 
 def _fifth(bound: int) -> float:
-    """Where in its decade a bound stands, 0 to 4."""
+    """Return the position of a bound in its decade, 0 to 4."""
     lead = bound / 10.0 ** (len(str(bound)) - 1)
     return min(4.0, float(sum(lead >= step for step in (1.5, 2.4, 3.9, 6.2))))

@@ -1,4 +1,4 @@
-"""`fieldtwin identify`: what one device says that it is, and which profile fits. Parses and prints, no more."""
+"""`fieldtwin identify`: read a device's identification and find the profile that fits."""
 
 from __future__ import annotations
 
@@ -127,7 +127,10 @@ def _first_frames(endpoint: str, node: int) -> Iterator[str]:
 
 
 def known_profiles(folders: list[Path]) -> list[DeviceProfile]:
-    """Every device profile in the search path, the first of each file name; one that cannot be read is told and left out."""
+    """Return every device profile in the search path, the first of each file name.
+
+    A profile that cannot be read is reported and skipped.
+    """
     found: dict[str, DeviceProfile] = {}
     for folder in search_path(folders):
         for path in sorted((folder / "devices").glob("*.yaml")):
@@ -174,7 +177,7 @@ def _show_candidate(candidate: Candidate) -> None:
 
 
 def _told(result: ModbusIdentity | CanIdentity) -> list[tuple[str, str]]:
-    """What the device said of itself, line by line, and where it kept quiet."""
+    """Return the device's answers line by line, and the requests that it did not answer."""
     rows: list[tuple[str, str]] = []
     if isinstance(result, ModbusIdentity):
         clues = result.clues

@@ -1,4 +1,4 @@
-"""`fieldtwin infer`: what the registers of dumps probably are, and a draft profile. Parses and prints, no more."""
+"""`fieldtwin infer`: infer the register types from dumps, and write a draft profile."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def command(
 
 
 def _load(path: Path, unit: int | None) -> Dump:
-    """Load a dump, or a recording of exchanges as one. Raises `FileInvalid`, `UsageError`."""
+    """Load a dump, or a recording of exchanges as a dump. Raises `FileInvalid`, `UsageError`."""
     try:
         with path.open("rb") as file:
             is_recording = b'"fieldtwin_recording"' in file.readline(MOST_HEADER_BYTES)

@@ -1,4 +1,4 @@
-"""`fieldtwin line`: what a wire looks like before anything is sent. Parses and prints, no more."""
+"""`fieldtwin line`: examine a serial line or bus without sending."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`fieldtwin read`: values of one device, once. Parses and prints, no more."""
+"""`fieldtwin read`: read values of one device once."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`fieldtwin scan`: who is on a wire. Parses and prints, no more."""
+"""`fieldtwin scan`: find the devices on a bus."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def _end(found: bool, stopped: bool, took_s: float) -> int:
 
 
 def _plan_of_modbus(endpoint: str, options: dict[str, Any]) -> Iterator[str]:
-    """Phases, settings, frames: for `--dry-run`."""
+    """Return the phases, settings and frames for `--dry-run`."""
     made = _modbus_options(options)
     if Endpoint.parse(endpoint).is_serial:
         yield f"listen for {duration(made.listen_s)}; with traffic heard nothing is sent" + (
@@ -162,7 +162,7 @@ def _can_options(options: dict[str, Any]) -> CanScanOptions:
 
 
 def numbers(text: str | None, low: int, high: int, name: str) -> tuple[int, ...] | None:
-    """``1-20,247`` as numbers, each once, in order. Raises `UsageError`."""
+    """Return ``1-20,247`` as numbers without duplicates, ascending. Raises `UsageError`."""
     if text is None:
         return None
     found: list[int] = []
@@ -177,7 +177,7 @@ def numbers(text: str | None, low: int, high: int, name: str) -> tuple[int, ...]
 
 
 def _refuse_foreign(can: bool, options: dict[str, Any]) -> None:
-    """What belongs to the other protocol."""
+    """Raise `UsageError` for options of the other protocol."""
     foreign = ("units", "quick", "every_setting") if can else ("nodes", "bitrate", "no_lss")
     names = {"every_setting": "--all"}
     given = [names.get(n, "--" + n.replace("_", "-")) for n in foreign if options[n]]

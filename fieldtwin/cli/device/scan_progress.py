@@ -1,4 +1,4 @@
-"""How far a scan is: a bar with an estimate on a terminal, elsewhere a line for each phase."""
+"""The progress of a scan: a bar with an estimate on a terminal, elsewhere one line per phase."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a scan found, as tables for people and as JSON."""
+"""The result of a scan, as tables and as JSON."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from fieldtwin.gateway.core.errors import ModbusExceptionReply
 
 
 def show_modbus(scan: ModbusScan) -> None:
-    """The units, then what else there is to say."""
+    """Print the units, then the notes."""
     heard = scan.heard
     if heard is not None and heard.bytes:
         talk.print(f"heard {heard.bytes} bytes, {heard.frames} whole frames", markup=False)
@@ -71,7 +71,7 @@ def unit_ranges(units: Sequence[int]) -> str:
 
 
 def modbus_json(scan: ModbusScan) -> dict[str, Any]:
-    """The same for programs."""
+    """Return the result of a Modbus scan as JSON data."""
     heard = scan.heard
     return {
         "endpoint": scan.url,
@@ -121,7 +121,7 @@ def modbus_json(scan: ModbusScan) -> dict[str, Any]:
 
 
 def show_can(scan: CanScan) -> None:
-    """The nodes, then what else there is to say."""
+    """Print the nodes, then the notes."""
     heard = scan.heard
     rate = f" at {scan.bitrate} bit/s" if scan.bitrate else ""
     talk.print(f"listened for {scan.listened_s:.1f} s{rate}: {heard.frames} frames, {heard.errors} error frames")
@@ -156,7 +156,7 @@ def show_can(scan: CanScan) -> None:
 
 
 def can_json(scan: CanScan) -> dict[str, Any]:
-    """The same for programs."""
+    """Return the result of a CANopen scan as JSON data."""
     heard = scan.heard
     return {
         "endpoint": scan.url,

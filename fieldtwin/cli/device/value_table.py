@@ -1,4 +1,4 @@
-"""Values of one device as a table for people, and the exit code that tells a script how the asking went."""
+"""Values of one device as a table, and the exit code that reports failed reads to a script."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ REFUSED, UNREACHABLE = 5, 4
 
 
 def value_table(tags: Sequence[Tag], answers: Mapping[str, Answer]) -> Table:
-    """Name, value and unit, then where it stands and what came over the wire."""
+    """Return a table with name, value, unit, address and the raw data received."""
     table = Table(box=None, pad_edge=False, header_style="bold")
     table.add_column("name", overflow="fold")
     table.add_column("value", overflow="fold")
@@ -37,7 +37,7 @@ def value_table(tags: Sequence[Tag], answers: Mapping[str, Answer]) -> Table:
 
 
 def exit_code(answers: Iterable[Answer]) -> int:
-    """0 where every value came; 4 where the wire lost one, else 5 where the device refused one."""
+    """Return 0 if every value was read; 4 if one was lost on the bus, else 5 if the device refused one."""
     reasons = {a.value.reason for a in answers if a.problem}
     if reasons - {Reason.REFUSED}:
         return UNREACHABLE

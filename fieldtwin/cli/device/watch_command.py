@@ -1,4 +1,4 @@
-"""`fieldtwin watch`: live values of one device. Parses and prints, no more."""
+"""`fieldtwin watch`: show live values of one device."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def command(
     try:
         run_precise(watch.run(every_s, most, for_s or None, log))
     except KeyboardInterrupt:
-        pass  # the way to stop it
+        pass  # Ctrl-C is the normal way to stop
     finally:
         watch.close()
     if plot_path is not None and watch.count:
@@ -90,7 +90,7 @@ def command(
 
 
 class _Watch:
-    """Takes samples and shows them: on a terminal one table, elsewhere a line each."""
+    """Take samples and show them: as one table on a terminal, elsewhere one line per sample."""
 
     def __init__(self, target: Target, tags: Sequence[Tag], *, as_json: bool) -> None:
         self.histories = {t.name: History() for t in tags}
@@ -100,9 +100,9 @@ class _Watch:
         self._live = Live(console=data, auto_refresh=False) if data.is_terminal and not as_json else None
 
     async def run(self, every_s: float, most: int | None, for_s: float | None, log: Path | None) -> None:
-        """Take samples for `for_s` seconds; a sample that is not complete then is abandoned.
+        """Take samples for `for_s` seconds, and abandon a sample that is incomplete then.
 
-        Raises `Unreachable` if none was complete: each tag of a silent device takes a whole reply timeout.
+        Raises `Unreachable` if no sample was complete: each tag of a silent device takes a whole reply timeout.
         """
         try:
             async with asyncio.timeout(for_s) as limit:

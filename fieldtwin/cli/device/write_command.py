@@ -1,4 +1,4 @@
-"""`fieldtwin write`: set values of one device, with care. Parses, asks and prints, no more."""
+"""`fieldtwin write`: write values of one device, after a confirmation, and read them back."""
 
 from __future__ import annotations
 
@@ -127,11 +127,11 @@ async def _write(
 async def _carry_out(
     point: Point, writes: Sequence[Write], old: Sequence[Answer | None], hold_s: float | None
 ) -> list[Written]:
-    """All writes, in order. With `hold_s` what was written is put back, also where one of them failed or somebody stopped it."""
+    """Write all values in order. With `hold_s`, restore them afterwards, also after a failure or an interruption."""
     done: list[Written] = []
     try:
         for write, before in zip(writes, old, strict=True):
-            # Until it is known what came of it, it was written.
+            # counts as written until the outcome is known
             done.append(Written(write, before.value.raw if before is not None else None, None))
             done[-1] = await writing.carry_out(point, write, before)
         if hold_s is not None:
@@ -146,7 +146,7 @@ async def _carry_out(
 
 
 async def _put_back(point: Point, done: list[Written]) -> list[Written]:
-    """The last one first, and each of them, whatever comes of the others."""
+    """Restore the values in reverse order; a failure does not stop the rest."""
     back: list[Written] = []
     failed: FieldtwinError | None = None
     for written in reversed(done):
@@ -201,7 +201,7 @@ def _row(written: Written) -> dict[str, Any]:
 
 
 def _restart(target: Target, items: Sequence[str], log: Path | None, *, i_know: bool, yes: bool, dry_run: bool) -> int:
-    """Function 08h, sub-function 01h: the unit's port starts anew, its counters are cleared (AP 6.8.1)."""
+    """Send function 08h, sub-function 01h: the unit restarts its port and clears its counters (AP 6.8.1)."""
     if items or target.protocol != "modbus":
         raise UsageError("--restart-communications stands alone, for a Modbus unit")
     request = Diagnostics(RESTART_COMMUNICATIONS)
@@ -219,7 +219,7 @@ def _restart(target: Target, items: Sequence[str], log: Path | None, *, i_know: 
                 try:
                     await client.execute(target.address, request)
                 except ReplyTimeout:
-                    return False  # a unit in listen-only mode restarts without a word (AP 6.8.1)
+                    return False  # a unit in listen-only mode restarts without a reply (AP 6.8.1)
                 return True
 
     answered = run_precise(send())

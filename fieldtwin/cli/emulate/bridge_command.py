@@ -1,4 +1,4 @@
-"""`fieldtwin bridge`: Modbus TCP clients to units on a serial line, or the other way round, in one command."""
+"""`fieldtwin bridge`: connect Modbus TCP clients to units on a serial line, or serial clients to TCP devices."""
 
 from __future__ import annotations
 

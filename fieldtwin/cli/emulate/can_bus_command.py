@@ -1,4 +1,4 @@
-"""`fieldtwin can-bus`: the software CAN bus on its own."""
+"""`fieldtwin can-bus`: run the software CAN bus as a separate process."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ async def _bridge(bus: SoftBusServer, kernel: Endpoint, bitrate: int) -> CanBrid
 
 
 async def _until(stop: asyncio.Event, bridge: CanBridge | None) -> None:
-    """Until somebody stops it, or a bus of the bridge is gone."""
+    """Wait until the user stops the command, or a bus of the bridge is lost."""
     stopped = asyncio.ensure_future(stop.wait())
     waited: list[asyncio.Future[Any]] = [stopped, bridge.ended] if bridge else [stopped]
     await asyncio.wait(waited, return_when=asyncio.FIRST_COMPLETED)

@@ -1,4 +1,4 @@
-"""`fieldtwin emulate`: the field side of a system in this terminal, or one device on a wire of its own."""
+"""`fieldtwin emulate`: emulate the devices of a system, or one device on a serial line, socket or CAN bus."""
 
 from __future__ import annotations
 
@@ -234,7 +234,7 @@ def _extras(
     seed: int,
     any_unit: bool,
 ) -> Extras | None:
-    """What else a Modbus device is given; None: nothing. Raises `UsageError` and `FileInvalid`."""
+    """Return the optional parts of a Modbus device, or None. Raises `UsageError` and `FileInvalid`."""
     from fieldtwin.emulators.device_faults import check_device
     from fieldtwin.emulators.faults.schema import load_faults
     from fieldtwin.gateway.core.files.profile import load_profile
@@ -264,7 +264,10 @@ def _extras(
 
 
 def _values(said: tuple[str, ...]) -> dict[str, float | str]:
-    """The values of ``TAG=VALUE`` and of YAML files with a mapping of tags to values. A later one counts."""
+    """Return the values of ``TAG=VALUE`` and of YAML files with a mapping of tags to values.
+
+    Later values override earlier ones.
+    """
     from fieldtwin.gateway.core.files.yaml_file import load
 
     found: dict[str, float | str] = {}
@@ -289,7 +292,7 @@ def _number_or_text(text: str) -> float | str:
 
 
 def _kind(what: str, profiles: tuple[Path, ...]) -> tuple[str, Path]:
-    """What `what` names: ("system" | "device" | "recording" | "log" | "data sheet", file)."""
+    """Return the kind of `what` and its file: ("system" | "device" | "recording" | "log" | "data sheet", file)."""
     from fieldtwin.twin.template.package import is_template
 
     direct = Path(what)

@@ -1,4 +1,4 @@
-"""`fieldtwin faults`: which faults there are, where they can be put, and what they can be told."""
+"""`fieldtwin faults`: list the faults, where they apply, and their parameters."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def command(names: tuple[str, ...], as_json: bool) -> int:
 
 
 def _described(kind: type[Fault]) -> dict[str, Any]:
-    """A fault as JSON; its parameters as JSON schema has them."""
+    """Return a fault as JSON data, with its parameters as a JSON schema."""
     from fieldtwin.emulators.faults.schema import aims_of
 
     own = kind.form.model_json_schema().get("properties", {})
@@ -75,7 +75,7 @@ def _code(code: int) -> str:
 
 
 def _number(value: float | str | None) -> str:
-    """Codes, which are large, as everybody writes them."""
+    """Return a number as text; codes, which are large, in hexadecimal."""
     if value is None:
         return "by the tag's type"
     if isinstance(value, str | bool):

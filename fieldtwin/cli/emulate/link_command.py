@@ -1,4 +1,4 @@
-"""`fieldtwin link`: the emulated connection on its own, socat-compatible."""
+"""`fieldtwin link`: the emulated connection as a separate process, compatible with socat."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.run.emulate.fault_counts import struck
 
 BITRATE = 125_000
-"""Of a bus that the link runs itself, where its endpoint does not say ``bitrate=``."""
+"""The bit rate of a bus that the link runs itself, if its endpoint has no ``bitrate=``."""
 
 
 @click.command("link")
@@ -129,7 +129,7 @@ async def _can(near: Endpoint, far: Endpoint, faults: WireFaults) -> None:
 
 
 async def _can_end(endpoint: Endpoint, closing: AsyncExitStack) -> CanConnection:
-    """Join a bus; with ``?listen=1`` run one, where others join."""
+    """Join a bus; with ``?listen=1`` run a bus that others join."""
     if endpoint.param("listen") not in ("1", "true"):
         end = await open_can_end(endpoint, 0)
         closing.push_async_callback(end.aclose)

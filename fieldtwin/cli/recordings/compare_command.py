@@ -1,4 +1,4 @@
-"""`fieldtwin compare`: does a device do what a recording says? Parses and prints, no more."""
+"""`fieldtwin compare`: compare a device with a recording."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from fieldtwin.twin.site.data_files import find
 
 SHOWN = 20
 INCONCLUSIVE = 4
-"""Nothing that could be compared differs, but not everything could be compared."""
+"""Exit code: all compared values agree, but some could not be compared."""
 
 
 @click.command("compare")
@@ -117,7 +117,7 @@ def command(recording: Path, other: str, as_json: bool, everything: bool, **opti
 
 
 def _headed(recording: Path, other: str, live: bool, options: dict[str, Any]) -> dict[str, Any]:
-    """Which device was compared with what: `fieldtwin report` reads it."""
+    """Add the header that names the device and the reference: `fieldtwin report` reads it."""
     can = recording.suffix == ".log"
     address = options["node"] if can else options["unit"]
     if address is None and not can:
@@ -127,7 +127,7 @@ def _headed(recording: Path, other: str, live: bool, options: dict[str, Any]) ->
 
 
 def _dry(recording: Path, url: str, options: dict[str, Any]) -> int:
-    """The frames of what would be asked, as often as it would be."""
+    """Print the frames that would be sent, with their repetitions."""
     target = target_from(url, options)
     asked = 0
     if recording.suffix == ".log":
@@ -147,7 +147,7 @@ def _dry(recording: Path, url: str, options: dict[str, Any]) -> int:
     return 0
 
 
-# -- what may differ ----------------------------------------------------------------------------------------------------
+# -- tolerances -----------------------------------------------------------------------------------------------------------
 
 
 def _tolerances(texts: tuple[str, ...]) -> tuple[Tolerance, dict[str, Tolerance]]:
@@ -268,7 +268,7 @@ def _expect_exchanges(path: Path) -> None:
 
 
 def _allow_writes(recording: Path, url: str, options: dict[str, Any]) -> None:
-    """A write to a plant is asked for once, with what it would be."""
+    """Ask once before writing to a plant, and show what would be written."""
     writes = [e for e in exchanges_of(recording) if changes(e.request)]
     dangerous = [e for e in writes if e.unit == 0 or e.request[0] == 8]
     if dangerous and not options["i_know"]:
@@ -282,13 +282,13 @@ def _allow_writes(recording: Path, url: str, options: dict[str, Any]) -> None:
 
 
 def _wearing(profile: DeviceProfile | None) -> set[tuple[str, int]]:
-    """What is written once and never in loops."""
+    """Return the items with a limited number of write cycles: each is written once, never in a loop."""
     tags = profile.tags.values() if profile is not None else ()
     return {(t.at.table, a) for t in tags if t.nonvolatile and t.at for a in range(t.at.address, t.at.end)}
 
 
 def _run(work: Callable[[asyncio.Event, Callable[[int], None]], Coroutine[Any, Any, None]]) -> None:
-    """Until it is done, or a signal ends it: then what was compared so far counts."""
+    """Run until the comparison is done or a signal ends it; what has been compared by then counts."""
 
     async def main() -> None:
         stop = stop_signal()
@@ -301,7 +301,7 @@ def _run(work: Callable[[asyncio.Event, Callable[[int], None]], Coroutine[Any, A
     run_precise(main())
 
 
-# -- what is shown --------------------------------------------------------------------------------------------------------
+# -- output --------------------------------------------------------------------------------------------------------------
 
 
 def _show(result: Comparison, recording: Path, other: str, everything: bool) -> None:
@@ -344,7 +344,7 @@ def _show(result: Comparison, recording: Path, other: str, everything: bool) -> 
 
 
 def _show_shifts(result: Comparison) -> None:
-    """Where the dialogue continued the recorded one, and what the recording has nothing about."""
+    """Print where the dialogue continued the recorded one, and what the recording does not cover."""
     for shift in result.shifts[:SHOWN]:
         data.print(
             f"unit {shift.unit}, {shift.where}: was read before, continues at value {shift.at + 1} of {shift.recorded} recorded",

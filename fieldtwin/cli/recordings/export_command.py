@@ -1,4 +1,4 @@
-"""`fieldtwin export`: recordings for other programs. Parses and prints, no more."""
+"""`fieldtwin export`: convert recordings for other programs."""
 
 from __future__ import annotations
 

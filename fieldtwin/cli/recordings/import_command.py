@@ -1,4 +1,4 @@
-"""`fieldtwin import`: foreign files become recordings. Parses and prints, no more."""
+"""`fieldtwin import`: convert files of other programs to recordings."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ def _stem(file: Path) -> str:
 
 
 class _bar:
-    """A progress bar where somebody looks."""
+    """Show a progress bar on a terminal."""
 
     def __init__(self, file: Path) -> None:
         self._bar = Progress(

@@ -1,4 +1,4 @@
-"""`fieldtwin record`: what a device says, what passes on a line, or a CAN bus, into a file. Parses and prints, no more."""
+"""`fieldtwin record`: record a device's replies, the traffic of a serial line, or a CAN bus."""
 
 from __future__ import annotations
 
@@ -151,7 +151,7 @@ def command(
 
 
 def _scenario_of(run: str | None, system: str, out: Path, profiles: tuple[str, ...]) -> int:
-    """A recorded run as a scenario, with the tolerances that `fieldtwin trace --as-scenario` has by itself."""
+    """Write a recorded run as a scenario, with the default tolerances of `fieldtwin trace --as-scenario`."""
     from fieldtwin.cli.recordings.regression_view import write_scenario
     from fieldtwin.scenarios.regression.comparing import Allowed
     from fieldtwin.twin.site.system import load_system
@@ -163,12 +163,12 @@ def _scenario_of(run: str | None, system: str, out: Path, profiles: tuple[str, .
 
 
 def _end(text: str) -> Endpoint:
-    """One side of a tap; a plain path is a port."""
+    """Return one side of a tap; a plain path is a serial port."""
     return Endpoint.parse(text if ":" in text else f"rtu:{text}")
 
 
 class _Job:
-    """One recording: its file, its end, and what is shown of it."""
+    """One recording: its file, its end condition, and its output on the terminal."""
 
     def __init__(self, out: Path, for_s: float | None, as_json: bool, options: dict[str, Any]) -> None:
         self._out, self._for_s, self._json, self._options = out, for_s, as_json, options
@@ -237,7 +237,7 @@ class _Job:
         return self._summary(file, counters if polled else None, {"frames": file.lines, "lost_here": lost})
 
     def tap(self, near: Endpoint, far: Endpoint) -> int:
-        """Record a line that passes through here."""
+        """Record a line whose two halves this process connects."""
 
         def tapped(sink: LineSink) -> Callable[[asyncio.Event], Coroutine[Any, Any, None]]:
             return LineTap(near, far, sink, say=self._say, clock=self._clock).run
@@ -245,7 +245,7 @@ class _Job:
         return self._line(far, tapped, "tapped", "bytes to the device", "back")
 
     def sniff(self, port: Endpoint) -> int:
-        """Record a line between other devices that one adapter listens to."""
+        """Record a line between other devices; one adapter listens to it."""
         return self._line(
             port,
             lambda sink: LineSniffer(port, sink, say=self._say, clock=self._clock).run,
@@ -266,7 +266,7 @@ class _Job:
         there: str,
         back: str,
     ) -> int:
-        """Write the bytes first, as they come, then make a recording of what they say."""
+        """Write the bytes as they arrive, then convert them to a recording of exchanges."""
         if self._out.exists():
             raise UsageError(f"{self._out} exists already", expected="another name")
         started = self._now()
@@ -294,13 +294,13 @@ class _Job:
         }  # fmt: skip
         return self._summary(file, None, said)
 
-    # -- around them --------------------------------------------------------------------------------------------------
+    # -- running and reporting ---------------------------------------------------------------------------------------------
 
     def _now(self) -> str:
         return datetime.fromtimestamp(self._clock.utc_ns() / NS_PER_S, UTC).isoformat(timespec="milliseconds")
 
     def _run(self, work: Callable[[asyncio.Event], Coroutine[Any, Any, None]], status: Callable[[], str]) -> None:
-        """Until it ends, a signal, or --for."""
+        """Run until the recording ends, a signal arrives, or --for has passed."""
 
         async def main() -> None:
             stop = stop_signal()
@@ -319,7 +319,7 @@ class _Job:
             run_precise(main())
 
     def _summary(self, file: RotatingFile, counters: PollCounters | None, said: dict[str, Any]) -> int:
-        """0; 4 where nobody ever answered."""
+        """Return 0, or 4 if no device ever answered."""
         polled = counters is not None and counters.exchanges > 0
         silent = counters is not None and polled and counters.unanswered == counters.exchanges
         if self._json:
@@ -362,7 +362,7 @@ class _Job:
 
 @contextmanager
 def _status() -> Iterator[Status | None]:
-    """A line that says how far it is, where somebody looks."""
+    """Show a status line on a terminal."""
     if not talk.is_terminal:
         yield None
         return

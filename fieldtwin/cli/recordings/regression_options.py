@@ -1,4 +1,4 @@
-"""What may differ between two runs: options that several commands share."""
+"""The options that set the tolerances between two runs; several commands share them."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _OPTIONS = (
 
 
 def tolerance_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """``tolerances``, ``window_s`` and ``ignored``."""
+    """Add the options for ``tolerances``, ``window_s`` and ``ignored``."""
     for option in reversed(_OPTIONS):
         command = option(command)
     return command

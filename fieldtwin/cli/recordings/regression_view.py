@@ -1,4 +1,4 @@
-"""Runs held against each other, as people and programs read it: `fieldtwin trace --against`, `fieldtwin run --compare`."""
+"""Comparisons of two runs, as text and as JSON: `fieldtwin trace --against`, `fieldtwin run --compare`."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from fieldtwin.twin.site.system import System
 
 SHOWN = 30
 LENGTHS_S = 1.0
-"""Runs whose lengths differ by more are said to."""
+"""A larger difference between the lengths of two runs is reported."""
 SUFFIX = ".scenario.yaml"
 
 
 def allowed_of(tolerances: tuple[str, ...], window_s: float, ignored: tuple[str, ...]) -> Allowed:
-    """``2%`` for all, ``ctd.pressure=0.5`` for one. Raises `UsageError`."""
+    """Parse ``2%`` for all fields or ``ctd.pressure=0.5`` for one. Raises `UsageError`."""
     share, amounts = Allowed().share, {}
     for text in tolerances:
         name, equals, amount = text.rpartition("=")
@@ -43,12 +43,12 @@ def allowed_of(tolerances: tuple[str, ...], window_s: float, ignored: tuple[str,
 
 
 def judged(system: System, old: Path, new: Path, allowed: Allowed) -> Verdict:
-    """The run in `new` by the one in `old`. Raises `FileInvalid`."""
+    """Compare the run in `new` with the run in `old`. Raises `FileInvalid`."""
     return compare(story_of(system, read_events(old, system)), story_of(system, read_events(new, system)), allowed)
 
 
 def show(verdict: Verdict, old: Path, *, as_json: bool) -> int:
-    """Print it; the exit code."""
+    """Print the comparison and return the exit code."""
     if as_json:
         json.dump(
             {
@@ -93,7 +93,10 @@ def show(verdict: Verdict, old: Path, *, as_json: bool) -> int:
 def write_scenario(
     system: System, run: Path, out: Path, named: str, *, allowed: Allowed, seed: int | None, values: bool
 ) -> int:
-    """Make a scenario of the run in `run`; `named` is how the system was. Raises `UsageError` for a file that is there."""
+    """Write the run in `run` as a scenario; `named` is the system as the user named it.
+
+    Raises `UsageError` if the file exists.
+    """
     if not out.name.endswith(SUFFIX):
         raise UsageError("a scenario's name", expected=f"NAME{SUFFIX}", got=out.name)
     beside = Path(named).is_file()

@@ -1,4 +1,4 @@
-"""`fieldtwin trace`: what happened in a run, in words, as JSON, or as waveforms. Parses and prints, no more."""
+"""`fieldtwin trace`: show the events of a run as text, as JSON, or as waveforms."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def command(
     folders = [Path(p) for p in profiles]
     agreed = consent(
         trust=trust or vcd is None
-    )  # waveforms alone look at what programs are: they are imported for that
+    )  # only waveforms need the programs' types, so only they import the programs
     plant = load_system(system_file(system, agreed, plant=True, profiles=folders), folders)
     if against is not None or as_scenario is not None:
         from fieldtwin.cli.recordings import regression_view
@@ -128,7 +128,7 @@ def _decoded(decoder: Decoder, events: Iterator[Event], end_ns: int | None) -> I
 
 def _wanted(only: tuple[str, ...], event: Event, decoded: Decoded) -> bool:
     names = {event.where, event.where.partition(".")[0], *(e.device for e in decoded.exchanges)}
-    told = decoded.text.partition(":")[0]  # a request names its device too
+    told = decoded.text.partition(":")[0]  # a request names its device as well
     return not only or not names.isdisjoint(only) or (event.kind is Kind.FRAME and told in only)
 
 
@@ -141,7 +141,7 @@ def _line(event: Event, decoded: Decoded) -> str:
 
 
 def _show_refusal(event: Event, decoded: Decoded, only: tuple[str, ...], *, as_json: bool) -> None:
-    """A write that did not reach its device is a problem that no exchange shows: nothing was sent."""
+    """Report a write that did not reach its device: nothing was sent, so no exchange shows it."""
     if event.kind is not Kind.REFUSED or not _wanted(only, event, decoded):
         return
     if as_json:

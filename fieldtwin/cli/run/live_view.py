@@ -1,6 +1,6 @@
-"""What a person sees of a run: a live table on a terminal, one line a second elsewhere, and the summary at the end.
+"""A run on the terminal: a live table (elsewhere one line a second), and the summary at the end.
 
-Everything shown comes from the session's statuses; nothing is computed here but text.
+Everything comes from the session's statuses; this module only formats text.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ MAX_TROUBLES = 5
 MAX_FORCES = 6
 MAX_REFUSED = 5
 READ_ONLY = "read-only"
-"""The cause of a refusal that is by design: the plant runs without leave to write."""
+"""The cause of a refusal that is intended: the plant runs read-only."""
 MOST_FAULTS = 20
 
 
 def print_mapping(session: RunSession) -> None:
-    """Say once where each plant endpoint is really opened."""
+    """Print once which endpoint stands in for each plant endpoint."""
     if not session.options.prototype:
         leave = "writes allowed" if session.options.allow_writes else "read-only"
         talk.print(f"[bold]plant[/bold] {session.system.name}: {leave}; instance {session.instance.name}")
@@ -53,7 +53,7 @@ def print_mapping(session: RunSession) -> None:
 
 
 def print_metrics(url: str) -> None:
-    """Say once where the metrics are."""
+    """Print once the address of the metrics."""
     if url:
         talk.print(f"  metrics  ←  {url}", soft_wrap=True)
 
@@ -64,7 +64,7 @@ def _print_thread(session: RunSession) -> None:
 
 
 class LiveView:
-    """``async with LiveView(session)``: shows the run while the body runs. On a terminal a table, otherwise lines."""
+    """``async with LiveView(session)``: show the run while the body runs, on a terminal as a table, else as lines."""
 
     def __init__(self, session: RunSession, quiet: bool) -> None:
         self._session = session
@@ -87,7 +87,7 @@ class LiveView:
             try:
                 await self._task
             except asyncio.CancelledError:
-                pass  # that is what was asked for
+                pass  # requested by the options
 
     async def _show_table(self) -> None:
         open_ports: set[str] = set()
@@ -105,13 +105,13 @@ class LiveView:
             open_ports = self._tell_once(open_ports)
             now = [*troubles(self._session), *_waiting_once(self._session)]
             for trouble in now:
-                if trouble not in told:  # once, and again only when it had gone
+                if trouble not in told:  # once, and again only after it had disappeared
                     talk.print(f"! {trouble}", soft_wrap=True, markup=False)
             told = set(now)
             talk.print(line(self._session), soft_wrap=True, markup=False)
 
     def _tell_once(self, told: set[str]) -> set[str]:
-        """Say once where the gateway listens: a prototype takes free ports. And that a lost field side is back."""
+        """Print once where the gateway listens (a prototype takes free ports), and report recovered simulated devices."""
         now = set(ports(self._session))
         if (back := self._session.field_return) is not None and back.news:
             now.add(back.news)
@@ -121,7 +121,7 @@ class LiveView:
 
 
 def ports(session: RunSession) -> list[str]:
-    """Where the gateway serves tags and lets clients reach units."""
+    """Return where the gateway serves tags and lets clients reach units."""
     gateway = session.gateway_status or {}
     return [
         f"{kind} {name}  ←  {front['listening']}"
@@ -135,8 +135,11 @@ THREAD_TROUBLES = (("thread", "trouble"), ("store of the thread", "store_trouble
 
 
 def troubles(session: RunSession) -> list[str]:
-    """What is wrong now, each with its reason: errors of the run, buses that cannot be opened, devices that do not answer, and
-    what stopped the PLC, the digital thread's carrier and store."""
+    """Return the present problems with their reasons.
+
+    They are errors of the run, buses that cannot be opened, devices that do not answer, and what stopped the PLC, the digital
+    thread's carrier or its store.
+    """
     gateway = session.gateway_status or {}
     found = list(session.errors)
     if session.field_return is not None and (trouble := session.field_return.trouble):
@@ -157,8 +160,10 @@ def troubles(session: RunSession) -> list[str]:
 
 
 def refused(gateway: dict[str, Any]) -> list[str]:
-    """The outputs that are refused now, each with its value, the reason and the program's line. In a read-only plant one line
-    for all that are not written by design."""
+    """Return the refused outputs, each with its value, the reason and the program's line.
+
+    In a read-only plant one line stands for all outputs that are not written by design.
+    """
     entries = [e for e in gateway.get("refusals", {}).get("entries", []) if e["standing"]]
     by_design = {e["tag"] for e in entries if e["cause"] == READ_ONLY}
     found = [refusal_text(e["tag"], e) for e in entries if e["cause"] != READ_ONLY]
@@ -168,7 +173,7 @@ def refused(gateway: dict[str, Any]) -> list[str]:
 
 
 def interference(session: RunSession) -> list[str]:
-    """Why the PLC does not do what its programs say: it is paused, a program waits for its start, or something is forced."""
+    """Return why the PLC does not follow its programs: it is paused, a program waits for its start, or a tag is forced."""
     plc = session.plc_status or {}
     found = ["PAUSED: the PLC executes nothing, its outputs stay as they are"] if plc.get("state") == "paused" else []
     found += waiting_texts(plc)
@@ -178,13 +183,13 @@ def interference(session: RunSession) -> list[str]:
 
 
 def _waiting_once(session: RunSession) -> list[str]:
-    """For the lines of a log: each program that waits, without the seconds, so that it is told once."""
+    """Return the waiting programs without the seconds, so that a log reports each once."""
     waiting = (session.plc_status or {}).get("waiting", {})
     return [f"program {program} has not started; missing {start['reason']}" for program, start in waiting.items()]
 
 
 def forces_text(forces: dict[str, Any]) -> str:
-    """``ctd.pressure = 5 by ada, ...``, of many the first few and how many more."""
+    """Return ``ctd.pressure = 5 by ada, ...``: the first few forces and the number of the rest."""
     shown = [
         f"{tag} = {value_text(force['value'])}" + (f" by {force['by']}" if force["by"] else "")
         for tag, force in list(forces.items())[:MAX_FORCES]
@@ -194,7 +199,7 @@ def forces_text(forces: dict[str, Any]) -> str:
 
 
 def line(session: RunSession) -> str:
-    """The run in one line."""
+    """Return the state of the run as one line."""
     gateway, plc = session.gateway_status or {}, session.plc_status or {}
     parts = [f"t={session.elapsed_s:.0f}s"]
     parts += [f"{program}={state}" for program, state in session.states.current.items()]
@@ -228,7 +233,7 @@ def _p99(plc: dict[str, Any]) -> str:
 
 
 def render(session: RunSession) -> RenderableType:
-    """The live table, as wide as the terminal allows."""
+    """Return the live table in the terminal's width."""
     kind = "prototype" if session.options.prototype else "plant"
     left = session.options.duration_s
     clock = f"{session.elapsed_s:5.1f} s" + (f" of {left:.0f} s" if left else "")
@@ -236,7 +241,7 @@ def render(session: RunSession) -> RenderableType:
     parts: list[RenderableType] = [head, _devices(session), _foot(session)]
     parts += [Text(text, style="bold yellow") for text in interference(session)]
     parts += [Text(f"! {trouble}", style="red") for trouble in troubles(session)[-MAX_TROUBLES:]]
-    parts.append(_tags(session))  # last: a low terminal cuts off the end of them and nothing else
+    parts.append(_tags(session))  # last, so that a low terminal cuts off only the end of the list
     return Group(*parts)
 
 
@@ -266,7 +271,7 @@ def _devices(session: RunSession) -> Table:
         good = device["online"]
         table.add_row(
             name,
-            Text("good", "green") if good else Text("bad", "red"),  # why stands below, where there is room
+            Text("good", "green") if good else Text("bad", "red"),  # the reason is shown below, where there is room
             f"{device['bus']}:{device['address']}",
             str(counters.get("requests", counters.get("sdo_requests", 0))),
             str(counters.get("replies", counters.get("sdo_replies", 0))),
@@ -299,7 +304,7 @@ def _tags(session: RunSession) -> Table:
 
 
 def value_text(value: Any) -> str:
-    """A value for a person: floats with six digits, none as a dash."""
+    """Return a value as text: floats with six digits, a missing value as a dash."""
     if value is None:
         return "-"
     return f"{value:.6g}" if isinstance(value, float) else str(value)
@@ -337,7 +342,7 @@ def _us(late: dict[str, Any], key: str) -> str:
 
 
 def print_summary(summary: dict[str, Any]) -> None:
-    """The end of a run, for a person, on stdout."""
+    """Print the summary of a run on stdout."""
     kind = "prototype" if summary["prototype"] else "plant"
     data.print(f"[bold]{summary['system']}[/bold] ({kind}), {summary['duration_s']:.1f} s")
     for name, device in summary["devices"].items():
@@ -376,13 +381,13 @@ def print_summary(summary: dict[str, Any]) -> None:
             data.print(f"  [yellow]FORCED[/yellow]         at the end: {forces_text(left)}", soft_wrap=True)
     _print_refused(summary)
     for one in summary["invariants"]:
-        if one["verdict"] != "failed":  # those that failed are among the errors
+        if one["verdict"] != "failed":  # the failed ones are among the errors
             said = "holds" if one["verdict"] == "passed" else "not judged"
             text = f"  {one['number']}: {one['text']}: {said}, {one['got']}"
             data.print(text, soft_wrap=True, markup=False, highlight=False)
     told = {f"{name}: {device['error']}" for name, device in summary["devices"].items() if device["state"] != "good"}
     for error in summary["errors"]:
-        if error in told:  # beside the device, above
+        if error in told:  # listed with the device, above
             continue
         data.print(f"  [red]error[/red]          {escape(error)}", soft_wrap=True)
     for what in summary["not_judged"]:
@@ -391,7 +396,7 @@ def print_summary(summary: dict[str, Any]) -> None:
 
 
 def _print_refused(summary: dict[str, Any]) -> None:
-    """The writes that did not reach their device and are no error, by cause: by design, tried again, or asked by a client."""
+    """Print the writes that did not reach their device and are not errors: by design, retried, or requested by a client."""
     by_design = sorted({e["tag"] for e in summary["refused"] if e["cause"] == READ_ONLY})
     if by_design:
         text = f"{', '.join(by_design)}: not written, the plant is read-only (--allow-writes)"
@@ -405,7 +410,7 @@ def _print_refused(summary: dict[str, Any]) -> None:
 
 
 def print_faults(faults: list[dict[str, Any]]) -> None:
-    """Print how often each fault of a run struck."""
+    """Print how often each fault of a run took effect."""
     from fieldtwin.results.fault_counts import struck_of
 
     for fault in faults[:MOST_FAULTS]:
@@ -423,14 +428,14 @@ def _times(count: int) -> str:
 
 
 def _thread_text(thread: dict[str, Any]) -> str:
-    """What the plant's side of the digital thread kept and sent, and what is wrong with store or carrier."""
+    """Return what the plant's side of the digital thread stored and sent, and the problems of its store or carrier."""
     text = f"{thread['written']} events kept, {thread['waiting']} not confirmed by the other side"
     troubles = [t for t in (thread["store_trouble"], thread["trouble"]) if t]
     return "; ".join([text, *troubles])
 
 
 def _learnt_text(learnt: dict[str, Any], kind: str) -> str:
-    """What a device, or what stood in for it, taught; the line for its profile last, so that it can be taken as it is."""
+    """Return what was learnt about a device; the last line is the one for its profile, ready to be copied."""
     parts = []
     if learnt["missing"]:
         parts.append(f"does not have {', '.join(learnt['missing'])}")

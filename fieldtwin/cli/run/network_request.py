@@ -1,4 +1,4 @@
-"""What the command line says of a run of a network."""
+"""The options of a network run."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 
 class NetworkRequest(NamedTuple):
-    """A run of the network in the file `path`. `commands` None: what the ship orders by default."""
+    """A run of the network in the file `path`. `commands` None: the default commands of the topside controller."""
 
     path: Path
     virtual: bool

@@ -1,4 +1,4 @@
-"""`fieldtwin run NETWORK`: several systems and the water between them, in virtual time or on this host."""
+"""`fieldtwin run NETWORK`: several systems and the acoustic channel between them, in virtual time or on this host."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from fieldtwin.twin.network.network import SHIP, Network, load_network
 
 FIRST_S = 1.0
 BASE_S = 10
-"""What the ship orders, and when, where nothing is said."""
+"""The default commands of the topside controller, with their times."""
 THREAD = "tcp://127.0.0.1:0"
 REFRESH_S = 0.25
 LINE_S = 5.0
@@ -43,7 +43,7 @@ MAX_TROUBLES = 5
 
 
 def run_network(request: NetworkRequest) -> int:
-    """The exit status: 0 when all is well, on every system."""
+    """Run the network and return the exit status: 0 if every system passed."""
     if request.virtual and request.duration_s <= 0:
         raise UsageError("--virtual needs an end", expected="--for 24h")
     if not request.virtual and (request.seed is not None or request.trace):
@@ -77,7 +77,7 @@ def _commands(request: NetworkRequest) -> tuple[Scripted, ...]:
 
 
 def _print_network(network: Network) -> None:
-    """Who is there, and who hears whom."""
+    """Print the members of the network, and which of them hear each other."""
     show_warnings(dict.fromkeys(warning for member in network.members.values() for warning in member.system.warnings))
     sea = network.medium(network.seed)
     talk.print(f"[bold]network[/bold] {network.name}, prototypes of {len(network.members)} systems", highlight=False)
@@ -190,7 +190,7 @@ async def _on_this_host(request: NetworkRequest, network: Network) -> int:
 
 
 async def _show(session: NetworkSession, quiet: bool) -> None:
-    """On a terminal a table, elsewhere a line for each system now and then."""
+    """Show a table on a terminal; elsewhere print a line for each system at intervals."""
     if quiet:
         return
     if talk.is_terminal:
@@ -232,7 +232,7 @@ def _states(session: RunSession) -> str:
 
 
 def _outputs(session: RunSession) -> str:
-    """What the control logic wants of its devices."""
+    """Return the values that the control logic commands."""
     outputs = (session.gateway_status or {}).get("outputs", [])
     return " ".join(f"{o['tag'].partition('.')[2]} {o['wanted']:g}" for o in outputs if o["wanted"] is not None)
 
@@ -262,7 +262,7 @@ def _verdict(summary: dict[str, Any]) -> int:
 
 
 def print_network_summary(summary: dict[str, Any]) -> None:
-    """The end of a run, for a person, on stdout, but for the verdict."""
+    """Print the summary of a network run on stdout, without the verdict."""
     data.print(f"[bold]{summary['network']}[/bold] (network of prototypes), {summary['duration_s']:.1f} s")
     for name, one in summary["systems"].items():
         good = [device for device, d in one["devices"].items() if d["state"] == "good"]

@@ -1,4 +1,4 @@
-"""`fieldtwin plc`: look into the PLC of a running instance, force, step, and ask why; draw and prove its programs."""
+"""`fieldtwin plc`: inspect the PLC of a running instance, force tags, single-step; draw and prove its programs."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def _emit(value: Any) -> int:
 
 
 def _sure(question: str, yes: bool) -> None:
-    """Raises `UsageError` where nobody can be asked, `Abort` where the answer is no."""
+    """Ask for confirmation. Raises `UsageError` without a terminal, `Abort` if the answer is no."""
     if yes:
         return
     if not sys.stdin.isatty():
@@ -68,7 +68,7 @@ def _call(instance: str, verb: str, **args: Any) -> Any:
 
 
 def _act(instance: str, verb: str, **args: Any) -> Any:
-    """A verb that changes something: on record with the user's name."""
+    """Send a command that changes the PLC; it is recorded with the user's name."""
     import getpass
 
     return _call(instance, verb, by=getpass.getuser(), **args)
@@ -211,7 +211,7 @@ def why(tag: str, instance: str, as_json: bool) -> int:
 
 
 def _agreed(system: str, profiles: tuple[str, ...], *, trust: bool) -> System:
-    """The system of which a program is to be looked at: it is imported, and nothing is opened."""
+    """Return the system whose program is inspected: the program is imported, and nothing is opened."""
     from fieldtwin.run.template import system_file
 
     folders = [Path(p) for p in profiles]

@@ -1,4 +1,4 @@
-"""What `fieldtwin plc` shows: tables on a terminal, the same as plain lines elsewhere."""
+"""The output of `fieldtwin plc`: tables on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from fieldtwin.plc.tag_view import MAX_AT_ONCE, matches
 REFRESH_S = 0.25
 IN_A_PIPE = 500
 ROOM_FOR_LIMITS = 100
-"""Columns of a terminal from which limits are shown, too."""
+"""A terminal with at least this many columns also shows the limits."""
 _WHOLE_TYPES = {
     span
     for bits in (8, 16, 32, 64)
@@ -34,11 +34,11 @@ AT_TIMEOUT = {
 }
 
 Row = dict[str, Any]
-"""One tag as the PLC's `image` verb describes it."""
+"""A tag as the PLC's `image` command describes it."""
 
 
 async def chosen_tags(client: ControlClient, patterns: tuple[str, ...]) -> list[str]:
-    """The names that match. Raises `UsageError` for a pattern that nothing matches."""
+    """Return the names that match. Raises `UsageError` for a pattern without a match."""
     names: list[str] = (await client.call("image"))["names"]
     for pattern in patterns:
         if not any(matches(name, pattern) for name in names):
@@ -47,11 +47,11 @@ async def chosen_tags(client: ControlClient, patterns: tuple[str, ...]) -> list[
 
 
 async def ask_rows(client: ControlClient, names: list[str]) -> list[Row]:
-    """Rows of tags, inputs before outputs, asked for in pieces so that no scan is late for it."""
+    """Read rows of tags, inputs before outputs, in pieces, so that no scan is delayed."""
     rows: list[Row] = []
     for at in range(0, len(names), MAX_AT_ONCE):
         rows += (await client.call("image", tags=names[at : at + MAX_AT_ONCE]))["tags"]
-    return sorted(rows, key=lambda row: row["side"])  # which keeps their order otherwise
+    return sorted(rows, key=lambda row: row["side"])  # which otherwise keep their order
 
 
 async def ask_tags(client: ControlClient, patterns: tuple[str, ...]) -> list[Row]:
@@ -59,7 +59,10 @@ async def ask_tags(client: ControlClient, patterns: tuple[str, ...]) -> list[Row
 
 
 def tags_as_data(rows: list[Row]) -> dict[str, Row]:
-    """For JSON: by tag. One that is read back stands in both regions: what is commanded, with what was read as `input`."""
+    """Return tags as JSON data, by name.
+
+    A tag that is read back is in both regions: the entry has the commanded value, and the value read as `input`.
+    """
     found: dict[str, Row] = {}
     for row in rows:
         before = found.get(row["tag"])
@@ -92,19 +95,19 @@ def tag_table(rows: list[Row]) -> Table:
 
 
 def _named(row: Row, value: Any) -> str:
-    """A value by its word where it has one, such as a state's name."""
+    """Return a value by its name if it has one, such as a state's."""
     return str(row["words"].get(str(value), _value(value)))
 
 
 def _limits(limits: list[float] | None) -> str:
-    """Nothing for those that only say how many bits an integer has."""
+    """Return the limits; nothing if they only state the width of an integer."""
     if limits is None or tuple(limits) in _WHOLE_TYPES:
         return ""
     return f"{limits[0]:.6g}..{limits[1]:.6g}"
 
 
 def _quality(row: Row) -> str:
-    """With its reason, and what programs see in place of it."""
+    """Return the quality with its reason, and the substitute value that programs see."""
     text = str(row["quality"]) + ("" if row["reason"] == "none" else f": {row['reason']}")
     for variable, seen in row["seen"].items():
         text += f"; {variable} sees {_value(seen['value'])} ({seen['quality']})"
@@ -116,7 +119,7 @@ def print_tags(rows: list[Row]) -> None:
 
 
 def _width() -> int:
-    """Columns: a terminal's, and in a pipe as many as it takes, so that nothing is cut off there."""
+    """Return the number of columns: the terminal's, and unlimited in a pipe, so that nothing is cut off."""
     return data.width if data.is_terminal else IN_A_PIPE
 
 
@@ -193,7 +196,7 @@ def print_status(status: dict[str, Any]) -> None:
 
 
 def waiting_texts(plc: dict[str, Any]) -> list[str]:
-    """One line for each program that has not started: what it waits for, how long already, and what happens at the timeout."""
+    """Return one line for each program that has not started: its missing inputs, the time waited, the timeout's effect."""
     return [
         f"WAITING: program {program} starts after its inputs have been good once; missing {start['reason']}; "
         f"{start['since_s']:.0f} s so far, {AT_TIMEOUT[start['at_timeout']].format(start['timeout_s'])}"
@@ -202,7 +205,7 @@ def waiting_texts(plc: dict[str, Any]) -> list[str]:
 
 
 def without_texts(plc: dict[str, Any]) -> list[str]:
-    """One line for each program that started although inputs were missing."""
+    """Return one line for each program that started although inputs were missing."""
     return [
         f"program {program} started without " + ", ".join(f"{tag} ({reason})" for tag, reason in missing.items())
         for program, missing in plc.get("started_without", {}).items()
@@ -210,7 +213,7 @@ def without_texts(plc: dict[str, Any]) -> list[str]:
 
 
 def is_now(rows: list[Row], tag: str) -> str:
-    """What a tag is before it is forced, with unit and limits; the command where it is read back, too."""
+    """Return the tag's value before it is forced, with unit and limits; for a tag that is read back, its command."""
     if not rows:
         raise UsageError(f"no tag {tag!r}", expected="a tag without *")
     row = rows[-1]
@@ -219,12 +222,12 @@ def is_now(rows: list[Row], tag: str) -> str:
 
 
 def acts_text(acts: dict[str, int]) -> str:
-    """What people did to a PLC, and how often: ``2 x force, 1 x pause``."""
+    """Return users' actions on the PLC, and how often: ``2 x force, 1 x pause``."""
     return ", ".join(f"{count} x {what}" for what, count in acts.items())
 
 
 def print_why(tag: str, changes: list[dict[str, Any]], waits_for: str = "") -> None:
-    """`waits_for`: what the program that writes the tag waits for before it starts."""
+    """Print the reason of a tag's value. `waits_for`: what the program that writes the tag waits for before it starts."""
     if waits_for:
         data.print(f"{tag}: its program has not started; missing {waits_for}", markup=False, soft_wrap=True)
     elif not changes:

@@ -1,4 +1,4 @@
-"""`fieldtwin reload`: a running instance reads its files again, between two polls."""
+"""`fieldtwin reload`: a running instance reads its files again between two polls."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def _who() -> str:
 
 
 class _NotReloaded(FieldtwinError):
-    """The instance said why; its exit code is ours."""
+    """The instance rejected the reload and gave the reason; this command ends with the instance's exit code."""
 
     def __init__(self, message: str, remote_exit_code: int) -> None:
         super().__init__(message)

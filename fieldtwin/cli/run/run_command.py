@@ -1,4 +1,4 @@
-"""`fieldtwin run`: a plant, or its prototype, from one and the same system file."""
+"""`fieldtwin run`: run a plant, or its prototype, from the same system file."""
 
 from __future__ import annotations
 
@@ -304,7 +304,7 @@ def _faults(path: str, system: str, profiles: tuple[str, ...]) -> tuple[dict[str
 
 
 class VirtualRequest(NamedTuple):
-    """What the command line says of a run in virtual time."""
+    """The options of a run in virtual time."""
 
     system: str
     duration_s: float
@@ -349,7 +349,7 @@ def _run_virtual(request: VirtualRequest, seeds: str, jobs: int, ledger: Path | 
 
 
 def _run_against(options: VirtualOptions, old: Path, as_json: bool) -> int:
-    """The run, and then what of it is otherwise than in the trace `old`; the worse of both exit codes."""
+    """Run, then compare the run with the trace `old`; return the worse of the two exit codes."""
     from fieldtwin.cli.recordings.regression_view import judged, show
     from fieldtwin.cli.run.virtual_view import run_one
     from fieldtwin.scenarios.regression.comparing import Allowed
@@ -382,7 +382,7 @@ async def _run(options: RunOptions, service_options: ServiceOptions, as_json: bo
         nonlocal interrupted
         interrupted = True
         session.stopped.set()
-        if not started:  # on a busy computer that takes a while, and nobody waits for it any more
+        if not started:  # on a busy computer this takes a while, and the user has asked to stop
             me.cancel()
 
     loop = asyncio.get_running_loop()
@@ -398,7 +398,7 @@ async def _run(options: RunOptions, service_options: ServiceOptions, as_json: bo
                 if service_options.log is None:
                     print_metrics(service.url)
                 if hasattr(signal, "SIGHUP"):
-                    # From a terminal it says that nobody watches any more; to a service, that its configuration changed.
+                    # SIGHUP from a terminal means that the terminal closed; for a service, that the configuration changed
                     watched = not notifier.wanted and any(map(os.isatty, range(3)))
                     loop.add_signal_handler(signal.SIGHUP, interrupt if watched else service.hang_up)
                 async with LiveView(session, quiet=as_json or service_options.log is not None):

@@ -1,4 +1,4 @@
-"""`fieldtwin shore`: the far end of a system's transmitter, on its own."""
+"""`fieldtwin shore`: the topside controller of a system's modem, as a separate process."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`fieldtwin run --virtual` on a terminal: how far it is, what came of it, and of many seeds which failed."""
+"""`fieldtwin run --virtual` on a terminal: progress, results, and the failed seeds."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 def parse_seeds(text: str) -> range:
-    """``7`` or ``1..200``. Raises `UsageError`."""
+    """Parse ``7`` or ``1..200``. Raises `UsageError`."""
     from fieldtwin.run.campaigns.many_seeds import MAX_SEEDS
 
     first, dots, last = text.partition("..")
@@ -37,7 +37,7 @@ def parse_seeds(text: str) -> range:
 
 
 def run_one(options: VirtualOptions, as_json: bool) -> int:
-    """One run, its summary on stdout. The exit status: 0 when all is well."""
+    """Run once and print the summary on stdout. Return the exit status: 0 if the run passed."""
     from fieldtwin.run.virtual.run import VirtualRun
 
     run = VirtualRun(options)
@@ -64,7 +64,7 @@ def run_one(options: VirtualOptions, as_json: bool) -> int:
 
 
 def again(seed: int) -> str:
-    """The command line that repeats the run of one seed, of those that are run now."""
+    """Return the command line that repeats the run of one seed."""
     words, skip = [], False
     for word in sys.argv[1:]:
         if skip:
@@ -83,9 +83,9 @@ def run_many(
     as_json: bool,
     ledger_path: Path | None = None,
 ) -> int:
-    """A run a seed. The exit status: 0 when all were well.
+    """Run once for each seed and return the exit status: 0 if all passed.
 
-    With a ledger, seeds that it has are not run again, and each that ends is written down at once.
+    With a ledger, seeds that it contains are not run again, and each run is recorded when it ends.
     """
     from fieldtwin.run.campaigns.ledger import Ledger
     from fieldtwin.run.campaigns.many_seeds import run_seeds, what_runs
@@ -184,7 +184,7 @@ def _shrink(options: Options, failed: SeedResult) -> None:
 
 
 def shrunk_texts(seed: int, count: int, minimal: bool, passes_without: bool, otherwise: Sequence[str]) -> list[str]:
-    """Return in words which faults the failure of a seed takes, and what happens without any of them."""
+    """Return in words which faults the failure of a seed needs, and what happens without any of them."""
     if not count:
         return [f"seed {seed} fails without any fault: the faults are not the cause"]
     what = f"{count} fault{'s' if count > 1 else ''}"
@@ -200,14 +200,14 @@ def _plain(result: SeedResult) -> dict[str, Any]:
 
 
 def shown_time(seconds: float) -> str:
-    """A length of virtual time, for a person."""
+    """Return a length of virtual time as text."""
     if seconds >= 2 * 3600:
         return f"{seconds / 3600:g} h"
     return f"{seconds / 60:g} min" if seconds >= 120 else f"{seconds:g} s"
 
 
 class progress_bar:
-    """A progress bar on stderr where that is a terminal. ``with progress_bar(60.0) as at: at(12.0)``."""
+    """Show a progress bar on stderr if that is a terminal. ``with progress_bar(60.0) as at: at(12.0)``."""
 
     def __init__(self, total: float, unit: str = "s") -> None:
         columns = (

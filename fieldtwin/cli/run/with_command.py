@@ -1,4 +1,4 @@
-"""`fieldtwin with`: a command, of whoever, against the emulated field of a system."""
+"""`fieldtwin with`: run any command against the simulated field devices of a system."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from fieldtwin.console import show_warnings, talk
 from fieldtwin.gateway.core.errors import UsageError
 
 LONG = ("_URL", "_TTY", "_BAUDRATE", "_FRAME", "_HOST", "_PORT", "_INTERFACE", "_CHANNEL")
-"""Endings of variables that say in parts what a shorter one says: they are not shown."""
+"""Endings of variables that repeat parts of a shorter variable: they are not shown."""
 
 
 @click.command("with", context_settings={"allow_interspersed_args": False})

@@ -1,4 +1,4 @@
-"""`fieldtwin doctor`: what this computer can do, and what to change where it cannot."""
+"""`fieldtwin doctor`: check what this computer supports, and name what to change."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`fieldtwin draw`: who hangs on which wire of a system, as text or as a picture."""
+"""`fieldtwin draw`: draw the buses of a system with their devices, as text or as SVG."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def _network(path: Path, profiles: list[Path]) -> tuple[Any, str, Callable[[], s
 
 
 def _put(facts: Any, text: str, svg: Callable[[], str], output: Path | None, as_json: bool) -> int:
-    """Where it is wanted: a file, or stdout. Raises `UsageError` for a file that cannot be written."""
+    """Write the drawing to the file or to stdout. Raises `UsageError` for a file that cannot be written."""
     if as_json:
         text = json.dumps(facts, indent=2) + "\n"
     elif output is not None:
@@ -76,5 +76,5 @@ def _put(facts: Any, text: str, svg: Callable[[], str], output: Path | None, as_
 
 
 def _room() -> tuple[int, ...]:
-    """The terminal's width; a pipe takes whole lines."""
+    """Return the terminal's width; a pipe takes whole lines."""
     return (shutil.get_terminal_size().columns,) if sys.stdout.isatty() else ()

@@ -1,4 +1,4 @@
-"""`fieldtwin report`: dumps, differences, comparisons and checks as one document that is printed and signed."""
+"""`fieldtwin report`: collect dumps, differences, comparisons and checks in one document to print and sign."""
 
 from __future__ import annotations
 

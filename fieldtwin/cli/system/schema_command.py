@@ -1,4 +1,4 @@
-"""`fieldtwin schema`: the JSON schema of a kind of file, for editors and checks."""
+"""`fieldtwin schema`: print the JSON schema of a kind of file, for editors and checks."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def _faults() -> dict[str, Any]:
 
 
 def _scenario() -> dict[str, Any]:
-    """The faults of its steps are those of fault files."""
+    """Return the schema of scenarios; the faults of their steps are those of fault files."""
     from fieldtwin.emulators.faults.json_schema import fault_defs
     from fieldtwin.scenarios.language.words import ScenarioForm
 
@@ -73,7 +73,7 @@ SCHEMAS: dict[str, Callable[[], dict[str, Any]]] = {
     "waivers": _waivers,
     "rules": _rules,
 }
-"""What a user writes, by its kind."""
+"""The kinds of files that users write."""
 
 
 @click.command("schema")

@@ -1,4 +1,4 @@
-"""`fieldtwin template`: pack a system into one file, look into such a file, unpack it, compare two."""
+"""`fieldtwin template`: pack a system into one file, check, unpack and compare such files."""
 
 from __future__ import annotations
 
@@ -201,7 +201,7 @@ def _style(line: str) -> str:
 def _print_files(manifest: Manifest) -> None:
     data.print(f"{manifest.system}: template {manifest.id[:16]}, fieldtwin {manifest.software.version}", soft_wrap=True)
     data.print(f"  {'SHA-256':12}  {'bytes':>13}  {'kind':17}  file")
-    for file in manifest.files:  # the path comes last and whole: somebody copies it
+    for file in manifest.files:  # the path is last and unwrapped, so that it can be copied
         words = f"  {file.sha256[:12]}  {file.bytes:13,}  {file.document or file.kind:17}  {escape(file.path)}"
         data.print(words, soft_wrap=True, highlight=False)
 

@@ -23,8 +23,11 @@ FAULTS_SHOWN = 12
 def run_scenario_campaign(
     path: Path, profiles: tuple[Path, ...], request: CampaignRequest, show: Callable[[ScenarioResult], None] | None
 ) -> list[ScenarioResult]:
-    """Run a scenario with each seed; return the result of the campaign as a whole, of each seed, and of the scenario that the
-    first failing seed was shrunk to. `show` None: nothing is printed to stdout."""
+    """Run a scenario with each seed.
+
+    Return the result of the whole campaign, of each seed, and of the scenario that the first failing seed was shrunk to. `show`
+    None: nothing is printed to stdout.
+    """
     seeds = parse_seeds(request.seeds)
     campaign = Campaign(path, profiles, request.choice.of(request.faults), request.duration_s, _words(request))
     with progress_bar(float(len(seeds)), "seeds") as at:
@@ -48,7 +51,7 @@ def run_scenario_campaign(
 
 
 def _words(request: CampaignRequest) -> tuple[str, ...]:
-    """The options that make a seed's run, besides the seed."""
+    """Return the options that define a seed's run, without the seed."""
     every_s, kinds, aims = request.choice
     said = {
         "--faults": request.faults or "",
@@ -61,7 +64,7 @@ def _words(request: CampaignRequest) -> tuple[str, ...]:
 
 
 def _show_seed(result: ScenarioResult, show: Callable[[ScenarioResult], None]) -> None:
-    """A line for a seed that passed, with the faults that struck; everything about one that did not."""
+    """Print a line for a passed seed, with the faults that took effect; for a failed one everything."""
     if result.verdict is not Verdict.PASSED:
         show(result)
         return

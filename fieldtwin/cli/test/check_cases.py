@@ -1,4 +1,4 @@
-"""Which cases of a catalogue are meant: ``--only`` of `fieldtwin check`, for masters and devices."""
+"""Select test cases: ``--only`` of `fieldtwin check`, for clients and devices."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _ID = re.compile(r"^((?:MB|CO)-)?(\d{1,3})([a-h]?)$", re.IGNORECASE)
 
 
 class Named(Protocol):
-    """What has an id, and a row of the catalogue."""
+    """An object with an ID and a row of the test-case list."""
 
     @property
     def id(self) -> str: ...
@@ -23,7 +23,7 @@ class Named(Protocol):
 
 
 def only_of(text: str | None, cases: Sequence[Named]) -> frozenset[str]:
-    """``MB-013,15a`` as ids; an unknown one is `UsageError` with the nearest."""
+    """Parse ``MB-013,15a`` as IDs. An unknown one is a `UsageError` with the nearest match."""
     chosen = set()
     known = {case.id for case in cases} | {case.row for case in cases}
     prefix = cases[0].id[:3]

@@ -1,4 +1,4 @@
-"""`fieldtwin check`: masters and devices that we did not write are judged."""
+"""`fieldtwin check`: run conformance tests against third-party clients, masters and devices."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def command() -> None:
 
 
 def _shared(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Options of every judgement."""
+    """Add the options of every conformance test."""
     options = [
         click.option("--only", metavar="IDS", help="Play only these cases or rows, separated by commas: MB-013,MB-015a."),
         click.option(
@@ -75,7 +75,7 @@ def _shared(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _seen(what: str, timeout: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Options of what a master sees and shows: `what` it reads, and what its own `timeout` is called."""
+    """Add the options for the client's readings and outputs: `what` it reads, and the name of its `timeout`."""
     options = [
         click.option(
             "--probe", default="", metavar="WHERE",
@@ -96,7 +96,7 @@ def _seen(what: str, timeout: str) -> Callable[[Callable[..., Any]], Callable[..
 
 
 def _with(options: Sequence[Callable[..., Any]], function: Callable[..., Any]) -> Callable[..., Any]:
-    """`function` with all of them, shown in this order."""
+    """Add all options to `function`, shown in this order."""
     for option in reversed(options):
         function = option(function)
     return function
@@ -285,7 +285,7 @@ def _objects(texts: tuple[str, ...]) -> dict[tuple[int, int], bytes]:
 
 @dataclass(frozen=True)
 class Files:
-    """What is written besides the table."""
+    """The files written in addition to the table."""
 
     junit: Path | None
     junit_flavour: str
@@ -305,7 +305,7 @@ def _judged(
     only: frozenset[str],
     fail_on: frozenset[Basis],
 ) -> int:
-    """Run it, show what was found, write the files. The exit code."""
+    """Run the test, show the results, write the files, and return the exit code."""
     from fieldtwin.cli.test.check_view import Progress, print_results
     from fieldtwin.conformance.clients.frame_log import MasterLog
     from fieldtwin.conformance.core.results import as_json as data_of

@@ -1,4 +1,4 @@
-"""What `fieldtwin check modbus` and `check canopen` share: options, the question, running with a bar, the files written."""
+"""Shared parts of `fieldtwin check modbus` and `check canopen`: options, confirmation, progress bar, output files."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 def shared(function: F) -> F:
-    """Options of every check of a device."""
+    """Add the options of every device check."""
     options = [
         click.option(
             "--allow", type=click.Choice(DANGERS), help="The most dangerous cases to play.  [default: read; write with --write]"
@@ -72,7 +72,7 @@ def shared(function: F) -> F:
 
 
 class Check:
-    """What the two commands have in common: the plan, the question, the files."""
+    """The common parts of the two commands: the plan, the confirmation, the files."""
 
     def __init__(self, protocol: str, endpoint: str, address: int, options: dict[str, Any]) -> None:
         self.protocol, self.endpoint, self.address, self.options = protocol, endpoint, address, options
@@ -80,7 +80,7 @@ class Check:
         self.interrupted = False
 
     def plan(self, cases: Sequence[DeviceCase[Any]], has: set[str], writes: bool) -> Plan:
-        """What may be played. Reads the waivers too: a wrong file is said before anything is sent."""
+        """Return the plan. Also read the waivers, so that an invalid file is reported before anything is sent."""
         from fieldtwin.cli.test.check_cases import only_of
         from fieldtwin.conformance.core.case import Danger
         from fieldtwin.conformance.core.waivers import Waivers, load_waivers
@@ -97,7 +97,7 @@ class Check:
         return Plan(only_of(self.options["only"], cases), Danger(allow), frozenset(has), self.options["for_s"])
 
     def ask(self, cases: Sequence[DeviceCase[Any]], plan: Plan, traits: frozenset[str]) -> None:
-        """Ask about what is more than reading. Raises `NotAllowed` where nobody can answer, `Abort` on a no."""
+        """Ask before anything except reading is sent. Raises `NotAllowed` without a terminal, `Abort` if the answer is no."""
         from fieldtwin.conformance.core.case import Danger
         from fieldtwin.conformance.devices.run import why_not
         from fieldtwin.console import talk
@@ -115,7 +115,7 @@ class Check:
         click.confirm("Play them?", abort=True, err=True)
 
     def done(self, subject: Subject, checked: Checked) -> int:
-        """Waive, write the files, show the table. The exit code."""
+        """Apply the waivers, write the files, show the table, and return the exit code."""
         from fieldtwin.cli.test.check_view import print_results
         from fieldtwin.conformance.core.results import exit_code, waive
         from fieldtwin.conformance.devices.results import as_json, as_report
@@ -144,9 +144,9 @@ class Check:
         return INTERRUPTED if self.interrupted else exit_code(results, fail_on)
 
     def play(self, most: int, check: Callable[..., Any]) -> Checked:
-        """Run ``check(taps, go_on, say, tell)`` with a bar, and with a log where one is wanted.
+        """Run ``check(taps, go_on, say, tell)`` with a progress bar, and with a log if requested.
 
-        Ctrl-C ends it behind the case that is played, a second one at once; what was lent is put back in any case.
+        Ctrl-C ends it after the present test case, a second one at once; changed values are restored in any case.
         """
         from fieldtwin.cli.test.check_view import Progress
         from fieldtwin.commissioning.access.frame_log import WireLog
@@ -173,7 +173,7 @@ class Check:
                     self.interrupted = True
                     talk.print("ends behind this case; Ctrl-C again: at once", markup=False)
 
-                with suppress(NotImplementedError):  # elsewhere than on Unix
+                with suppress(NotImplementedError):  # not on Unix
                     asyncio.get_running_loop().add_signal_handler(signal.SIGINT, stop)
                 checked: Checked = await task
                 return checked
@@ -195,7 +195,7 @@ class Check:
         )  # fmt: skip
 
     def estimate(self, on_paper: Checked) -> None:
-        """Say how many cases there are and how long they take with a device that answers at once."""
+        """Return the number of cases and their duration with a device that answers at once."""
         from fieldtwin.console import talk
 
         played = sum(bool(result.spoken) for result in on_paper.results)
@@ -205,7 +205,7 @@ class Check:
         )
 
     def on_paper(self, checked: Checked) -> int:
-        """What would be sent."""
+        """Print the frames of a dry run."""
         from fieldtwin.cli.test.check_view import print_paper
 
         print_paper(checked, as_json=self.options["as_json"])

@@ -1,4 +1,4 @@
-"""`fieldtwin check modbus` and `fieldtwin check canopen`: devices that we did not write are judged from outside."""
+"""`fieldtwin check modbus` and `fieldtwin check canopen`: conformance tests of third-party devices."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`fieldtwin check` on a terminal: how far it is, and the table of verdicts."""
+"""`fieldtwin check` on a terminal: the progress and the table of verdicts."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ STYLE = {
     Verdict.INCONCLUSIVE: "yellow", Verdict.SKIPPED: "dim",
 }  # fmt: skip
 FINDING = {Basis.ROBUSTNESS: "yellow", Basis.FIELD: "magenta"}
-"""Colours of failures that are no deviation from the standard: never red."""
+"""The colours of failures that do not deviate from the standard: never red."""
 BASIS = {Basis.STANDARD: "default", **FINDING}
 MARK = {
     Verdict.PASSED: "✓", Verdict.FAILED: "✗", Verdict.ERROR: "!", Verdict.INCONCLUSIVE: "?", Verdict.SKIPPED: "-",
@@ -42,7 +42,7 @@ DANGER = {"observe": "dim", "read": "cyan", "write": "yellow", "disrupt": "magen
 
 
 class Progress:
-    """A bar on a terminal; where there is none, only what fails is said as it comes."""
+    """A progress bar on a terminal; elsewhere failures are printed as they occur."""
 
     def __init__(self, most: int, at_first: str = "learning how it polls") -> None:
         self._bar = Bar(
@@ -59,11 +59,11 @@ class Progress:
         self._bar.stop()
 
     def say(self, text: str) -> None:
-        """A line of talk."""
+        """Print a diagnostic line."""
         talk.print(text, markup=False, soft_wrap=True)
 
     def tell(self, result: CaseResult) -> None:
-        """A case is done."""
+        """Report a finished case."""
         self._bar.update(self._task, advance=1, description=f"{result.case.id} {result.verdict.value}")
         if result.verdict.bad:
             mark = f"[{style_of(result)}]{MARK[result.verdict] if result.deviates else '!'}[/]"
@@ -75,19 +75,19 @@ class Progress:
 
 
 def style_of(result: CaseResult) -> str:
-    """The colour of a result: red only for a deviation from the standard."""
+    """Return the colour of a result: red only for a deviation from the standard."""
     return FINDING.get(result.case.basis, STYLE[result.verdict]) if result.verdict.bad else STYLE[result.verdict]
 
 
 def why(result: CaseResult) -> str:
-    """Why a failure counts, or that it does not: ``required by TG 4.4.1.3``, ``robustness`` or ``field problem``."""
+    """Return why a failure counts, or that it does not: ``required by TG 4.4.1.3``, ``robustness`` or ``field problem``."""
     return f"required by {result.case.required_by}" if result.deviates else called(result)
 
 
 def print_results(results: Sequence[CaseResult], does: str = "the device", *, all_wires: bool = False) -> None:
-    """The table on stdout, with what a case is about below `does`; without a terminal one line a case, nothing cut.
+    """Print the results on stdout, each description below `does`; without a terminal one uncut line per case.
 
-    Cases for other wires are only counted, unless `all_wires`.
+    Cases for other kinds of bus are only counted, unless `all_wires`.
     """
     elsewhere = [] if all_wires else [r for r in results if r.reason == OTHER_WIRE]
     results = [r for r in results if r not in elsewhere]
@@ -133,7 +133,7 @@ def _print_each(results: Sequence[CaseResult], does: str) -> None:
 def print_cases(
     cases: Sequence[About], does: str = "what the device does", must: str = "what the master must do"
 ) -> None:
-    """All cases, for `--list`: a table, or without a terminal one line for each case."""
+    """Print all cases for `--list`: a table, or without a terminal one line per case."""
     if not data.is_terminal:
         for case in cases:
             words = f"{case.title}: {case.does}; expected: {case.must} [{case.sources}]"
@@ -153,7 +153,10 @@ def print_cases(
 
 
 def listed(case: About) -> dict[str, Any]:
-    """The case for `--list --json`. `elsewhere` has its basis and clause on single kinds of wire, where they differ."""
+    """Return the case for `--list --json`.
+
+    `elsewhere` has its basis and clause on kinds of bus where they differ.
+    """
     keys = ("id", "title", "clause", "does", "must")
     elsewhere = [{"wire": e.wire, "basis": e.basis.value, "clause": e.clause} for e in case.elsewhere]
     return {k: getattr(case, k) for k in keys} | {
@@ -162,7 +165,7 @@ def listed(case: About) -> dict[str, Any]:
 
 
 def print_paper(checked: Checked, *, as_json: bool) -> None:
-    """What a check would send, case by case; what is not played is left out."""
+    """Print the frames that a check would send, case by case, without the cases that are not run."""
     played = [r for r in checked.results if r.spoken]
     if as_json:
         cases = [
@@ -192,7 +195,7 @@ def _sent(spoken: Sequence[Spoken]) -> list[str]:
 
 
 def _print_sent(frames: Sequence[str]) -> None:
-    """A frame a line; the same ones in a row once, with how often."""
+    """Print one frame per line; equal consecutive frames once, with their number."""
     for text, same in groupby(frames):
         times = len(list(same))
         data.print(f"  {text}" + (f"   x {times}" if times > 1 else ""), markup=False, soft_wrap=True)

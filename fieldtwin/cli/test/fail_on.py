@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from fieldtwin.conformance.core.results import CaseResult
 
 FAIL_ON = {"standard": 1, "robustness": 2, "field": 3}
-"""How many of the bases, in the order of `Basis`, decide the exit code."""
+"""The number of bases, in the order of `Basis`, that decide the exit code."""
 fail_on_option = click.option(
     "--fail-on", type=click.Choice(tuple(FAIL_ON)), default="standard", show_default=True,
     help="Which failed cases give exit code 1: those that the standard requires, also those of robustness, or also known "
@@ -28,7 +28,7 @@ def bases_of(choice: str) -> frozenset[Basis]:
 
 
 def print_not_counted(results: Sequence[CaseResult], fail_on: frozenset[Basis]) -> None:
-    """Say that failures are not counted, where there are any."""
+    """Print that failures are not counted, if there are any."""
     from fieldtwin.conformance.core.results import counts_as_failed
     from fieldtwin.console import talk
 

@@ -1,4 +1,4 @@
-"""`fieldtwin test`: scenarios, judged; a table for people, JSON, JUnit and HTML for others."""
+"""`fieldtwin test`: run scenarios and report the results as a table, JSON, JUnit XML or HTML."""
 
 from __future__ import annotations
 
@@ -223,7 +223,7 @@ def command(
 
 
 def _check_campaign(campaign: CampaignRequest, target: str, of_one_run: tuple[object, ...]) -> None:
-    """Raise `UsageError` where a campaign cannot do what the other options ask for."""
+    """Raise `UsageError` if a campaign cannot be combined with the other options."""
     campaign.check()
     if campaign.seeds and target != "virtual":
         raise UsageError(
@@ -236,7 +236,7 @@ def _check_campaign(campaign: CampaignRequest, target: str, of_one_run: tuple[ob
 
 
 def _controller(target: str, with_command: bool) -> tuple[str, tuple[str, ...]]:
-    """The target, and the user's program with its arguments. Raises `UsageError` where the two do not fit."""
+    """Return the target, and the user's program with its arguments. Raises `UsageError` if they do not fit together."""
     ctx = click.get_current_context()
     words: tuple[str, ...] = ctx.meta.get(_CONTROLLER, ())
     if not with_command:
@@ -306,7 +306,7 @@ def _show(result: object) -> None:
     table = Table(box=None, show_header=False, pad_edge=False)
     for check in result.checks:
         if check.verdict is not Verdict.PASSED:
-            if check.number not in result.reason.partition(":")[0].split():  # what the headline does not name
+            if check.number not in result.reason.partition(":")[0].split():  # not repeated from the headline
                 table.add_row(f"  {check.number}", escape(check.text))
             if check.expected:
                 table.add_row("  expected", escape(check.expected))
@@ -357,7 +357,7 @@ def _plain(result: object) -> dict[str, object]:
 
 
 def _machines(systems: list[System]) -> dict[SystemKey, tuple[Machine, ...]]:
-    """Return the state machines of each system, whose programs are made once."""
+    """Return the state machines of each system; its programs are created once."""
     from fieldtwin.reports.run.machines import machines_of
     from fieldtwin.results.model import key_of
 

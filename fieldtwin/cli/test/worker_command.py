@@ -1,4 +1,4 @@
-"""`fieldtwin test-host`: what the pytest plugin starts, and whoever tests drivers in another language."""
+"""`fieldtwin test-host`: the process that the pytest plugin starts, also for tests in other languages."""
 
 from __future__ import annotations
 

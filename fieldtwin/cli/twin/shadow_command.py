@@ -1,4 +1,4 @@
-"""`fieldtwin shadow`: a plant, or its prototype, watched from elsewhere by its digital shadow."""
+"""`fieldtwin shadow`: a digital shadow that follows a plant, or its prototype, from another computer."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ STYLE = {"mismatch": "bold red", "outside": "red", "bad": "yellow", "stale": "ye
 
 
 class ShadowTalk:
-    """Says each verdict as it is reached; that the states agree, when the state is another than before."""
+    """Prints each verdict as it is reached, and changes of the agreed state."""
 
     def __init__(self, *, quiet: bool) -> None:
         self._quiet = quiet
@@ -45,17 +45,17 @@ class ShadowTalk:
         talk.print(f"{when} {word} {escape(subject + verdict.text)}", soft_wrap=True)
 
     def trouble(self, where: str, text: str) -> None:
-        """What is wrong with thread or store, once, and that it is over."""
+        """Print the problems of thread or store once, and their end."""
         if not self._quiet:
             self.line(f"[bold yellow]{where:10}[/]", text or "all is well again")
 
     def line(self, word: str, text: str) -> None:
-        """Something of now, under a word as it is to be shown."""
+        """Print a line with the present time; `word` is its label."""
         talk.print(f"{_clock(datetime.now(UTC))} {word} {escape(text)}", soft_wrap=True)
 
 
 def _clock(when: datetime) -> str:
-    """The time of day, UTC, to the millisecond."""
+    """Return the time of day, UTC, to the millisecond."""
     return when.strftime("%H:%M:%S.%f")[:-3]
 
 
@@ -96,7 +96,7 @@ def command(
         print_shadow(seen)
     if not seen["origins"]:
         raise Unreachable(f"the plant's thread: {why_nothing(seen, place)}", where=place)
-    return 0 if seen["statuses"] and seen["agreed"] == seen["statuses"] else 1  # of no status, nothing is known
+    return 0 if seen["statuses"] and seen["agreed"] == seen["statuses"] else 1  # without a status there is no result
 
 
 async def _run(
@@ -113,14 +113,14 @@ async def _run(
 
 
 def why_nothing(seen: dict[str, Any], place: str) -> str:
-    """Of a shadow that was told nothing of its plant, which is at `place`: that need not be said twice."""
+    """Return why the shadow received nothing from its plant at `place`, without repeating the place."""
     thread = seen["thread"]
     why = str(thread.get("trouble") or thread.get("silent") or "no word of its log came")
     return why.removeprefix(f"{place}: ")
 
 
 def told_of(variables: dict[str, Any], undeclared: int) -> str:
-    """How many of the model's variables were heard of, and how many of them can be trusted."""
+    """Return how many of the model's variables were received, and how many of them can be trusted."""
     heard = [variable for variable in variables.values() if variable["t_ms"] is not None]
     good = sum(variable["quality"] == "good" for variable in heard)
     more = f"; {undeclared} values of others, which it does not declare" if undeclared else ""

@@ -1,4 +1,4 @@
-"""`fieldtwin twin`: a shadow with a way back: it plans, asks its model, and commands the plant."""
+"""`fieldtwin twin`: a digital twin: it plans, simulates, and commands the plant."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def command(
     The plant obeys while its own switch says `remote`, inside the limits and the rate in its own file, and no number twice.
     """
     folders = tuple(Path(p) for p in profiles)
-    runs_code = bool(horizon_s or planner)  # what a prototype or a planner in Python needs of a template
+    runs_code = bool(horizon_s or planner)  # for prototypes and planners in Python from a template
     agreed = consent(trust=trust or not runs_code)
     system = system_file(system, agreed, virtual=True, prototype_file=prototype_file, profiles=folders)
     loaded = load_system(system, folders)
@@ -128,7 +128,7 @@ def command(
 
 
 class TwinTalk(ShadowTalk):
-    """Says as well what is asked, sent and refused."""
+    """Prints, in addition, what is simulated, sent and refused."""
 
     def asks(self, command: COMMAND, question: Question) -> None:
         self._say("asks", f"a prototype of period {decode_period(command)} s, {question.horizon_s:g} s ahead")

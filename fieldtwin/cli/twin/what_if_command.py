@@ -1,4 +1,4 @@
-"""``fieldtwin what-if``: what would come of a command, a fault, or a whole plan."""
+"""``fieldtwin what-if``: simulate the effect of a command, a fault, or a whole plan."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ def command(
 
 
 def _ahead(seconds: float) -> str:
-    """A horizon as people say it."""
+    """Return a duration in the form that people use."""
     for unit, name in ((86_400, "d"), (3600, "h"), (60, "min")):
         if seconds >= 2 * unit:
             return f"{seconds / unit:g} {name}"

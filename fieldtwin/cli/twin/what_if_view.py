@@ -1,4 +1,4 @@
-"""What came of plans, as tables."""
+"""The results of plans, as tables."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _SHOWN = 40
 
 
 def show(console: Console, outcomes: Sequence[Outcome], units: Mapping[str, str]) -> None:
-    """Each plan: its verdict, its requirements, its states, its variables. `units` by the name of a tag."""
+    """Print each plan: its verdict, requirements, states and variables. `units` by tag name."""
     for outcome in outcomes:
         console.print()
         console.print(f"[bold]{escape(outcome.plan)}[/]: {'met' if outcome.met else 'not met'}", soft_wrap=True)

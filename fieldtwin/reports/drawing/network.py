@@ -1,6 +1,6 @@
-"""A network as a map: its systems where their modems are, a line between two that hear each other, how far and how long.
+"""A network as a map: the positions of its systems, with distance and delay between those that hear each other.
 
-Facts out of a loaded network, as text and as SVG; opens nothing.
+Takes a loaded network, returns text and SVG; opens nothing.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from fieldtwin.reports.markup import Markup, el
 from fieldtwin.twin.network.network import SHIP, Network
 
 WIDE, HIGH, LOW = 760.0, 420.0, 120.0
-"""Room for the places, in px: its width, its greatest and its smallest height."""
+"""The area for the places, in px: its width, its greatest and its smallest height."""
 AROUND = 110.0
-"""Room for the texts of those at the edge, in px."""
+"""The margin for the labels of places at the edge, in px."""
 
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Who is there: a system with its file and devices, or the ship. `at_m` as the file says it."""
+    """A member: a system with its file and devices, or the topside controller. `at_m` as in the file."""
 
     name: str
     system: str
@@ -32,7 +32,7 @@ class Place:
 
 @dataclass(frozen=True, slots=True)
 class Way:
-    """Two that hear each other: how far apart, and how long sound takes."""
+    """Two members that hear each other, with their distance and the sound's travel time."""
 
     one: str
     other: str
@@ -46,7 +46,7 @@ class Way:
 
 @dataclass(frozen=True, slots=True)
 class Map:
-    """A network's places, the ways between them, and the water in words."""
+    """A network's places, the ways between them, and a description of the acoustic channel."""
 
     network: str
     water: str
@@ -54,12 +54,12 @@ class Map:
     ways: tuple[Way, ...]
 
     def as_data(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the map as JSON data."""
         return asdict(self)
 
 
 def network_map(network: Network) -> Map:
-    """The map of `network`."""
+    """Return the map of `network`."""
     water, members = network.water, network.members
     where = network.places
     places = [Place(name, m.system.name, tuple(m.system.devices), tuple(where[name])) for name, m in members.items()]
@@ -72,7 +72,7 @@ def network_map(network: Network) -> Map:
 
 
 def text(drawn: Map) -> str:
-    """A line for each place: what is there, and whom it hears."""
+    """Return a line for each place: what is there, and which members it hears."""
     names = max(len(place.name) for place in drawn.places)
     systems = max(len(place.system) for place in drawn.places)
     lines = [f"{drawn.network} (network of prototypes)", f"water: {drawn.water}"]
@@ -87,7 +87,7 @@ def text(drawn: Map) -> str:
 
 
 def svg(drawn: Map) -> str:
-    """The map as SVG: x to the right, y up, depth in words."""
+    """Return the map as SVG: x to the right, y up, depth as text."""
     spots, height = _spots(drawn)
     width = WIDE + 2 * AROUND
     parts = [_way(way, spots) for way in drawn.ways]
@@ -102,7 +102,7 @@ def svg(drawn: Map) -> str:
 
 
 def _spots(drawn: Map) -> tuple[dict[str, tuple[float, float]], float]:
-    """Where each place is drawn, all in one scale, and the drawing's height."""
+    """Return the drawn position of each place, all in one scale, and the drawing's height."""
     xs, ys = [p.at_m[0] for p in drawn.places], [p.at_m[1] for p in drawn.places]
     across, up = max(xs) - min(xs), max(ys) - min(ys)
     scale = min(WIDE / across if across else 1e9, HIGH / up if up else 1e9) if across or up else 1.0
@@ -125,7 +125,7 @@ def _way(way: Way, spots: dict[str, tuple[float, float]]) -> list[Markup]:
 
 
 def _place(place: Place, spot: tuple[float, float], taken: list[tuple[float, float, float, float]]) -> list[Markup]:
-    """A dot, with its texts below it, or above where another one's are."""
+    """Draw a dot, with its texts below it, or above if another label is there."""
     metres = ", ".join(f"{m:g}" for m in place.at_m) + " m"
     rows = [(place.name, "name"), (place.system, ""), (", ".join(place.devices), "soft"), (metres, "soft")]
     rows = [row for row in rows if row[0]]

@@ -1,7 +1,7 @@
-"""The wires of a system as SVG: the controller on the left, a line for each bus, its devices hanging below it.
+"""The buses of a system as SVG: the controller on the left, a line for each bus, its devices below the line.
 
-One file without a font, a page or a script from elsewhere. It has its own ground and follows the reader's light or dark, and
-what is emulated is dashed. Pure: facts in, text out.
+One file that uses no external font, page or script. It draws its own background and follows the reader's light or dark theme;
+emulated parts are dashed. Pure: facts in, text out.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ CHAR = 7.25
 LINE = 16.0
 EDGE = 20.0
 ROOM = 1000.0
-"""How wide a drawing gets before devices go into another row."""
+"""A wider drawing puts devices into another row."""
 LONGEST = 44
 WIRE, LOGIC = 90, 34
-"""Characters of a text, at most, in a device's box, beside a wire, in the controller; all of it is shown to who points at it."""
+"""The maximum length of a text in a device's box, next to a bus, in the controller. A tooltip shows the whole text."""
 
 STYLE = Markup("""
 svg.wires { font: 12px ui-monospace, SFMono-Regular, Menlo, Consolas, "DejaVu Sans Mono", monospace;
@@ -35,7 +35,7 @@ svg.wires { font: 12px ui-monospace, SFMono-Regular, Menlo, Consolas, "DejaVu Sa
 
 
 def svg(wires: Wiring) -> str:
-    """The drawing of `wires`, with a line's end."""
+    """Return the drawing of `wires`, with a final line feed."""
     controller, left_width, left_height = _controller(wires)
     left = EDGE + left_width
     parts: list[Markup] = []
@@ -55,7 +55,7 @@ def svg(wires: Wiring) -> str:
 
 
 def document(title: str, width: float, height: float, *parts: Child) -> str:
-    """A drawing as a file of its own, with ground and looks; a line for each mark."""
+    """Return a drawing as a complete file, with background and styles; a line for each mark."""
     whole = el(
         "svg",
         el("title", title),
@@ -81,12 +81,12 @@ def _width(rows: list[tuple[str, str]], most: int = LONGEST) -> float:
 
 
 def _lines(x: float, y: float, rows: list[tuple[str, str]], most: int = LONGEST) -> list[Markup]:
-    """Texts below each other, each with its class; the first one's base line is at `y`."""
+    """Return texts below each other, each with its class; the base line of the first is at `y`."""
     return [_text(x, y + n * LINE, words, cls, most) for n, (words, cls) in enumerate(rows)]
 
 
 def _controller(wires: Wiring) -> tuple[list[Markup], float, float]:
-    """What is inside the box on the left, and that box's width and smallest height: the gateway, its PLC, what it answers."""
+    """Return the content of the box on the left, and its width and smallest height: the gateway, its PLC, its servers."""
     logic: list[tuple[str, str]] = [("PLC", "name")]
     for program in wires.programs:
         logic += [
@@ -107,7 +107,7 @@ def _controller(wires: Wiring) -> tuple[list[Markup], float, float]:
 
 
 def _wire(wire: Wire, left: float, top: float) -> tuple[Markup, float, float]:
-    """A bus from the controller's edge at `left`: the drawing, its width from there, its height."""
+    """Return a bus that starts at the controller's edge at `left`: the drawing, its width from there, its height."""
     dashed = " emulated" if wire.stand_in else ""
     head = [(f"{wire.name}  {wire.kind}" + (f", {wire.rate}" if wire.rate else ""), "name"), (wire.endpoint, "")]
     if wire.stand_in:
@@ -154,7 +154,7 @@ def _rows(station: Station) -> list[tuple[str, str]]:
 
 
 def _box(x: float, y: float, width: float, tall: float, rows: list[tuple[str, str]], dashed: str) -> list[Markup]:
-    """A device below the line at `y`, with its drop."""
+    """Return the box of a device below the line at `y`, with its drop cable."""
     return [
         el("path", cls="line" + dashed, d=f"M{x + width / 2:.1f},{y:.1f} V{y + 22:.1f}"),
         el("rect", cls="box" + dashed, x=x, y=y + 22, width=width, height=tall, rx=6),

@@ -1,4 +1,4 @@
-"""The wires of a system as lines of text, for a terminal and for whoever reads a pipe. Knows nothing of terminals."""
+"""The buses of a system as lines of text, for a terminal or a pipe. It does not know the terminal."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ Cells = tuple[str, ...]
 
 
 def tree(wires: Wiring, columns: int = 1000) -> str:
-    """A tree: the system, its buses with their devices, its programs, what it serves.
+    """Return a tree: the system, its buses with their devices, its programs, its servers.
 
-    What does not fit into `columns` characters goes on in a line below, between cells.
+    Text longer than `columns` characters continues on the next line, between cells.
     """
     branches: list[tuple[str, str, list[Cells]]] = [
         (wire.name, _wire_line(wire), [_station_cells(station) for station in wire.stations]) for wire in wires.wires

@@ -1,6 +1,6 @@
-"""Who hangs on which wire of a system, as facts for a drawing: controller, buses, devices, what stands in for them.
+"""The facts of a drawing: controller, buses, devices, and their emulators.
 
-Reads a loaded system and, for a prototype, its file; opens nothing and draws nothing.
+Takes a loaded system and, for a prototype, its file; opens nothing and draws nothing.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from fieldtwin.twin.site.system import System
 
 @dataclass(frozen=True, slots=True)
 class Station:
-    """A device where it hangs: its address, how often it is asked, what may be written to it. `plays`: what stands in for it."""
+    """A device on its bus: its address, its poll period, its writable outputs. `plays`: what emulates it."""
 
     name: str
     device: str
@@ -30,7 +30,7 @@ class Station:
 
 @dataclass(frozen=True, slots=True)
 class Wire:
-    """A bus with the plant's endpoint. `stand_in`: where its emulators listen; empty where it is the plant's own."""
+    """A bus with the plant's endpoint. `stand_in`: where its emulators listen; empty if the real bus is used."""
 
     name: str
     kind: str
@@ -42,7 +42,7 @@ class Wire:
 
 @dataclass(frozen=True, slots=True)
 class Logic:
-    """A program of the PLC: where it comes from, and how many variables are bound to tags."""
+    """A program of the PLC: its source, and the number of variables that are bound to tags."""
 
     name: str
     source: str
@@ -53,7 +53,7 @@ class Logic:
 
 @dataclass(frozen=True, slots=True)
 class Server:
-    """What the gateway answers others with: tags as registers, or units of a bus."""
+    """A server of the gateway: it serves tags as registers, or units of a bus."""
 
     name: str
     endpoint: str
@@ -62,7 +62,7 @@ class Server:
 
 @dataclass(frozen=True, slots=True)
 class Wiring:
-    """A system's wires. `prototype`: at least the file of one was asked for."""
+    """A system's buses. `prototype`: a prototype file was requested."""
 
     system: str
     prototype: bool
@@ -71,12 +71,12 @@ class Wiring:
     servers: tuple[Server, ...]
 
     def as_data(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the wiring as JSON data."""
         return asdict(self)
 
 
 def wiring(system: System, prototype: Prototype | None = None) -> Wiring:
-    """The wires of `system`; with `prototype`, what stands in for each of them as well."""
+    """Return the wiring of `system`; with `prototype`, also the emulators of each bus."""
     return Wiring(
         system.name,
         prototype is not None,

@@ -1,4 +1,4 @@
-"""What stands above the JSON of a verb, so that a site acceptance document knows which device, who, when, by which words."""
+"""The header of a command's JSON, from which the site acceptance document takes device, user, time and command line."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from fieldtwin.results.subject import who
 def headed(
     kind: str, protocol: str, endpoint: str, address: int, against: str, *, device: str = "", when: str = ""
 ) -> dict[str, Any]:
-    """``{"kind": "fieldtwin compare", "version": 1, "about": {...}}`` to put in front of what the verb found.
+    """Return ``{"kind": "fieldtwin compare", "version": 1, "about": {...}}`` to put before a command's results.
 
-    `endpoint` is empty where no live device was asked, `device` then says what stands for it; `against` is what it was held
-    against. `when` is ISO 8601, now if not said.
+    `endpoint` is empty if there was no live device; `device` then names the file that stands for it. `against` is the
+    reference. `when` is ISO 8601, now by default.
     """
     return {
         "kind": f"fieldtwin {kind}",

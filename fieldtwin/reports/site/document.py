@@ -1,4 +1,4 @@
-"""What a site acceptance document is made of: devices, what was done to each, what deviated, the files that say so."""
+"""The data of a site acceptance document: devices, actions, deviations, and the files that prove them."""
 
 from __future__ import annotations
 
@@ -8,15 +8,17 @@ from typing import Any, Literal
 
 Kind = Literal["check", "dump", "comparison", "difference"]
 Weight = Literal["deviation", "robustness", "field problem", "open", "waived"]
-"""A deviation contradicts the standard or the reference; the operator accepts it or has it corrected. No clause
-requires what a robustness finding or a known field problem is about. An open point could not be decided. A waived deviation
-has an owner."""
+"""A deviation contradicts the standard or the reference; the operator accepts it or has it corrected.
+
+Robustness findings and known field problems break no clause. An open point could not be decided. A waived deviation has an
+owner.
+"""
 SERIAL = "serial number"
 
 
 @dataclass(frozen=True, slots=True)
 class Deviation:
-    """Something that is not as it must be. `where` is an address or a case, `source` the standard's clause or the reference."""
+    """A finding. `where` is an address or a case, `source` the standard's clause or the reference."""
 
     weight: Weight
     what: str
@@ -28,20 +30,21 @@ class Deviation:
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Something to be printed as it is. `rows` have as many texts as there are `columns`."""
+    """A table to print as it is. Each row has one text for each of the `columns`."""
 
     title: str
     columns: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
     left_out: int = 0
-    """Rows that there is no room for."""
+    """Number of rows that were left out for lack of space."""
 
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """One file: something that was done to one device. `facts` are in the order in which people read them.
+    """One file: the result of one action on one device.
 
-    `protocol`, `address` and `endpoint` say which device; `verdict` is one word, `summary` one line.
+    `facts` are in reading order. `protocol`, `address` and `endpoint` identify the device; `verdict` is one word, `summary` one
+    line.
     """
 
     kind: Kind
@@ -61,7 +64,7 @@ class Piece:
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """A file as it was read: its name, size and SHA-256, so that nobody argues about another one later."""
+    """A file as it was read: its name, size and SHA-256, which prove later that it is the same file."""
 
     name: str
     size: int
@@ -74,7 +77,7 @@ class Source:
 
 @dataclass
 class Device:
-    """One device: all pieces with the same protocol, wire and address. `label` and `serial` may be said by the user."""
+    """One device: all pieces with the same protocol, bus and address. The user can set `label` and `serial`."""
 
     number: int
     protocol: str
@@ -86,12 +89,12 @@ class Device:
 
     @property
     def name(self) -> str:
-        """``unit 1``, ``node 5``."""
+        """Return ``unit 1``, ``node 5``."""
         return f"{'node' if self.protocol == 'canopen' else 'unit'} {self.address}"
 
     @property
     def identity(self) -> dict[str, str]:
-        """What it says of itself, in all pieces; the latest word counts."""
+        """Return the device's identification from all pieces; the latest value counts."""
         said: dict[str, str] = {}
         for piece in sorted(self.pieces, key=lambda piece: piece.when):
             said.update(piece.identity)
@@ -99,20 +102,23 @@ class Device:
 
     @property
     def serial(self) -> str:
-        """What the user says, else what the device says; empty where nobody does. A CANopen node says 0 for none."""
+        """Return the serial number that the user gave, else the device's own, else an empty text.
+
+        A CANopen node has 0 for none.
+        """
         said = self.identity.get(SERIAL, "")
         return self.serial_said or ("" if said.split(" ")[0] == "0" else said)
 
     @property
     def type(self) -> str:
-        """Maker and product, as far as it says; else the profile by which it was read."""
+        """Return maker and product if the device reports them; else the profile with which it was read."""
         said = self.identity
         words = [said.get(name, "") for name in ("vendor", "product", "name", "product code", "model", "server id")]
         return ", ".join(dict.fromkeys(word for word in words if word)) or said.get("profile", "")
 
     @property
     def revision(self) -> str:
-        """Its revision, hardware and software, as far as it says."""
+        """Return its revisions of hardware and software, if it reports them."""
         said = self.identity
         named = (("revision", ""), ("hardware", "hardware "), ("software", "software "))
         return ", ".join(prefix + said[name] for name, prefix in named if said.get(name))
@@ -120,7 +126,7 @@ class Device:
 
 @dataclass(frozen=True)
 class Document:
-    """The whole. `prepared` is ISO 8601 in UTC."""
+    """The whole document. `prepared` is ISO 8601 in UTC."""
 
     site: str
     by: str
@@ -132,7 +138,7 @@ class Document:
 
     @property
     def deviations(self) -> list[tuple[Device, Piece, Deviation]]:
-        """All of them, those to be decided on first."""
+        """Return all deviations, those that need a decision first."""
         order = {weight: at for at, weight in enumerate(("deviation", "open", "robustness", "field problem", "waived"))}
         found = [(d, p, deviation) for d in self.devices for p in d.pieces for deviation in p.deviations]
         return sorted(found, key=lambda each: order[each[2].weight])
@@ -141,7 +147,7 @@ class Document:
         return sum(deviation.weight == weight for _, _, deviation in self.deviations)
 
     def as_json(self) -> dict[str, Any]:
-        """For programs."""
+        """Return the document as JSON data."""
         return {
             "kind": "fieldtwin site report",
             "version": 1,

@@ -1,6 +1,6 @@
-"""The site acceptance document: one HTML file that is printed and signed. No network, no script.
+"""The site acceptance document: one HTML file to print and sign, without network access or scripts.
 
-Made for paper: A4, black on white with or without colour, every word in it readable without a screen. Nothing is folded away.
+It is designed for paper: A4, readable in black and white, with all content visible.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ WORDS = {
     "waived": "waived",
 }  # fmt: skip
 NOTED: dict[Weight, str] = {"robustness": "robustness finding", "field problem": "known field problem"}
-"""Findings that are no deviation, as counted in the result."""
+"""Findings that do not deviate from the standard, as counted in the result."""
 
 
 def write_html(document: Document, path: Path) -> None:
-    """Write it; raises `FileInvalid` where that is not possible."""
+    """Write the page. Raises `FileInvalid` if it cannot be written."""
     put(path, render_html(document))
 
 
 def render_html(document: Document) -> str:
-    """The whole page."""
+    """Return the whole page."""
     body = [
         _header(document),
         el("h2", "1 Devices"),
@@ -46,14 +46,14 @@ def render_html(document: Document) -> str:
 
 
 def day(when: str) -> str:
-    """``2026-11-21 11:33 UTC`` of ISO 8601."""
+    """Return ``2026-11-21 11:33 UTC`` for an ISO 8601 time."""
     if len(when) < 16 or when[10:11] != "T":
         return when
     return f"{when[:10]} {when[11:16]}" + (" UTC" if when.endswith(("+00:00", "Z")) else "")
 
 
 def plural(count: int, word: str) -> str:
-    """``no deviation``, ``1 deviation``, ``2 deviations``."""
+    """Return ``no deviation``, ``1 deviation``, ``2 deviations``."""
     return f"{count or 'no'} {word}{'' if count in (0, 1) else 's'}"
 
 
@@ -81,7 +81,7 @@ def _header(document: Document) -> Markup:
 
 
 def _span(document: Document) -> str:
-    """From the first to the last of all that was done."""
+    """Return the time from the first to the last action."""
     times = sorted(piece.when for device in document.devices for piece in device.pieces if piece.when)
     if not times:
         return ""
@@ -97,7 +97,7 @@ def _facts(facts: list[tuple[str, str]]) -> Markup:
 
 
 def _grid(columns: tuple[str, ...], rows: list[list[object]], widths: tuple[int, ...] = ()) -> Markup:
-    """A table; `widths` in per cent."""
+    """Return a table; `widths` in per cent."""
     cells = [[el("td", cell if isinstance(cell, Markup) else str(cell)) for cell in row] for row in rows]
     sized = el("colgroup", [el("col", style=f"width:{width}%") for width in widths]) if widths else Markup("")
     head = el("thead", el("tr", [el("th", name) for name in columns]))
@@ -159,7 +159,7 @@ def _deviation(number: int, device: Device, deviation: Deviation) -> list[object
     ]  # fmt: skip
 
 
-# -- what was done -----------------------------------------------------------------------------------------------------------
+# -- actions -----------------------------------------------------------------------------------------------------------
 
 
 def _device(device: Device) -> Markup:

@@ -1,6 +1,6 @@
-"""Files into pieces: whose file is this, and what does it say. Every kind of file is read in a function of its own.
+"""Read files for the site acceptance document: find each file's device and results.
 
-Whatever a file holds ends as text in a document: nothing in it is trusted to be what it should be.
+Each kind of file has a function. The content is not trusted: all of it becomes text of the document.
 """
 
 from __future__ import annotations
@@ -20,23 +20,22 @@ from fieldtwin.reports.site.document import Deviation, Device, Document, Kind, P
 from fieldtwin.reports.site.reading_dump import dump_piece
 
 MOST_BYTES = 1 << 28
-"""Of one JSON file; dumps are read line by line."""
+"""Limit for one JSON file; dumps are read line by line."""
 MOST_ROWS = 200
-"""Of a table: more are for a file, not for paper."""
+"""Limit for the rows of one table: longer lists belong in a file, not on paper."""
 SUFFIXES = (".json", ".jsonl")
 
 
 class NotTaken(FileInvalid):
-    """A file of another kind: nothing that goes into a document."""
+    """The file is of a kind that does not belong into the document."""
 
 
 def read_site(
     paths: Iterable[Path], *, site: str, by: str, prepared: str, customer: str = "", remarks: str = ""
 ) -> tuple[Document, list[str]]:
-    """The document of all files, and of folders those of the kinds that it takes; and what was left out of these, and why.
+    """Return the document of all files, and the files of folders that were left out, with the reason.
 
-    Raises `FileInvalid` for a file that was named and is none of them, and for one that is damaged wherever it is; `UsageError`
-    where there is nothing.
+    Raises `FileInvalid` for a named file of an unsuitable kind, and for any damaged file; `UsageError` without any file.
     """
     pieces: list[tuple[Path, Piece]] = []
     left_out: list[str] = []
@@ -80,7 +79,7 @@ def _source(path: Path, piece: Piece) -> Source:
 
 
 def read_piece(path: Path) -> Piece:
-    """One file. Raises `FileInvalid` where it is none that belongs into a document."""
+    """Read one file. Raises `FileInvalid` if it does not belong into the document."""
     try:
         with path.open("rb") as file:
             head = file.readline(1 << 20)
@@ -109,7 +108,7 @@ def read_piece(path: Path) -> Piece:
 
 
 def check_piece(data: dict[str, Any]) -> Piece:
-    """The JSON of `fieldtwin check modbus|canopen`."""
+    """Read the JSON of `fieldtwin check modbus|canopen`."""
     about, cases, counts = data["about"], data["cases"], data["counts"]
     weights: dict[str, Weight] = {"failed": "deviation", "error": "deviation", "inconclusive": "open"}
     deviations = []
@@ -154,7 +153,7 @@ def check_piece(data: dict[str, Any]) -> Piece:
 
 
 def _weight(case: dict[str, Any]) -> Weight:
-    """How much a failed case weighs: as its file says, or as its case says where the file is older than that (version 1)."""
+    """Return the weight of a failed case: from its file, or from its test case if the file is older (version 1)."""
     said = case.get("basis") or bases().get(str(case["id"]), Basis.STANDARD.value)
     weights: dict[str, Weight] = {Basis.ROBUSTNESS.value: "robustness", Basis.FIELD.value: "field problem"}
     return weights.get(said, "deviation")
@@ -162,7 +161,7 @@ def _weight(case: dict[str, Any]) -> Weight:
 
 @cache
 def bases() -> dict[str, str]:
-    """Case id -> the value of its basis, for all cases for devices."""
+    """Return the value of the basis by case ID, for all cases for devices."""
     from fieldtwin.conformance.devices.canopen import cases as canopen_cases
     from fieldtwin.conformance.devices.modbus import cases as modbus_cases
 
@@ -179,7 +178,7 @@ def _case(case: dict[str, Any], weight: Weight) -> Deviation:
 
 
 def compare_piece(data: dict[str, Any]) -> Piece:
-    """The JSON of `fieldtwin compare`: a device against a recording."""
+    """Read the JSON of `fieldtwin compare`: a device against a recording."""
     about, found = data["about"], data["differences"]
     alike_ones: dict[tuple[str, ...], list[dict[str, Any]]] = {}
     for each in found:
@@ -209,7 +208,7 @@ def compare_piece(data: dict[str, Any]) -> Piece:
     latency = [(r["service"], r["count"], _ms(r["recorded_s"]), _ms(r["other_s"])) for r in data["latency"]]
     tables = (_table("Latency: median, 90 %, 99 %", ("function", "exchanges", "recorded", "this one"), latency),)
     summary = f"{data['compared']} exchanges, {alike} alike"
-    if data["met"]:  # what is allowed by the share that was asked for is no deviation
+    if data["met"]:  # a difference within the allowed share is not a deviation
         deviations = [
             replace(d, weight="waived", found=f"{d.found}; within the share that was asked for") for d in deviations
         ]
@@ -218,7 +217,7 @@ def compare_piece(data: dict[str, Any]) -> Piece:
 
 
 def _difference(same: list[dict[str, Any]]) -> Deviation:
-    """What differed in one place, however often: the first time as an example."""
+    """Return all differences in one place as one finding, with the first as an example."""
     first = same[0]
     what, request, recorded, other, where = (str(first[k]) for k in ("what", "request", "recorded", "other", "where"))
     often = f", {len(same)} times, first" if len(same) > 1 else ","
@@ -231,7 +230,7 @@ def _ms(quantiles: list[float]) -> str:
 
 
 def diff_piece(data: dict[str, Any]) -> Piece:
-    """The JSON of `fieldtwin diff`: a dump against another one, or against a profile or an EDS."""
+    """Read the JSON of `fieldtwin diff`: a dump against another one, or against a profile or an EDS."""
     about, found = data["about"], data["found"]
     deviations = [
         Deviation("deviation", f"{d['name']}: {d['kind']}", str(d["right"]), str(d["left"]), str(d["at"]))
@@ -256,7 +255,7 @@ def _headed(
     deviations: list[Deviation],
     tables: tuple[Table, ...],
 ) -> Piece:
-    """A piece of what `about.headed` stands above."""
+    """Return a piece for JSON with the header of `about.headed`."""
     where = str(about["endpoint"]) or str(about["device"])
     return Piece(
         kind, str(about["protocol"]), int(about["address"]), where, str(about["started"]), str(about["by"]), verdict, summary,

@@ -1,4 +1,4 @@
-"""A dump as a piece of a document: what was read, what refused, how fast it answered, and who the device is."""
+"""A dump as a piece of the document: readable and refused ranges, response times, and the device's identification."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ NUMBERS = {
 
 
 def dump_piece(path: Path) -> Piece:
-    """Raises `FileInvalid` as `load_dump`."""
+    """Read a dump. Raises `FileInvalid` like `load_dump`."""
     dump = load_dump(path)
     header = dump.header
     cells = sum(len(each.cells) for each in dump.passes)
@@ -49,8 +49,10 @@ def dump_piece(path: Path) -> Piece:
 
 
 def _verdict(dump: Dump) -> str:
-    """``whole`` only of a dump that ended and asked for each address with a definite answer. ``sampled``: it left out addresses
-    between others that were answered alike."""
+    """Return the verdict: ``whole`` only if the dump is complete and every address gave a definite answer.
+
+    ``sampled``: it left out addresses between others with the same answer.
+    """
     if not dump.ended:
         return "broken off"
     if dump.is_mostly_unknown:
@@ -61,7 +63,7 @@ def _verdict(dump: Dump) -> str:
 
 
 def identity(dump: Dump) -> dict[str, str]:
-    """What the device says of itself: a CANopen node in its objects, a Modbus device by functions 2B/0E and 11."""
+    """Return the device's identification: a CANopen node's objects, a Modbus device's answers to functions 2B/0E and 11."""
     said: dict[str, str] = {}
     if dump.header.get("profile"):
         said["profile"] = str(dump.header["profile"])
@@ -81,7 +83,7 @@ def identity(dump: Dump) -> dict[str, str]:
 
 
 def _raw(dump: Dump, function: int) -> bytes:
-    """What that function answered, empty where it did not."""
+    """Return the data that the function returned; empty if there was no answer."""
     try:
         return bytes.fromhex(dump.functions.get(function, {}).get("hex", ""))
     except (TypeError, ValueError):
@@ -114,7 +116,7 @@ def _spans(texts: Any, most: int = 8) -> str:
 
 
 def _places(found: dict[str, Any], key: str) -> str:
-    """The ranges in which every address has that state, and of the sampled ones how many have it."""
+    """Return the ranges in which every address has that state; for sampled ranges, how many have it."""
     sampled = [
         f"{s['asked'] if key != 'not_asked' else s['addresses'] - s['asked']} of {s['range']}"
         for s in found.get("sampled", [])
@@ -124,7 +126,7 @@ def _places(found: dict[str, Any], key: str) -> str:
 
 
 def _longest(found: dict[str, Any]) -> str:
-    """The longest read that was taken; without a refused longer one it is a lower bound."""
+    """Return the longest accepted read; it is a lower bound if no longer one was refused."""
     if not found.get("max_read"):
         return ""
     return str(found["max_read"]) if found.get("limit_proved") else f"{found['max_read']} or more"

@@ -1,4 +1,4 @@
-"""The looks of the site acceptance document: paper first. Colour never says anything alone."""
+"""The style sheet of the site acceptance document, designed for paper. Colour is never the only sign of a result."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""A recorded run as a scenario: what came in becomes its stimuli, what followed its expectations, with tolerance and window.
+"""Turn a recorded run into a scenario: its inputs become stimuli, its outputs expectations with tolerance and window.
 
-Stimuli are the commands of the far end, faults and, where asked for, what devices said; the emulators of the scenario's prototype
-play their recordings by themselves. Pure: a `Story` in, text out.
+Stimuli are the commands of the remote client, faults and, on request, device values; the emulators of the scenario's prototype
+replay their recordings without stimuli. Pure: a `Story` in, text out.
 """
 
 from __future__ import annotations
@@ -21,20 +21,23 @@ from fieldtwin.scenarios.regression.run_history import Change, Story
 from fieldtwin.twin.site.system import System
 
 BRIEF_NS = 200_000_000
-"""A state that lasted less is not waited for: a check might come too late for it."""
+"""A shorter state is not expected: a check could come too late."""
 RESTLESS = 3
-"""A tag that changes more often between two stimuli is compared with what its device holds, not with one value."""
+"""A tag that changes more often between two stimuli is compared with the device's register, not with a value."""
 MOST_STEPS = 5_000
 AHEAD_NS = 200_000_000
-"""Tags are looked at so long before the next stimulus."""
+"""Time before the next stimulus at which tags are compared."""
 STOPPING_NS = 2 * NS_PER_S
-"""The end of a run is its outputs being made safe and its devices leaving: nothing that is expected again."""
+"""At the end of a run, outputs become safe and devices leave: these changes are not expected again."""
 
 
 @dataclass(frozen=True)
 class Wanted:
-    """How the scenario is to be. `share` of a value is its tolerance, `window_s` how long after its time something may come.
-    `values`: what devices said is set, too (for a prototype that plays something else)."""
+    """The options of the scenario.
+
+    `share` of a value is its tolerance, `window_s` the allowed delay. `values`: device values are set, too (for a prototype
+    that replays something else).
+    """
 
     name: str
     system: str
@@ -53,7 +56,10 @@ class _Stimulus:
 
 
 def as_scenario(system: System, story: Story, wanted: Wanted) -> str:
-    """The scenario file. Raises `UsageError` for a run of which nothing can be expected, or with more than a scenario takes."""
+    """Return the scenario file.
+
+    Raises `UsageError` for a run without anything to expect, or with more steps than a scenario allows.
+    """
     stimuli = sorted(_stimuli(system, story, wanted), key=lambda s: s.t_ns)
     steps = list(_steps(system, story, wanted, stimuli))
     if not any("expect:" in step for step in steps):
@@ -70,7 +76,7 @@ def as_scenario(system: System, story: Story, wanted: Wanted) -> str:
 
 
 def _faults(story: Story) -> Iterator[_Stimulus]:
-    """Faults put in and taken away, with all that was said of them."""
+    """Return the steps that start and end faults, with all their parameters."""
     for event in story.faults:
         if not event.data.get("on"):
             yield _Stimulus(event.t_ns, f"clear: {json.dumps(event.where)}")
@@ -84,7 +90,7 @@ def _stimuli(system: System, story: Story, wanted: Wanted) -> Iterator[_Stimulus
         try:
             yield _Stimulus(came.t_ns, f"send: {{period_s: {decode_period(COMMAND(came.payload))}}}")
         except FieldtwinError:
-            continue  # no command that a scenario can send: what the system made of it is expected all the same
+            continue  # not a command that a scenario can send; its effects are expected all the same
     yield from _faults(story)
     if not wanted.values:
         return
@@ -100,7 +106,7 @@ def _stimuli(system: System, story: Story, wanted: Wanted) -> Iterator[_Stimulus
 
 
 def _steps(system: System, story: Story, wanted: Wanted, stimuli: list[_Stimulus]) -> Iterator[str]:
-    """Time goes by in pauses; an expectation that is met in time takes as long as it did in the run."""
+    """Return pauses and expectations; an expectation that is met in time takes as long as in the run."""
     now_ns = 0
     last_ns = max(0, story.end_ns - STOPPING_NS)
     bounds = [*(s.t_ns for s in stimuli), last_ns]
@@ -128,11 +134,11 @@ def _steps(system: System, story: Story, wanted: Wanted, stimuli: list[_Stimulus
             now_ns = look_ns
             yield from _looks(
                 system, story, wanted, begin_ns, look_ns
-            )  # of what has moved; of all that there is at the end
+            )  # of the fields that changed; at the end of all fields
 
 
 def _seen(story: Story, wanted: Wanted, begin_ns: int, end_ns: int) -> Iterator[tuple[int, str]]:
-    """What programs said in between, that lasted long enough to be seen."""
+    """Return the expected values of programs that lasted long enough to be observed."""
     for name, changes in story.states.items():
         for n, change in enumerate(changes):
             until_ns = changes[n + 1].t_ns if n + 1 < len(changes) else story.end_ns
@@ -145,7 +151,7 @@ def _seen(story: Story, wanted: Wanted, begin_ns: int, end_ns: int) -> Iterator[
 
 
 def _looks(system: System, story: Story, wanted: Wanted, begin_ns: int, look_ns: int) -> Iterator[str]:
-    """What everything is at the end of such a time: numbers of programs, tags by value, or like what their device holds."""
+    """Return the expectations at the end of a period: programs' numbers, tags by value, or as the device's register."""
     within = f"within: {_s(0, wanted)}"
     last = look_ns >= story.end_ns - STOPPING_NS - AHEAD_NS
 
@@ -188,8 +194,10 @@ def _looks(system: System, story: Story, wanted: Wanted, begin_ns: int, look_ns:
 
 
 def _slack(changes: list[Change], story: Story, *, counts: bool = False) -> float:
-    """How far a field that moves by itself may have got meanwhile: its largest step, of what `counts` in its device two at
-    least. 0 for one that commands alone have changed: that one is known exactly."""
+    """Return how far a field may drift meanwhile: its largest step, at least two for one that `counts` in its device.
+
+    0 for a field that only commands change: its value is known exactly.
+    """
     numbers = [c.value for c in changes if isinstance(c.value, int | float) and not isinstance(c.value, bool)]
     if len(changes) <= len(story.commands) + 2 and not counts:
         return 0

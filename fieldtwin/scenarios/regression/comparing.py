@@ -1,6 +1,7 @@
-"""Two runs of a system held against each other by what they mean: states and their order, values, qualities, latencies.
+"""Compare two runs of a system by meaning: states and their order, values, qualities, latencies.
 
-The older one is what the newer one is judged by. Nothing is compared byte for byte: a change that nobody can notice is none.
+The older run is the reference for the newer one. Bytes are not compared, so a change without an observable effect is not a
+difference.
 """
 
 from __future__ import annotations
@@ -18,8 +19,11 @@ MOST_SHOWN = 1_000
 
 @dataclass(frozen=True)
 class Allowed:
-    """What may differ: when by `window_s`, values by `share` of their size or by `amounts` by field, latencies by
-    `latency_share` and `latency_ms`, whichever is more. Fields of `ignored` (or a whole device or program) are left out."""
+    """The allowed differences.
+
+    Times may differ by `window_s`, values by `share` of their size or by `amounts` per field, latencies by `latency_share` or
+    `latency_ms`, whichever is more. Fields of `ignored` (or a whole device or program) are left out.
+    """
 
     window_s: float = 1.0
     share: float = 0.01
@@ -32,7 +36,7 @@ class Allowed:
         return name in self.ignored or name.partition(".")[0] in self.ignored
 
     def near(self, name: str, old: object, new: object) -> bool:
-        """Whether both are the same value, to people."""
+        """Return whether both values are equal within the tolerance."""
         if isinstance(old, bool) or isinstance(new, bool):
             return old is new
         if isinstance(old, int | float) and isinstance(new, int | float):
@@ -44,8 +48,11 @@ class Allowed:
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """`what` is field, value, quality, order, time, latency or problem; `where` the field, or the device and what it was
-    asked; `times` how often, `t_s` the first time."""
+    """A difference.
+
+    `what` is field, value, quality, order, time, latency or problem; `where` the field, or the device and the request; `times`
+    how often, `t_s` the first time.
+    """
 
     what: str
     where: str
@@ -62,7 +69,7 @@ class Difference:
 
 @dataclass(frozen=True)
 class Verdict:
-    """`compared` fields and services, of which `differences`; the runs' lengths in seconds."""
+    """The number of `compared` fields and services, the `differences`, and the runs' lengths in seconds."""
 
     compared: int
     differences: tuple[Difference, ...]
@@ -71,17 +78,17 @@ class Verdict:
 
     @property
     def common_s(self) -> float:
-        """The time that both runs have. What one of them has after it was not compared."""
+        """Return the time that both runs cover. Anything after it was not compared."""
         return min(self.old_s, self.new_s)
 
     @property
     def same(self) -> bool:
-        """Whether nothing became worse or otherwise; of nothing compared nothing is known."""
+        """Return whether nothing became worse or different; False if nothing was compared."""
         return bool(self.compared) and not self.differences
 
 
 def compare(old: Story, new: Story, allowed: Allowed | None = None) -> Verdict:
-    """Judge `new` by `old`. What only the longer run has behind the end of the other is not looked at."""
+    """Compare `new` with `old`. Events of the longer run after the end of the shorter one are ignored."""
     allowed = allowed or Allowed()
     end_ns = min(old.end_ns, new.end_ns)
     found: list[Difference] = []
@@ -92,7 +99,7 @@ def compare(old: Story, new: Story, allowed: Allowed | None = None) -> Verdict:
                 continue
             one, other = _until(before.get(name, []), end_ns), _until(after.get(name, []), end_ns)
             if not one and not other:
-                continue  # neither run has it in the time that both have
+                continue  # absent from both runs in their common time
             compared += 1
             if bool(one) != bool(other):
                 there, missing = "there", "not there"
@@ -112,7 +119,10 @@ def _until(changes: list[Change], end_ns: int) -> list[Change]:
 def _states(
     name: str, old: list[Change], new: list[Change], end_ns: int, window_ns: int, allowed: Allowed
 ) -> list[Difference]:
-    """The same values in the same order, each in time. Behind the last window's begin one of both may have one more."""
+    """Compare states: the same values in the same order, each in time.
+
+    In the last window, one of the runs may have one more.
+    """
     for one, other in zip(old, new, strict=False):
         if not allowed.near(name, one.value, other.value):
             return [Difference("order", name, str(one), str(other), other.t_ns / NS_PER_S)]
@@ -144,7 +154,7 @@ def _otherwhen(name: str, one: Change, other: Change) -> Difference:
 def _values(
     name: str, old: list[Change], new: list[Change], end_ns: int, window_ns: int, allowed: Allowed
 ) -> list[Difference]:
-    """Whatever one of both became, the other was as well, within the window."""
+    """Compare values: each value of one run occurred in the other one within the window."""
     for one, other, swapped in ((old, new, False), (new, old, True)):
         unmatched = list(_unmatched(name, one, other, end_ns, window_ns, allowed))
         if not unmatched:
@@ -164,7 +174,7 @@ def _unmatched(
     found: list[tuple[Change, Change | None]] = []
     for change in one:
         if change.t_ns > end_ns - window_ns:
-            break  # the other run may not have come to it
+            break  # the other run may have ended before it
         first = max(0, bisect_right(times, change.t_ns - window_ns) - 1)
         last = bisect_right(times, change.t_ns + window_ns)
         around = other[first:last]
@@ -179,7 +189,7 @@ def _alike(name: str, one: Change, other: Change, allowed: Allowed) -> bool:
 
 
 def _between(name: str, change: Change, around: Sequence[Change]) -> bool:
-    """A value that moves was passed by: the other run was below and above it, and looked at other moments."""
+    """Return whether a moving value was passed: the other run was below and above it, and sampled at different moments."""
     value = change.value
     if not isinstance(value, int | float) or isinstance(value, bool):
         return False
@@ -188,7 +198,7 @@ def _between(name: str, change: Change, around: Sequence[Change]) -> bool:
 
 
 def _latencies(old: Story, new: Story, allowed: Allowed) -> list[Difference]:
-    """How long answers take in the middle: only slower is worse."""
+    """Compare the medians of response times: only a slower one is worse."""
     found = []
     for key, before in sorted(old.latency_ns.items()):
         after = new.latency_ns.get(key, [])
@@ -205,7 +215,7 @@ def _latencies(old: Story, new: Story, allowed: Allowed) -> list[Difference]:
 
 
 def _problems(old: Story, new: Story, allowed: Allowed) -> list[Difference]:
-    """Requests without a good answer that there were none of, or much more of."""
+    """Compare requests without a good answer: a new or much more frequent problem is a difference."""
     found = []
     for key, now in sorted(new.problems.items()):
         was = old.problems[key]

@@ -1,7 +1,7 @@
-"""What a run was about, by its trace or capture: what each tag and state was and when, how quick devices were, what came in.
+"""The history of a run from its trace or capture: tags, states and qualities over time, response times, inputs.
 
-That, and not bytes or nanoseconds, is what runs of different versions have in common. Pure: events in, a `Story` out. Bounded: so
-many changes a field; what is more is counted.
+Runs of different versions can be compared by this, and not by bytes or nanoseconds. Pure: events in, a `Story` out. The changes
+of a field are limited; the rest is counted.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ from fieldtwin.results.trace import FAR_END, Event, Kind
 from fieldtwin.twin.site.system import System
 
 MOST = 200_000
-"""Changes of a field."""
+"""Maximum number of recorded changes per field."""
 SELDOM = 5
 
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """From `t_ns` on the field was `value`, of `quality` ("" for a state, and for what was only seen on a wire)."""
+    """From `t_ns` on the field had `value` and `quality` ("" for a state, and for a value seen only on a bus)."""
 
     t_ns: int
     value: Any
     quality: str = ""
 
     def says(self) -> tuple[Any, str]:
-        """What matters of it: a bad value is no value."""
+        """Return the relevant content: a bad value counts as no value."""
         return (None if self.quality == "bad" else self.value), self.quality
 
     def __str__(self) -> str:
@@ -42,7 +42,7 @@ class Change:
 
 @dataclass(frozen=True, slots=True)
 class Came:
-    """A command of the far end of `device`: its payload. As it was sent, or, where that was not seen, as it came in."""
+    """A command of the remote client of `device`: its payload as sent, or as received if the sending was not recorded."""
 
     t_ns: int
     device: str
@@ -51,8 +51,11 @@ class Came:
 
 @dataclass
 class Story:
-    """`tags` and `states`: changes by DEVICE.TAG and PROGRAM.VARIABLE; `latency_ns` and `problems` by (device, service) and
-    (device, service, problem); `faults` as events have them."""
+    """The changes of a run.
+
+    `tags` and `states`: changes by DEVICE.TAG and PROGRAM.VARIABLE; `latency_ns` and `problems` by (device, service) and
+    (device, service, problem); `faults` as events have them.
+    """
 
     end_ns: int = 0
     tags: dict[str, list[Change]] = field(default_factory=dict)
@@ -63,17 +66,19 @@ class Story:
     commands: list[Came] = field(default_factory=list)
     faults: list[Event] = field(default_factory=list)
     published: Counter[str] = field(default_factory=Counter)
-    """How often each tag was, changed or not."""
+    """How often each tag was published, changed or not."""
     left_out: int = 0
 
     def pace_ns(self, name: str) -> int:
-        """How long it may be from a tag's change to the next time that it is published: one and a half of its usual interval.
-        0 for a state, and for what is hardly ever read."""
+        """Return the longest time from a tag's change to its next publication: one and a half of its usual interval.
+
+        0 for a state, and for a tag that is rarely read.
+        """
         times = self.published[name]
         return self.end_ns * 3 // (2 * times) if times >= SELDOM else 0
 
     def note(self, into: dict[str, list[Change]], name: str, change: Change) -> None:
-        """`name` is so; nothing where it was so before."""
+        """Record that `name` has this value, unless it had it before."""
         changes = into.setdefault(name, [])
         if changes and changes[-1].says() == change.says():
             return
@@ -84,7 +89,7 @@ class Story:
 
 
 def story_of(system: System, events: Iterable[Event]) -> Story:
-    """Read events in their order. Of a capture, which has frames alone, tags are what devices answered."""
+    """Return the history of events in their order. For a capture, which has only frames, tags are the devices' answers."""
     story, decoder = Story(), Decoder(system)
     answered: list[tuple[str, Change]] = []
     sent: list[Came] = []
@@ -125,7 +130,7 @@ def story_of(system: System, events: Iterable[Event]) -> Story:
 
 
 def _is_measured(system: System, exchange: Exchange, tag: str) -> bool:
-    """Not a message, of which a device has many, each once; and nothing of a sensor that has not sampled yet."""
+    """Return whether the tag is a measurement: not a message, of which each occurs once, and not a sensor without a sample."""
     config = system.devices.get(exchange.device)
     if config is None or tag not in config.profile.tags:
         return False
@@ -143,7 +148,10 @@ def _count(story: Story, exchange: Exchange) -> None:
 
 
 def _mailbox(story: Story, system: System, boxes: dict[str, tuple[int, ...]], exchange: Exchange) -> None:
-    """A message in an inbox: sequence, length in bytes, payload, two bytes a register. Each sequence is one command."""
+    """Decode a message in an inbox: sequence, length in bytes, payload, two bytes per register.
+
+    Each sequence number is one command.
+    """
     config = system.devices.get(exchange.device)
     box = config.profile.inbox if config is not None else None
     if box is None or not exchange.ok or not exchange.reads() or len(exchange.registers) < 2:

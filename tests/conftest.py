@@ -1,4 +1,4 @@
-"""Every test must leave no thread, process or open socket behind; warnings are errors (pyproject.toml)."""
+"""Every test must leave no thread, process or open socket; warnings are errors (pyproject.toml)."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from hypothesis import settings
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-# How long an example takes is the host's load. Where a change is judged (CI), the examples are the same each time.
+# The time per example depends on the host's load. In CI, the examples are the same each time.
 settings.register_profile("fieldtwin", deadline=None, derandomize=bool(os.environ.get("CI")))
 settings.load_profile("fieldtwin")
 
 
 @pytest.fixture(autouse=True)
 def leaves_no_threads() -> Iterator[None]:
-    """Fail the test that leaves a thread running."""
+    """Fail a test that leaves a thread running."""
     before = set(threading.enumerate())
     yield
     leaked = [t for t in threading.enumerate() if t not in before and t.is_alive()]
@@ -33,11 +33,11 @@ def leaves_no_threads() -> Iterator[None]:
 
 @pytest.fixture(autouse=True, scope="module")
 def leaves_nothing_to_the_collector() -> Iterator[None]:
-    """Collect after each file, so that an unclosed resource caught in a cycle warns in the file that left it.
+    """Collect garbage after each file, so that an unclosed resource in a reference cycle warns in its own file.
 
-    Not after each test: there are thousands. What is left when a file has ended, which is modules, tests and their reports,
-    is never looked at again: with everything imported, going through it took a quarter of a second each time, a fifth of the
-    whole suite.
+    There are thousands of tests, so this does not happen after each of them. The remaining objects (modules, tests and
+    their reports) are frozen: with everything imported, each collection took a quarter of a second, which was a fifth
+    of the suite's time.
     """
     yield
     gc.collect()
@@ -45,29 +45,33 @@ def leaves_nothing_to_the_collector() -> Iterator[None]:
 
 
 def pytest_collection_finish() -> None:
-    """The same for all that collecting the tests has imported and made."""
+    """Do the same for the objects created while tests were imported and collected."""
     gc.collect()
     gc.freeze()
 
 
 LINES = {"system": "systems", "spec": "programs", "docs": "programs", "interop": "programs"}
-"""Folders whose tests start many processes, and the line that they stand in: more at once would only wait for each other.
+"""Folders whose tests start many processes, and the queue that they share, because parallel ones would only wait for
+each other.
 
-Each of the two takes about as long as all else: three processes."""
+Each of the two queues takes about as long as all other tests together: three processes.
+"""
 
 
 def line_of(nodeid: str) -> str:
-    """What shares a process with what: a line of `LINES`, else a file."""
+    """Return the tests' group, which shares a process: a queue of `LINES`, or else the file."""
     file = nodeid.partition("::")[0]
     return LINES.get(Path(file).parent.name, file)
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
-    """With several processes (pytest-xdist): whole systems in one of them, one after the other, programs of users and strangers
-    in another; all else file by file, so that what a file's tests share is made once.
+    """Distribute tests over the processes of pytest-xdist: whole systems in one process, one after the other; user
+    programs and third-party programs in another; all other tests file by file, so that fixtures of a file are created
+    once.
 
-    Not by the marker `xdist_group`: pytest 9.2 no longer lets xdist 3.8 change a test's id, and then each test goes anywhere.
+    The marker `xdist_group` cannot be used: pytest 9.2 no longer lets xdist 3.8 change the id of a test, so tests run
+    in any process.
     """
     from xdist.scheduler import LoadScopeScheduling
 
@@ -79,6 +83,6 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Tests marked `socketcan` want a kernel with CAN and its vcan0; scripts/test-vcan provides both."""
+    """Tests marked `socketcan` need a kernel with CAN and the interface vcan0; scripts/test-vcan provides both."""
     if item.get_closest_marker("socketcan") and not Path("/sys/class/net/vcan0").exists():
         pytest.skip("no vcan0 here: scripts/test-vcan runs this")

@@ -1,4 +1,4 @@
-"""What tests share: running a coroutine on a loop of its own that must be left clean, and waiting for a condition."""
+"""Helpers shared by tests: run a coroutine on a separate loop that must end clean, and wait for a condition."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ T = TypeVar("T")
 
 
 def run(coro: Coroutine[Any, Any, T], timeout_s: float = 20.0) -> T:
-    """Run `coro` on a fresh loop; fail when it takes too long or leaves tasks behind."""
+    """Run `coro` on a fresh loop; fail if it takes too long or leaves tasks."""
 
     async def guarded() -> T:
         before = asyncio.all_tasks()

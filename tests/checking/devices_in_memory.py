@@ -43,8 +43,8 @@ def on_modbus(
     at: int = 1,
     serve: Callable[[ByteConnection], Awaitable[None]] | None = None,
 ) -> T:
-    """What `use` comes to with a device served at `url` in memory. `use` gets the net, the url and the clock. `serve`: another
-    device altogether."""
+    """Return what `use` returns with a device served at `url` in memory. `use` gets the net, the URL and the clock.
+    `serve` provides a different device."""
     loop = VirtualLoop()
 
     async def main() -> T:

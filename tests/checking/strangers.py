@@ -1,7 +1,8 @@
-"""Checks of servers of other makes: pymodbus's and libmodbus's, on real sockets and ptys, a few cases to a server.
+"""Run the checks against third-party servers, pymodbus's and libmodbus's, on real sockets and ptys, a few cases per
+server.
 
-The servers are those of tests/interop, as a program of their own. All checks run at once:
-most of it is waiting for who is silent.
+The servers are those of tests/interop, in a separate program. All checks run at the same time, because they mostly wait
+for servers that do not answer.
 """
 
 from __future__ import annotations
@@ -30,16 +31,16 @@ from fieldtwin.gateway.core.errors import Unreachable
 
 PROGRAM = Path(__file__).parents[1] / "interop" / "strange_slaves.py"
 A_SERVER = 2
-"""Cases that one server is asked."""
+"""Number of cases per server."""
 STAGGER_S = 0.02
-"""From the beginning of one check to that of the next: what many do at once would look like a peer that thinks for long."""
+"""Interval between the starts of two checks. With many simultaneous checks, a server would seem slow to answer."""
 TIMEOUT_S = 0.25
-"""libmodbus thinks for 0.5 s before it refuses; three timeouts are waited for an answer that is due."""
+"""libmodbus waits 0.5 s before it refuses a request; a check waits three timeouts for an expected answer."""
 MAY_WRITE = {"holding": (190, 10), "coil": (3, 1)}
 
 
 class PtyConnector(OsConnector):
-    """Opens the near side of a pty, the far side of which is the server's port."""
+    """Open the near side of a pty; the server has opened the far side."""
 
     def __init__(self, end: ByteConnection) -> None:
         super().__init__()
@@ -52,7 +53,7 @@ class PtyConnector(OsConnector):
 
 
 def version_of(peer: str) -> str:
-    """The peer's version here, empty where it is not installed."""
+    """Return the installed version of the peer, or an empty text."""
     if peer == "pymodbus":
         return version("pymodbus")
     if (name := find_library("modbus")) is None:
@@ -64,7 +65,7 @@ def version_of(peer: str) -> str:
 async def check_all(
     peer: str, wire: str, folder: Path, after_s: float = 0.0, only: frozenset[str] = frozenset()
 ) -> list[DeviceResult]:
-    """Every case that `wire` (rtu, ascii or mbap) has, or these, on as many servers as it takes, in their order."""
+    """Run all cases of `wire` (rtu, ascii or mbap), or the given ones, in order, on as many servers as necessary."""
     await asyncio.sleep(after_s)
     traits = traits_of(Endpoint.parse({"rtu": "rtu:/x", "ascii": "ascii:/x", "mbap": "tcp://x:1"}[wire]))
     ids = [case.id for case in CASES if case.chosen(only) and (not case.wires or traits & set(case.wires))]

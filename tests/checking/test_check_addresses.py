@@ -1,6 +1,7 @@
-"""Addresses of `check modbus`: hexadecimal ones are taken, and cells named by `--write` are tried when the tables are learned.
+"""Addresses of `check modbus`: hexadecimal numbers are accepted, and cells named by `--write` are tried when the tables
+are probed.
 
-Defect: `--read holding:0x163` was refused, and MB-036c and MB-049 were skipped as "it has no such table" although
+Defect: `--read holding:0x163` was refused, and MB-036c and MB-049 were skipped with "it has no such table" although
 `--write coil:500` named a coil.
 """
 

@@ -1,4 +1,5 @@
-"""Care with plants: what a check may send by its danger, what it asks for, what it puts back; `--dry-run` sends nothing."""
+"""Plant safety of checks: impact levels limit what a check sends, it asks first, it restores values, and `--dry-run`
+sends nothing."""
 
 from __future__ import annotations
 
@@ -29,7 +30,7 @@ URL = "tcp://127.0.0.1:0"
 
 
 class Listening(ModbusUnit):
-    """Keeps every request."""
+    """Record every request."""
 
     def __init__(self) -> None:
         self.__dict__.update(make_unit().__dict__)
@@ -104,7 +105,7 @@ def test_nothing_is_sent_on_a_line_on_which_somebody_talks() -> None:
     asked: list[bytes] = []
 
     async def chatter(end: ByteConnection) -> None:
-        """Another master's request every 0.3 s, and an ear."""
+        """A client that sends a request every 0.3 s, and a passive listener."""
         while True:
             asked.append(await end.read_within(0.3))
             await end.write(bytes.fromhex("05 03 00 00 00 01 85 8E"))
@@ -140,7 +141,8 @@ def test_what_writes_or_disrupts_is_confirmed() -> None:
     for words in (["--write", "holding:1"], ["--allow", "disrupt"]):
         result = fieldtwin("modbus", "tcp://127.0.0.1:1", *words)
         assert isinstance(result.exception, NotAllowed), words
-    assert isinstance(fieldtwin("modbus", "tcp://127.0.0.1:1").exception, Unreachable)  # reads are not asked for
+    # the user is not asked before reads
+    assert isinstance(fieldtwin("modbus", "tcp://127.0.0.1:1").exception, Unreachable)
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""`fieldtwin check modbus` from the command line on a real socket: files, waivers, exit codes, the log of what was sent."""
+"""`fieldtwin check modbus` from the command line on a real socket: files, waivers, exit codes, the log of sent frames."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from fieldtwin.gateway.wallclock import WallClock
 
 @pytest.fixture(scope="module")
 def device() -> Iterator[str]:
-    """A device that adds 1 to the exception of a read of nothing, on a port of this computer."""
+    """A device on a local port that adds 1 to the exception code of a read of nonexistent registers."""
     ready, urls = threading.Event(), []
     unit = make_unit()
     right = unit.respond

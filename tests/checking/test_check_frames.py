@@ -1,4 +1,4 @@
-"""Replies found in whatever came back: nothing is lost, nothing invented, whatever the bytes are."""
+"""Extracting replies from arbitrary received bytes loses nothing and invents nothing."""
 
 from __future__ import annotations
 

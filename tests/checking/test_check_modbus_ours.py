@@ -1,4 +1,4 @@
-"""Our own emulated devices pass every Modbus case that can be played on their wire, on each kind of wire."""
+"""Our emulated devices pass every Modbus case that applies to their wire, on each kind of wire."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`fieldtwin check modbus` on devices that are not ours: pymodbus's and libmodbus's servers get the verdicts that are known."""
+"""`fieldtwin check modbus` on third-party devices: pymodbus's and libmodbus's servers get the documented verdicts."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _found: dict[tuple[str, str], list[DeviceResult]] = {}
 
 
 def found_on(peer: str, wire: str) -> list[DeviceResult]:
-    """Played once, all of them at the same time."""
+    """Run once, all at the same time."""
 
     async def main(folder: Path) -> list[list[DeviceResult]]:
         return await asyncio.gather(*(check_all(p, w, folder, n * 0.5) for n, (p, w) in enumerate(here)))
@@ -36,7 +36,7 @@ def found_on(peer: str, wire: str) -> list[DeviceResult]:
 
 
 def again(peer: str, wire: str, only: frozenset[str]) -> list[DeviceResult]:
-    """These cases alone: what they found may have been this computer's load."""
+    """Run these cases alone, because their earlier results may have been caused by the load of this computer."""
     with tempfile.TemporaryDirectory(dir="/tmp") as folder:
         return asyncio.run(check_all(peer, wire, Path(folder), only=only))
 
@@ -54,7 +54,8 @@ def test_verdicts_are_the_known_ones(peer: str, wire: str) -> None:
     results = found_on(peer, wire)
     known = KNOWN[peer][wire]
     found = not_passed(results)
-    if odd := frozenset(id for id in found | known if found.get(id) != known.get(id)):  # once more, without the crowd
+    # repeat without the load of the other cases
+    if odd := frozenset(id for id in found | known if found.get(id) != known.get(id)):
         found = {id: said for id, said in found.items() if id not in odd} | not_passed(again(peer, wire, odd))
     if here == KNOWN["versions"][peer]:
         assert found == known

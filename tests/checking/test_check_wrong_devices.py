@@ -1,4 +1,5 @@
-"""Each case for Modbus devices can fail: one wrong answer fails the one case that is about it; careless devices fail theirs."""
+"""Each case for Modbus devices can fail: one wrong answer fails exactly the case for it, and careless devices fail
+their cases."""
 
 from __future__ import annotations
 
@@ -73,7 +74,7 @@ TWISTS: dict[str, wrong.Twist] = {
     "MB-049": wrong.instead(0x01, b"\x01\x01\xf8", where=lambda pdu: count(pdu) == 3),
     "MB-050a": wrong.instead(0x08, None, where=lambda pdu: len(pdu) > 100),
 }
-"""The case that fails, and what the device does for it."""
+"""The failing case, and the behaviour of the device that fails it."""
 
 
 @pytest.mark.parametrize("case_id", TWISTS)

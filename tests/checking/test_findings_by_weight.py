@@ -1,8 +1,9 @@
-"""What the standard requires, robustness, and known field problems are told apart in cases, verdicts, exit codes and reports.
+"""Cases, verdicts, exit codes and reports distinguish requirements of the standard, robustness, and known field
+problems.
 
-Defect: a strict RTU server, which discards noise together with the frame that follows it without a silence, got red deviations
-for MB-008a and MB-008b, although no clause requires otherwise. The exit code, the colours and the acceptance document knew one
-kind of failure only.
+Defect: a strict RTU server, which discards noise together with a frame that follows without a silence, was reported red
+for MB-008a and MB-008b, although no clause requires more. The exit code, the colours and the acceptance document had
+only one kind of failure.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ def test_a_case_that_the_standard_requires_names_its_clause(case: DeviceCase[obj
 
 
 async def strict_rtu(end: ByteConnection) -> None:
-    """A server that takes all bytes up to a silence as one frame (SL 2.5.1.1), and answers only if its check sum is right."""
+    """A server that treats all bytes up to a silence as one frame (SL 2.5.1.1), and answers only if its CRC is correct."""
     unit = make_unit()
     data = b""
     while True:
@@ -80,7 +81,7 @@ def test_a_strict_rtu_server_that_discards_noise_with_the_frame_passes() -> None
     assert [(r.verdict, r.reason) for r in found] == [
         (Verdict.PASSED, "discards it: strict"),
         (Verdict.PASSED, "discards it: strict"),
-        (Verdict.PASSED, "refuses it: strict"),  # zeros after a frame leave its check sum right, and its length wrong
+        (Verdict.PASSED, "refuses it: strict"),  # zeros appended to a frame keep its CRC valid, but not its length
     ]
 
 
@@ -116,7 +117,7 @@ def test_the_acceptance_document_counts_only_required_cases_as_deviations(versio
     ]
     data = as_json(SUBJECT, results)
     assert data["findings"] == {"standard": 0, "robustness": 1, "field problem": 1}
-    if version == 1:  # a file of an earlier version, which knows no basis
+    if version == 1:  # a file of an earlier version, without a basis
         data["version"] = 1
         del data["findings"]
         for case in data["cases"]:
@@ -151,7 +152,7 @@ def test_a_request_with_two_errors_may_be_refused_for_either() -> None:
 
 
 async def one_at_a_time(end: ByteConnection) -> None:
-    """A TCP server that refuses each request but the first of a segment with exception 06."""
+    """A TCP server that refuses all requests of a segment except the first with exception 06."""
     unit = make_unit()
     while True:
         try:

@@ -1,4 +1,4 @@
-"""The site acceptance document: every device, serial number and deviation of the files stands in it, escaped."""
+"""The site acceptance document contains every device, serial number and deviation of the files, escaped."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ RESULTS = [
 
 @pytest.fixture
 def check(tmp_path: Path) -> Path:
-    """The JSON of a check, as `--out` writes it."""
+    """Return the JSON of a check, as written by `--out`."""
     path = tmp_path / "unit17.json"
     path.write_text(json.dumps(as_json(SUBJECT, RESULTS)))
     return path
@@ -56,7 +56,7 @@ def check(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def dump(tmp_path: Path) -> Path:
-    """A dump of a node that says its serial number."""
+    """Return a dump of a node with a serial number."""
     lines = [
         {
             "fieldtwin_dump": 1, "protocol": "canopen", "address": 5, "ranges": ["1000h..1FFFh"], "profile": None,
@@ -78,7 +78,7 @@ def report(*words: str | Path) -> Result:
 
 
 def words_of(html: str) -> str:
-    """What a reader sees."""
+    """Return the visible text."""
     body = html[html.index("<body") :]
     return " ".join(unescape(re.sub(r"<[^>]*>", " ", body)).split())
 
@@ -179,7 +179,7 @@ def test_a_dump_that_was_broken_off_is_an_open_point(dump: Path, tmp_path: Path)
 
 
 def test_a_dump_that_left_out_addresses_between_others_is_called_sampled(tmp_path: Path) -> None:
-    """Observed: "whole" for a dump that had not asked for 29 of 101 addresses."""
+    """Defect: the report said "whole" for a dump that had not requested 29 of 101 addresses."""
     lines = [
         {
             "fieldtwin_dump": 2, "protocol": "modbus", "address": 1, "ranges": ["holding:0..9"], "profile": None,

@@ -1,4 +1,4 @@
-"""Modbus devices that are wrong on purpose: in one answer, or careless about all that a frame should be."""
+"""Intentionally wrong Modbus devices: wrong in one answer, or careless about all properties of a frame."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from fieldtwin.gateway.protocols.modbus.ascii import lrc
 from fieldtwin.gateway.protocols.modbus.crc import with_crc
 
 Twist = Callable[[ModbusUnit, bytes, bytes | None], bytes | None]
-"""The unit, the request and the right answer -> what is answered."""
+"""Map the unit, the request and the correct answer to the answer sent."""
 Serve = Callable[[ByteConnection], Awaitable[None]]
 
 
 def twisted(twist: Twist) -> ModbusUnit:
-    """The device of the tests with another tongue."""
+    """The device of the tests with a replaced answer function."""
     unit = make_unit()
     right = unit.respond
     unit.respond = lambda pdu, now_ns: twist(unit, pdu, right(pdu, now_ns))  # type: ignore[method-assign]
@@ -26,12 +26,12 @@ def twisted(twist: Twist) -> ModbusUnit:
 
 
 def instead(function: int, answer: bytes | None, *, where: Callable[[bytes], bool] = lambda pdu: True) -> Twist:
-    """Another answer to requests of `function` that are so."""
+    """Replace the answer to requests of `function` that meet the condition."""
     return lambda unit, pdu, right: answer if pdu[0] == function and where(pdu) else right
 
 
 def swallow_after(function: int) -> Twist:
-    """Nothing to the request behind one of `function`."""
+    """Do not answer the request that follows one of `function`."""
     seen: list[int] = []
 
     def twist(unit: ModbusUnit, pdu: bytes, right: bytes | None) -> bytes | None:
@@ -43,7 +43,7 @@ def swallow_after(function: int) -> Twist:
 
 
 def alternating(function: int, answers: list[bytes | None]) -> Twist:
-    """The answers to requests of `function`, in turn."""
+    """Return these answers to requests of `function`, in order."""
     turn = [0]
 
     def twist(unit: ModbusUnit, pdu: bytes, right: bytes | None) -> bytes | None:
@@ -56,7 +56,7 @@ def alternating(function: int, answers: list[bytes | None]) -> Twist:
 
 
 def written(table: str, value: Callable[[bytes], int], function: int, where: Callable[[bytes], bool]) -> Twist:
-    """Whatever is answered, the first cell is written."""
+    """Write the first cell, whatever the answer is."""
 
     def twist(unit: ModbusUnit, pdu: bytes, right: bytes | None) -> bytes | None:
         if pdu[0] == function and where(pdu):
@@ -67,7 +67,7 @@ def written(table: str, value: Callable[[bytes], int], function: int, where: Cal
 
 
 def old_value_of_fc23(unit: ModbusUnit, pdu: bytes, right: bytes | None) -> bytes | None:
-    """Reads before it writes: the right answer with its bit turned back."""
+    """Read before writing: the correct answer with its bit restored."""
     return right[:3] + bytes((right[3] ^ 1,)) if pdu[0] == 0x17 and right and len(right) == 4 else right
 
 
@@ -79,7 +79,7 @@ def _answer(unit: ModbusUnit, pdu: bytes) -> bytes:
 
 
 async def careless_rtu(end: ByteConnection) -> None:
-    """Takes eight bytes for a request, whoever it is for and whatever its CRC is; half a second ends a frame."""
+    """Treat any eight bytes as a request, for any unit and with any CRC; half a second ends a frame."""
     unit, data = make_unit(), b""
     while True:
         chunk = await end.read_within(0.5)
@@ -90,7 +90,7 @@ async def careless_rtu(end: ByteConnection) -> None:
 
 
 async def careless_ascii(end: ByteConnection) -> None:
-    """Takes what is between a colon and CR LF; no LRC, no other unit, no end of patience."""
+    """Accept the text between a colon and CR LF; check neither LRC nor unit, and wait without limit."""
     unit, data = make_unit(), b""
     while True:
         data += await end.read()
@@ -108,7 +108,7 @@ async def careless_ascii(end: ByteConnection) -> None:
 
 
 async def careless_tcp(end: ByteConnection) -> None:
-    """Takes each segment for an ADU, believes no header, answers as unit 1 with id 1 if there was none."""
+    """Treat each segment as an ADU, ignore the header, and answer as unit 1, with id 1 if there was none."""
     unit = make_unit()
     try:
         while True:

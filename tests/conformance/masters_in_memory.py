@@ -1,4 +1,4 @@
-"""Masters in memory and in virtual time, judged by the cases: ours, and ones that are wrong on purpose."""
+"""Clients in memory and in virtual time, tested by the cases: ours, and intentionally wrong ones."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ WORDS = (1111, 2222, 3333)
 PERIOD_S = 0.3
 TIMEOUT_S = 0.2
 LAZY_S = 0.3
-"""How long masters rest between two polls."""
+"""Pause of the clients between two polls."""
 Publish = Callable[[str], None]
 Master = Callable[[MemoryNet, Endpoint, VirtualClock, Publish], Coroutine[object, object, None]]
 
 
 class Told:
-    """A probe that the master calls."""
+    """A probe that the client calls."""
 
     def __init__(self) -> None:
         self._classifier = Classifier(WORDS[2])
@@ -49,8 +49,8 @@ class Told:
 
 
 async def ours(net: MemoryNet, endpoint: Endpoint, clock: VirtualClock, publish: Publish) -> None:
-    """The project's client as a driver uses it: a bad answer is no value, a lost connection is opened again, and so is one
-    on which nothing comes."""
+    """Our client as used by a driver: an invalid answer gives no value, and a lost or silent connection is opened
+    again."""
     while True:
         client = ModbusClient.at(endpoint, await net.open_bytes(endpoint), clock, timeout_s=TIMEOUT_S)
         unheard = 0
@@ -72,7 +72,7 @@ async def ours(net: MemoryNet, endpoint: Endpoint, clock: VirtualClock, publish:
 def judge(
     master: Master, url: str, *only: str, timeout_s: float = TIMEOUT_S, probed: bool = True
 ) -> dict[str, CaseResult]:
-    """Case id -> result of a master that is asked over `url` in memory."""
+    """Return the result by case id for a client that connects to `url` in memory."""
     loop = VirtualLoop()
 
     async def main() -> list[CaseResult]:
@@ -106,8 +106,8 @@ async def our_canopen(
     block: bool = False,
     download: bool = False,
 ) -> None:
-    """The project's CANopen master: reads an object, starts the node at first and whenever it boots, and when its heartbeat is
-    back. With `download` it writes a long object by blocks as well."""
+    """Our NMT master. It reads an object, and starts the node at first, after each boot-up and when the heartbeat
+    returns. With `download` it also writes a long object by block transfer."""
     async with Nursery() as nursery:
         connection = await net.open_can(endpoint, 125_000)
         boots: asyncio.Queue[bool] = asyncio.Queue()
@@ -126,7 +126,7 @@ async def our_canopen(
                 await canopen.nmt(NmtCommand.START, 5)
             try:
                 raw = await canopen.sdo_upload(5, 0x2000, 0, length=None if block else 4, block=block)
-                if len(raw) >= 4:  # an empty one is no number
+                if len(raw) >= 4:  # an empty text is not a number
                     publish(str(int.from_bytes(raw[:4], "little")))
                 if download:
                     await canopen.sdo_download(5, 0x2100, 0, bytes(range(50)), block=True)
@@ -136,7 +136,7 @@ async def our_canopen(
 
 
 def judge_canopen(master: Master, *only: str, timeout_s: float = TIMEOUT_S) -> dict[str, CaseResult]:
-    """Case id -> result of a CANopen master on a bus in memory."""
+    """Return the result by case id for an NMT master on a bus in memory."""
     loop = VirtualLoop()
 
     async def main() -> list[CaseResult]:

@@ -1,7 +1,9 @@
-"""Masters of others, each as a program for `fieldtwin check modbus-master|canopen-master -- python strange_masters.py NAME`.
+"""Third-party clients, each a program for `fieldtwin check modbus-master|canopen-master -- python strange_masters.py
+NAME`.
 
-One read of two registers (one object) every 20 ms behind the last answer, a timeout of 150 ms, no retries; what is read is
-printed, so that `--probe output` sees it. What a library throws is caught, and the connection made again where it offers that.
+Each reads two registers (one object) 20 ms after the last answer, with a timeout of 150 ms and without retries. It
+prints the values, so that `--probe output` sees them. It catches exceptions of the library, and reconnects if the
+library supports that.
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ from typing import Any
 
 TIMEOUT_S, PAUSE_S = 0.15, 0.02
 Master = tuple[Callable[[], Any], Callable[[], object]]
-"""Reads the value (None: there is none) and connects again; either may return an awaitable."""
+"""Read the value (None if there is none) and reconnect; both functions may return an awaitable."""
 
 
 def _tcp() -> tuple[str, int]:
@@ -103,7 +105,7 @@ def modbus_tk_rtu() -> Master:
 
 
 def _modbus_tk(master: Any) -> Master:
-    """`open` does nothing while the library believes that it is connected, as does pymodbus's `connect`."""
+    """`open` does nothing while the library considers itself connected, like pymodbus's `connect`."""
     return lambda: master.execute(1, 3, 0, 2)[0], master.open
 
 
@@ -185,7 +187,7 @@ async def main() -> None:
             value = await _result(read())
             if value is not None:
                 print(value, flush=True)
-        except Exception as e:  # whatever a library throws: that it goes on is what is judged
+        except Exception as e:  # any exception of the library, because the test is about whether it continues
             print(type(e).__name__, flush=True)
             await _result(again())
         await asyncio.sleep(PAUSE_S)

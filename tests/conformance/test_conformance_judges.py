@@ -1,4 +1,4 @@
-"""The judges, on observations written by hand: frames and times in, a verdict out."""
+"""The verdict functions, tested with handwritten observations: frames and times in, a verdict out."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def _at(s: float) -> int:
 
 
 def _good() -> list[Event]:
-    """It asks, is answered oddly, asks again, and publishes what it is told then."""
+    """The client asks, gets an odd answer, asks again, and publishes the second answer."""
     return [
         Asked(_at(0), 1, READ),
         Told(_at(0.1), 1, b"odd", False),
@@ -165,7 +165,7 @@ NOT_OF_MASTERS = {
     "MB": (*(1, 4), *range(29, 36), *range(38, 51), *(53, 57), *range(58, 64)),
     "CO": (*(3, 7), *range(9, 13), *(19, 31, 32, 41, 45, 46), *range(48, 52), *range(55, 60), *(61, 63, 64, 65, 66)),
 }
-"""Rows of the catalogues that no case plays; docs/conformance.md says why."""
+"""Rows of the test-case lists without a case; docs/conformance.md gives the reasons."""
 
 
 @pytest.mark.parametrize(("prefix", "rows", "cases"), [("MB", 70, CASES), ("CO", 66, CANOPEN_CASES)])

@@ -1,8 +1,9 @@
-"""A driver fails only for what it did, and passes only where the probe could see what it published.
+"""A driver fails only for its own behaviour, and passes only if the probe could see its published values.
 
-Seen once: MB-021 failed a client that saw an exception at once and then backed off for about its timeout. MB-015b passed or
-failed minimalmodbus by the caller's pause, because the late reply to one request was taken for the reply to the next. Clients
-that printed 0, 42 or 65535 for an exception passed MB-021 and MB-024, and canopen passed CO-030 although it printed 0.
+Defects: MB-021 failed a client that reported an exception at once and then backed off for about its timeout. MB-015b
+passed or failed minimalmodbus depending on the caller's pause, because the late reply to one request was taken for the
+reply to the next. Clients that printed 0, 42 or 65535 for an exception passed MB-021 and MB-024, and canopen passed
+CO-030 although it printed 0.
 """
 
 from __future__ import annotations
@@ -32,7 +33,8 @@ TIMEOUT_S = 0.2
 
 
 async def _frame(line: ByteConnection, *, sees_short: bool) -> bytes:
-    """A reply of the expected length, or what came until the timeout; one that `sees_short` takes 5 bytes of an exception."""
+    """Read a reply of the expected length, or the bytes received before the timeout. With `sees_short`, accept 5 bytes
+    of an exception."""
     got = b""
     try:
         async with asyncio.timeout(TIMEOUT_S):
@@ -46,8 +48,8 @@ async def _frame(line: ByteConnection, *, sees_short: bool) -> bytes:
 def _poller(
     pause_s: float, backs_off_s: float = 0.0, *, sees_short: bool = True, flushes: bool = False
 ) -> Callable[..., object]:
-    """A careful master on a line, but for what the options say. `flushes`: it gives up at the first frame that is not its own,
-    and forgets what came before its next request, as minimalmodbus does."""
+    """A correct client on a serial line, except for the options. `flushes`: it gives up at the first frame that is not
+    its own, and discards its input before the next request, as minimalmodbus does."""
 
     async def poll(net: MemoryNet, endpoint: Endpoint, clock: VirtualClock, publish: Publish) -> None:
         line = await net.open_bytes(endpoint)
@@ -186,7 +188,7 @@ def test_a_marked_value_that_is_no_number_is_no_value() -> None:
 
 
 def _gives_up_at_the_first_adu(pause_s: float) -> Callable[..., object]:
-    """A Modbus TCP master that takes no second ADU when the first one has another transaction id, as modbus_tk does."""
+    """A Modbus TCP client that reads no second ADU if the first has a different transaction id, as modbus_tk does."""
 
     async def poll(net: MemoryNet, endpoint: Endpoint, clock: VirtualClock, publish: Publish) -> None:
         link = await net.open_bytes(endpoint)
@@ -209,6 +211,6 @@ def _gives_up_at_the_first_adu(pause_s: float) -> Callable[..., object]:
 
 @pytest.mark.parametrize("pause_s", [0.005, 0.016, 0.020, 0.021, 0.030])
 def test_an_honest_answer_at_the_end_of_a_case_is_not_taken_for_an_odd_one(pause_s: float) -> None:
-    """The device answered honestly with the value of the case until its last delayed frame was sent."""
+    """The device answered correctly with the value of the case until its last delayed frame was sent."""
     result = judge(_gives_up_at_the_first_adu(pause_s), "tcp://plc:502", "MB-056c")["MB-056c"]  # type: ignore[arg-type]
     assert (result.verdict, "were not taken" in result.reason) == (Verdict.FAILED, True), result.reason

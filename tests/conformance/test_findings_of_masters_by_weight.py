@@ -1,7 +1,8 @@
-"""What the standard requires, robustness, and known field problems are told apart for masters, as they are for devices.
+"""Results of clients distinguish requirements of the standard, robustness, and known field problems, as those of
+devices do.
 
-Defect: every failure of a master was red and gave exit code 1, although many cases ask for more than any clause does. A client on
-TCP that does not compare the unit id of a reply conforms (TG 4.4.1.3), and failed the check all the same.
+Defect: every failure of a client was red and gave exit code 1, although many cases require more than any clause. A TCP
+client that does not compare the unit ID of a reply conforms (TG 4.4.1.3), and still failed the check.
 """
 
 from __future__ import annotations
@@ -31,9 +32,9 @@ from fieldtwin.reports.junit import render_junit
 MASTERS: dict[str, About] = {case.about.id: case.about for case in (*MODBUS_MASTERS, *CANOPEN_MASTERS)}
 DEVICES: tuple[About, ...] = (*modbus_devices.CASES, *canopen_devices.CASES)
 CLAUSE = re.compile(r"^(?:(?:SL|AP|TG) )?\d+(?:\.\d+)*(?:$|[;,])")
-"""A source that begins with a clause: of a Modbus document, or of CiA 301."""
+"""A source that begins with a clause of a Modbus document or of CiA 301."""
 REPORT = re.compile(r"(?:^|; )[\w-]+(?: PR)? #\d+")
-"""A source that names a report of another project."""
+"""A source that names a report of a different project."""
 
 
 @pytest.mark.parametrize("case", [*MASTERS.values(), *DEVICES], ids=lambda case: f"{case.role}-{case.id}")

@@ -1,4 +1,4 @@
-"""Our own masters pass every case that there is on their wire; what does not pass says why, and is in this list."""
+"""Our own clients pass every case for their wire; each exception is listed here with its reason."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ NOT_ITS_BUSINESS = {
     "MB-021": "polls no sooner than its timeout",
     "MB-025": "merges no reads",
 }
-"""A client is told what to read and when: splitting reads is a driver's business."""
+"""A client does not decide what to read and when: splitting reads is the task of a driver."""
 LINE = "rtu:/line?baudrate=19200"
 
 
@@ -59,7 +59,8 @@ def test_our_modbus_client_bears_every_hostile_device(url: str, passed: int) -> 
 
 
 async def _prompt(net: MemoryNet, endpoint: Endpoint, clock: VirtualClock, publish: Publish) -> None:
-    """Two shapes of reads, a write now and then, one echo checked; asks again as soon as it has an answer."""
+    """Read two different ranges, write occasionally, check one echo; send the next request as soon as an answer
+    arrives."""
     client = ModbusClient.at(endpoint, await net.open_bytes(endpoint), clock, timeout_s=TIMEOUT_S)
     count = 0
     while True:

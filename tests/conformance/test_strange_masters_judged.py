@@ -1,4 +1,5 @@
-"""`fieldtwin check` on masters that we did not write, each a program of its own, and on ours with its own served registers."""
+"""`fieldtwin check` on third-party clients, each in a separate program, and on our client with its own served
+registers."""
 
 from __future__ import annotations
 
@@ -62,14 +63,14 @@ raise SystemExit("I was told to")
 
 
 def environment() -> dict[str, str]:
-    """Where programs under test find this project's modules."""
+    """Where programs under test find the modules of this project."""
     return {**os.environ, "PYTHONPATH": str(ROOT), "NO_COLOR": "1"}
 
 
 def run_check(
     tmp_path: Path, *args: str, program: str, probe: str = "output"
 ) -> tuple[int, dict[str, tuple[str, str]], str]:
-    """Exit code, id -> (verdict, reason), talk."""
+    """Return the exit code, (verdict, reason) by id, and the console output."""
     script = tmp_path / "master.py"
     script.write_text(program)
     done = subprocess.run(

@@ -1,6 +1,6 @@
-"""A verdict about a master comes with the frames that it rests on, and with a command that plays the case again.
+"""A verdict about a client comes with the frames that support it, and with a command that repeats the case.
 
-Seen once: the results had no frames at all, ``--only`` of the reproduce line stood after ``--`` and went to the driver, and the
+Defects: results had no frames, ``--only`` of the reproduce line came after ``--`` and was passed to the driver, and the
 aborts of canopen-python, whose multiplexer is 0, were shown as aborts of no transfer.
 """
 
@@ -156,7 +156,8 @@ while True:
 
 @pytest.mark.long
 def test_a_port_that_the_case_gives_back_is_no_connection_of_the_master(tmp_path: Path) -> None:
-    """The evidence said that the master opened a connection, while the reason said that the master sent nothing any more."""
+    """Defect: the evidence said that the client opened a connection, but the reason said that the client sent nothing
+    any more."""
     (tmp_path / "master.py").write_text(GIVES_UP_ITS_PORT)
     words = ["check", "modbus-master", "--listen", f"pty:{tmp_path}/line", "--timeout", "150ms", "--only", "66"]
     words += ["--probe", "output", "--patience", "3s", "--json", "--", sys.executable, "master.py"]

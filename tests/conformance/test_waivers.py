@@ -1,4 +1,4 @@
-"""Waivers, and what becomes of results under them."""
+"""Waivers and their effect on results."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Masters that are wrong on purpose, each in one way: the case that is about it fails, with a reason that names it."""
+"""Clients with one intentional error each: the corresponding case fails, and its reason names the error."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def _zero_for_refusals(reply: bytes) -> int | None:
 
 
 async def _answer(line: ByteConnection) -> bytes:
-    """All that comes within the timeout, up to a pause of 5 ms."""
+    """Return all bytes received within the timeout, up to a pause of 5 ms."""
     got = b""
     try:
         async with asyncio.timeout(TIMEOUT_S):
@@ -95,7 +95,7 @@ def test_a_late_reply_is_only_a_failure_where_the_timeout_is_known() -> None:
 async def _gives_up(net: MemoryNet, endpoint: Endpoint, clock: VirtualClock, publish: Publish) -> None:
     line = await net.open_bytes(endpoint)
     silences = 0
-    while silences < 2:  # the first one is how its timeout is found out
+    while silences < 2:  # the test determines the timeout from the first one
         await line.write(with_crc(REQUEST))
         reply = await _answer(line)
         if _checks_crc_only(reply) is None:
@@ -130,7 +130,7 @@ def test_a_master_that_asks_a_busy_device_at_once_does_not_back_off() -> None:
 
 
 async def _naive_sdo(net: MemoryNet, endpoint: Endpoint, clock: VirtualClock, publish: Publish) -> None:
-    """Any frame with the right number is the answer."""
+    """Accept any frame with the correct number as the answer."""
     bus = await net.open_can(endpoint, 125_000)
     while True:
         await bus.send(CanFrame(0x605, bytes((0x40, 0x00, 0x20, 0, 0, 0, 0, 0))))
@@ -156,9 +156,10 @@ def test_a_naive_sdo_client_fails_what_it_does_not_look_at() -> None:
 def _sdo(
     *, whole_s: float = 0.0, stale: bool = False, pdo: bool = False, beat_s: float = 0.0, guards: bool = False
 ) -> Callable[..., object]:
-    """A careful SDO client with one mistake. `whole_s`: its timeout is for a whole transfer; `stale`: it does not stop the timer
-    of a transfer that is over; `pdo`: it publishes what a TPDO begins with; `beat_s`: it commands a node whose heartbeat is later
-    than that; `guards`: it asks for the state by remote frames, and ends for good when a toggle bit is wrong."""
+    """A correct SDO client with one mistake. `whole_s`: its timeout covers a whole transfer; `stale`: it does not stop
+    the timer of a finished transfer; `pdo`: it publishes the first bytes of a TPDO; `beat_s`: it commands a node whose
+    heartbeat is later than that; `guards`: it requests the state by remote frames, and stops for good at a wrong toggle
+    bit."""
 
     async def poll(net: MemoryNet, endpoint: Endpoint, clock: VirtualClock, publish: Publish) -> None:
         bus, loop = await net.open_can(endpoint, 125_000), asyncio.get_running_loop()
@@ -240,8 +241,8 @@ def test_one_mistake_of_an_sdo_client_is_one_failure(
 
 
 def _tcp(request: bytes, *, closes: bool = True, again: bool = False) -> Callable[..., object]:
-    """A master on TCP, one connection as long as it lasts. Unless it `closes`, it opens another for every request and leaves the
-    old ones; `again`: what nobody answered is sent once more."""
+    """A TCP client with one connection as long as it lasts. Unless it `closes`, it opens a new connection for each
+    request and keeps the old ones open. `again`: it repeats unanswered requests once."""
 
     async def poll(net: MemoryNet, endpoint: Endpoint, clock: VirtualClock, publish: Publish) -> None:
         links: list[ByteConnection] = []
@@ -288,7 +289,8 @@ def test_a_write_to_unit_0_that_is_sent_once_passes() -> None:
 
 
 def _in_ascii(*, checks: bool, newest: bool) -> Callable[..., object]:
-    """A master on a line in ASCII: it `checks` the LRC or not, and takes the `newest` colon for the beginning or the first."""
+    """An ASCII client on a line. It `checks` the LRC or not, and treats the `newest` colon or the first one as the
+    start."""
     asked = b":" + (REQUEST + bytes((-sum(REQUEST) & 0xFF,))).hex().upper().encode() + b"\r\n"
 
     async def poll(net: MemoryNet, endpoint: Endpoint, clock: VirtualClock, publish: Publish) -> None:

@@ -1,13 +1,14 @@
-"""What the pages of docs/ show is done: files are written, commands run in one folder a page, and their output compared.
+"""Execute the pages of docs/: write the files, run the commands of a page in one folder, and compare their output.
 
-A comment before a fence says what it is for; forges and the book do not show it.
+A comment before a fence gives its purpose. Forges and the book do not show it.
 
-    <!-- file: tank.yaml -->    the fence is that file
-    <!-- run -->                `$ ` lines are commands, the lines below each its output; `...` stands for anything
-    <!-- begin -->              a command that goes on until the page's end; its output must come before the page goes on
-    <!-- end -->                no fence: what goes on is interrupted
+    <!-- file: tank.yaml -->    the fence is the content of that file
+    <!-- run -->                `$ ` lines are commands, the lines below each its output; `...` matches anything
+    <!-- begin -->              a command that runs until the end of the page; its output must appear before the page continues
+    <!-- end -->                without a fence: running commands are interrupted
 
-Other fences are pictures. What takes longer stands as `<!-- run: long -->`: then all of the page runs with the tests marked long.
+Other fences are illustrations. Long blocks have `<!-- run: long -->`: then the whole page runs with the tests marked
+long.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ _MARK = re.compile(r"^<!-- (file|run|begin|end)(?:: (\S+))? -->\n(?:```[^\n]*\n(
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """A marked fence: what is done with it, the word behind the colon, its text, its line on the page."""
+    """A marked fence: the action, the argument after the colon, its text, its line on the page."""
 
     does: str
     word: str
@@ -39,7 +40,7 @@ class Block:
 
 
 def blocks(page: Path) -> list[Block]:
-    """The marked fences of a page, in order."""
+    """Return the marked fences of a page, in order."""
     text = page.read_text("utf-8")
     return [
         Block(found[1], found[2] or "", found[3] or "", text.count("\n", 0, found.start()) + 1)
@@ -52,7 +53,7 @@ def is_long(page: Path) -> bool:
 
 
 def commands(text: str) -> list[tuple[str, str]]:
-    """Each command of a console block with the output below it."""
+    """Return each command of a console block with its output."""
     found: list[tuple[str, list[str]]] = []
     for line in text.splitlines():
         if line.startswith("$ "):
@@ -63,7 +64,7 @@ def commands(text: str) -> list[tuple[str, str]]:
 
 
 def agrees(shown: str, seen: str) -> bool:
-    """Whether `seen` is what is shown; `...` is anything, and spaces at the ends of lines are none."""
+    """Return whether `seen` matches the text shown; `...` matches anything, and spaces at line ends are ignored."""
     parts = [re.escape(part.strip("\n")) for part in _bare(shown).split("...")]
     return re.fullmatch(r"\s*" + r"(?s:.*?)".join(parts) + r"\s*", _bare(seen)) is not None
 
@@ -74,13 +75,13 @@ def _bare(text: str) -> str:
 
 @dataclass(slots=True)
 class Reader:
-    """Somebody who does what a page says, in a folder of their own, with `fieldtwin` on the path."""
+    """A reader who executes a page in a separate folder, with `fieldtwin` on the path."""
 
     folder: Path
     going_on: list[subprocess.Popen[str]] = field(default_factory=list)
 
     def does(self, block: Block) -> None:
-        """One block. Raises AssertionError that says which command, what was shown and what was seen."""
+        """Execute one block. Raise AssertionError with the command, the expected output and the actual output."""
         if block.does == "file":
             place = self.folder / block.word
             place.parent.mkdir(parents=True, exist_ok=True)
@@ -93,7 +94,7 @@ class Reader:
                 assert agrees(shown, seen), f"line {block.line}: {command}\n--- shown\n{shown}\n--- seen\n{seen}"
 
     def ends(self) -> None:
-        """Interrupt what goes on, as Ctrl-C does, the last first."""
+        """Interrupt running commands, as Ctrl-C does, the newest first."""
         while self.going_on:
             process = self.going_on.pop()
             os.killpg(process.pid, signal.SIGINT)
@@ -113,14 +114,14 @@ class Reader:
         return out
 
     def _begins(self, command: str, shown: str) -> str:
-        """Until it said as many lines as are shown."""
+        """Wait until the command has printed as many lines as shown."""
         process = self._started(command)
         self.going_on.append(process)
         assert process.stdout is not None
         seen = b""
         while seen.count(b"\n") < len(shown.splitlines()):
             ready, _, _ = select.select([process.stdout], [], [], PATIENCE_S)
-            came = os.read(process.stdout.fileno(), 65536) if ready else b""  # past the stream's own buffer
+            came = os.read(process.stdout.fileno(), 65536) if ready else b""  # more than the buffer of the stream
             if not came:
                 break
             seen += came
@@ -155,7 +156,7 @@ class Reader:
 
 
 def main() -> int:
-    """Every page, as a stranger with nothing but an installation walks them (scripts/walk). 1 where one shows what is not so."""
+    """Execute every page with nothing but an installation (scripts/walk). Return 1 if a page shows wrong output."""
     wrong = 0
     for page in sorted((ROOT / "docs").rglob("*.md")):
         if not (todo := blocks(page)):

@@ -1,4 +1,4 @@
-"""The book of docs/: its links lead somewhere, its reference has what the program has, and it is built without a warning."""
+"""The book of docs/: its links work, its reference matches the program, and it builds without a warning."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""docs/ci.md: the recipes are YAML of the form that the services take, and call fieldtwin with options that there are."""
+"""docs/ci.md: the recipes are YAML in the form of the services, and call fieldtwin with existing options."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ RECIPES = re.findall(r"^<!-- recipe: (\w+) -->\n```yaml\n(.*?)^```$", PAGE.read_
 
 
 def commands_of(service: str, text: str) -> list[str]:
-    """The shell lines of a recipe; fails where it is not of the service's form."""
+    """Return the shell lines of a recipe; fail if the recipe does not have the form of the service."""
     recipe = yaml.safe_load(text)
     if service == "gitlab":
         jobs = recipe.values()
@@ -32,7 +32,7 @@ def commands_of(service: str, text: str) -> list[str]:
 
 
 def parsed(command: str) -> click.Context:
-    """The command line, parsed and not run. Raises click.UsageError for what there is not."""
+    """Parse the command line without running it. Raises click.UsageError for unknown options."""
     words = shlex.split(command.split(" > ")[0])
     assert words.pop(0) == "fieldtwin"
     name = words.pop(0)

@@ -1,4 +1,4 @@
-"""Every `fieldtwin` command that a page shows, in a fence or in a line of text, there is, with the options shown."""
+"""Every `fieldtwin` command on a page, in a fence or in a line of text, exists with the options shown."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "SECURITY.md",
 PAGES += [*sorted(p for p in (ROOT / "docs").rglob("*.md") if "decisions" not in p.parts)]
 _FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 MISSPELT = "fieldtwin runn observatory:"
-"""Shown in the walkthrough for what it prints."""
+"""The walkthrough shows these commands because of their error messages."""
 _INLINE = re.compile(r"`(fieldtwin\s[^`]+)`")
 
 
 def shown(text: str) -> list[str]:
-    """The command lines of a page: fences of shells, continued lines joined, and what stands in a sentence."""
+    """Return the command lines of a page: shell fences with continued lines joined, and commands in sentences."""
     found = []
     for language, body in _FENCE.findall(text):
         lines = body.replace("\\\n", " ").splitlines()
@@ -37,12 +37,12 @@ def shown(text: str) -> list[str]:
 
 
 def _parts(line: str) -> list[list[str]]:
-    """The words of each command of a line; what stands before the name (variables, `timeout 5`) is left out."""
+    """Return the words of each command of a line, without a prefix such as variables or `timeout 5`."""
     lexer = shlex.shlex(line, posix=True, punctuation_chars="();<>|&")
     lexer.whitespace_split = True
     try:
         words = list(lexer)
-    except ValueError:  # a sentence's quotes
+    except ValueError:  # quotes of the sentence
         return []
     parts: list[list[str]] = [[]]
     for word in words:
@@ -55,7 +55,7 @@ def _parts(line: str) -> list[list[str]]:
 
 
 def unknown(words: list[str]) -> str:
-    """What of a command line there is not, in words; empty when all of it is there."""
+    """Return the parts of a command line that do not exist, as a text; empty if all exist."""
     command, words = cli, words[1:]
     if words and words[0] in ("COMMAND", "VERB"):
         return ""
@@ -101,7 +101,7 @@ def test_a_command_that_there_is_not_is_noticed():
 
 
 def fences(*languages: str) -> list[tuple[str, str]]:
-    """(page, text) of all fences in these languages."""
+    """Return (page, text) of all fences in these languages."""
     texts = [(page.relative_to(ROOT).as_posix(), page.read_text("utf-8")) for page in PAGES]
     return [(name, body) for name, text in texts for language, body in _FENCE.findall(text) if language in languages]
 

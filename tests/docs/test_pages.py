@@ -1,4 +1,4 @@
-"""The pages of docs/ that show commands: each is done as it is written, and its output compared."""
+"""The pages of docs/ that show commands: each command is executed as written, and its output compared."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ def _as_test(page: Path):
 
 @pytest.mark.parametrize("page", [_as_test(page) for page in PAGES])
 def test_what_a_page_shows_is_so(page):
-    with tempfile.TemporaryDirectory(prefix="pg", dir="/tmp") as folder:  # short: sockets are made below it
+    # short, because socket paths are created below it
+    with tempfile.TemporaryDirectory(prefix="pg", dir="/tmp") as folder:
         reader = Reader(Path(folder))
         try:
             for block in blocks(page):

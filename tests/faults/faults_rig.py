@@ -1,8 +1,9 @@
-"""A small system in virtual time through a table of faults: what each did to values, the driver, the tag and the program.
+"""Run a small system in virtual time through a table of faults and record their effects on values, driver, tag and
+program.
 
-The real gateway, PLC and emulators, wires in memory: a sensor on a paced RTU line, the same one behind Modbus TCP, and a CANopen
-node. One run takes all rows of a wire one after the other, the wires side by side: a row has `LASTS_S` with its fault, and then
-`AFTER_S` in which all has to be well again.
+It uses the real gateway, PLC and emulators with wires in memory: a sensor on a paced RTU line, the same sensor on
+Modbus TCP, and a CANopen node. One run executes all rows of a wire one after the other, and the wires in parallel. A
+row has its fault for `LASTS_S`, and within the following `AFTER_S` the system must recover.
 """
 
 from __future__ import annotations
@@ -96,7 +97,7 @@ TAGS = {
 
 
 class Watch(Program):
-    """Has both sensors sample, and shows whether what it reads is good."""
+    """Make both sensors sample, and show whether the values read are good."""
 
     line: float | None = var_input(TagKind.REAL)
     lan: float | None = var_input(TagKind.REAL)
@@ -116,19 +117,19 @@ class Watch(Program):
 
 @dataclass
 class Seen:
-    """What a row showed. Times in s after its fault began; `well_s` after it was gone."""
+    """The result of a row. Times are in s after the start of the fault; `well_s` is in s after its end."""
 
     reasons: set[str] = field(default_factory=set)
-    """Why the tag was not good."""
+    """Reasons why the tag was not good."""
     driver_says: set[str] = field(default_factory=set)
-    """What the driver says is wrong with its device: the errors that it shows, and `offline`."""
+    """The driver's view of the device: the errors in its status, and `offline`."""
     program_saw: bool = False
-    """That its input was not good."""
+    """Whether the program saw that its input was not good."""
     published: int = 0
-    """How many good values there were while it lasted."""
+    """Number of good values during the fault."""
     values: list[Any] = field(default_factory=list)
     well_s: float | None = None
-    """When the tag was good for good; None: never."""
+    """Time from which the tag remained good; None if never."""
     struck: int = 0
 
     def not_good(self, reason: str) -> None:
@@ -137,7 +138,7 @@ class Seen:
 
 @dataclass
 class Row:
-    """A fault on a wire, and what it is told."""
+    """A fault on a wire, with its parameters."""
 
     wire: str
     name: str
@@ -160,7 +161,7 @@ class Row:
 
 
 class _Run(VirtualRun):
-    """Looks at every tag each scan."""
+    """Check every tag in each scan."""
 
     def __init__(self, options: VirtualOptions, rows: Sequence[Row]) -> None:
         super().__init__(options)
@@ -187,7 +188,7 @@ class _Run(VirtualRun):
         bench.trace.listen(self._on_tag, Kind.TAG)
 
     def _on_tag(self, event: Event) -> None:
-        """What lasts less than a scan counts as well."""
+        """States shorter than a scan count as well."""
         if event.data["quality"] != "good":
             for row in self.rows:
                 at_s = event.t_ns / NS_PER_S - row.begins_s
@@ -219,7 +220,8 @@ class _Run(VirtualRun):
 
 
 def _said_by_driver(bench: VirtualBench, device: str) -> set[str]:
-    """Return the errors that the gateway's status shows for a device now. A conflict of node ids is shown until the end."""
+    """Return the errors that the gateway's status shows for a device now. A conflict of node IDs is shown until the
+    end."""
     bus: Any = bench.run.gateway.buses[bench.system.devices[device].bus]
     if isinstance(bus, CanopenBus):
         state: Any = next(s for s in bus.nodes.values() if s.driver.config.name == device)
@@ -232,11 +234,11 @@ def _said_by_driver(bench: VirtualBench, device: str) -> set[str]:
 def through(
     rows: Sequence[tuple[str, str, dict[str, Any]]], before: Callable[[VirtualBench], Awaitable[None]] | None = None
 ) -> _Run:
-    """Run the rows: wire, fault, what it is told. `before` them something else can be done, for 3 s."""
+    """Run the rows: wire, fault, parameters. A `before` function may do something else for 3 s first."""
     numbers: dict[str, int] = {}
     made = []
     for wire, name, said in rows:
-        turn = DEVICES[wire]  # one fault at a time on a device
+        turn = DEVICES[wire]  # one fault at a time per device
         made.append(Row(wire, name, said, numbers.get(turn, 0)))
         numbers[turn] = made[-1].number + 1
     with TemporaryDirectory() as directory:

@@ -1,5 +1,6 @@
-"""Every row of the two catalogues of edge cases that concerns the drivers, as a scenario in virtual time: the real gateway, PLC
-and emulators, a fault on the wire, and what the wire, the tag's quality and the program show, and how soon all is well again."""
+"""Every row of the two lists of edge cases that concerns drivers, as a scenario in virtual time: the real gateway, PLC
+and emulators, a fault on the wire, its effects on the wire, the tag's quality and the program, and the time until
+recovery."""
 
 from __future__ import annotations
 
@@ -34,7 +35,7 @@ WHERE = {
     PORTS: ("real ports and sockets, which virtual time has none of", ("wires", "unit")),
     BUS: ("the wire and kernels", ("unit", "vectors/canopen_bus.toml")),
 }
-"""Why a row has no scenario here, and where it is tested instead."""
+"""Why a row has no scenario here, and which test covers it instead."""
 
 ELSEWHERE = {
     **dict.fromkeys(("MB-001", "MB-004", *(f"MB-{n:03}" for n in (*range(29, 48), 49, 53))), SLAVES),

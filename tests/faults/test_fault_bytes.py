@@ -1,4 +1,5 @@
-"""What each fault makes of a frame, byte by byte: on a line, in ASCII, behind an MBAP header; of CAN frames; of numbers."""
+"""The effect of each fault on a frame, byte by byte: on a line, in ASCII, with an MBAP header; on CAN frames; on
+numbers."""
 
 from __future__ import annotations
 
@@ -173,10 +174,10 @@ def test_the_next_frame_goes_before_the_reordered() -> None:
     (held,) = fault.strike(first, Random(1)).pieces
     assert [piece.data for piece in fault.strike(second, Random(1)).pieces] == [second.data, first.data]
     assert held.gone is not None
-    assert held.gone()  # it went behind the other
+    assert held.gone()  # the frames were swapped
     (alone,) = fault.strike(first, Random(1)).pieces
     assert alone.gone is not None
-    assert not alone.gone()  # nobody came
+    assert not alone.gone()  # no second frame arrived
 
 
 NODE = 5
@@ -219,7 +220,7 @@ NODE = 5
 def test_on_a_can_bus(
     name: str, said: dict[str, Any], frame: tuple[int, str], expected: list[tuple[int, str, float]] | None
 ) -> None:
-    """None: it does not aim at that."""
+    """None: the fault does not apply to this."""
     fault = made(name, **said)
     assert isinstance(fault, CanFault)
     sent = CanFrame(frame[0], bytes.fromhex(frame[1]))
@@ -304,7 +305,7 @@ REQUEST = understood(Way.REQUEST, Framing.RTU, line("1103 0010 0002"))
 
 
 def hits(fault: Active, times: int = 8, frame: Frame = REQUEST) -> list[int]:
-    """Which of so many frames, a second apart, it strikes; from 1."""
+    """Return which frames out of so many, one second apart, the fault changes; counted from 1."""
     return [n for n in range(1, times + 1) if fault.strikes(frame, n * 1_000_000_000)]
 
 
@@ -353,7 +354,7 @@ def test_faults_strike_one_after_the_other() -> None:
 
 @pytest.mark.parametrize("divides", [kind for kind in FAULTS.values() if issubclass(kind, WireFault) and kind.divides])
 def test_what_divides_a_frame_strikes_after_all_others(divides: type[WireFault]) -> None:
-    """Else the bytes of `garbage` would lie inside the frame, and Modbus TCP has no check sum to notice them."""
+    """Otherwise the bytes of `garbage` would be inside the frame, and Modbus TCP has no checksum to detect them."""
     faults = WireFaults(Framing.MBAP)
     for fault in (divides(divides.form()), made("garbage", data="FFFF")):
         faults.put_in(Active(fault.name, fault, Aim(), Random(1), 0, 5))
@@ -388,7 +389,7 @@ def test_frames_are_found_however_they_are_cut(pdus: list[bytes], framing: Frami
 
 
 def publish(payload: bytes, first: int = 0x30) -> bytes:
-    """A packet of MQTT (3.3): first byte, remaining length in groups of seven bits, topic "t", payload."""
+    """An MQTT packet (3.3): first byte, remaining length in groups of seven bits, topic "t", payload."""
     rest, length = len(payload) + 3, b""
     while rest or not length:
         length += bytes([rest & 0x7F | (0x80 if rest > 0x7F else 0)])
@@ -418,7 +419,7 @@ def test_frames_of_a_stream_are_found_however_they_are_cut(
 
 
 def test_of_mqtt_only_what_nobody_agreed_to_bring_is_struck() -> None:
-    """PUBLISH with QoS 0. Without the rest there is no session with the broker, and TCP brings it anyway."""
+    """PUBLISH with QoS 0. Other packets establish the session with the broker, and TCP delivers them."""
     faults = WireFaults(Framing.MQTT)
     faults.put_in(Active("drop", made("drop"), Aim(), Random(1), 0, None))
 

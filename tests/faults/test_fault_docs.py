@@ -1,4 +1,4 @@
-"""docs/faults.md: its file is one, and its keys are those that there are."""
+"""docs/faults.md: its example is a valid fault file, and its keys exist."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Fault files: what is wrong in one is named with its file, line, column and the nearest known word; and `fieldtwin faults`."""
+"""Errors in fault files are reported with file, line, column and the nearest known word; also `fieldtwin faults`."""
 
 from __future__ import annotations
 

@@ -1,6 +1,8 @@
-"""Every fault end to end, in virtual time: why the tag was not good, what the program saw, and how soon all was well again.
+"""Every fault end to end in virtual time: why the tag was not good, what the program saw, and how soon the system
+recovered.
 
-No value that a device did not hold is ever published as good. A row without reasons is one that nobody may notice.
+A value that the device did not hold is never published as good. A row without reasons is a fault that cannot be
+noticed.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ NOBODY: frozenset[str] = frozenset()
 
 
 class Row(NamedTuple):
-    """`why`: what the tag's quality says while it lasts. `well_s`: within how long after its end all is well."""
+    """`why`: the reason of the tag's quality during the fault. `well_s`: maximum time from its end to recovery."""
 
     wire: str
     name: str
@@ -119,11 +121,11 @@ DRIVER_SAYS = {
     "heartbeat_lost": "heartbeat lost",
     "duplicate-node": "two nodes seem to have the id",
 }
-"""What the driver's status shows, by why the tag is not good, or by the fault."""
+"""The error in the driver's status, by the reason of the tag's quality or by the fault."""
 NOT_A_DRIVERS = {"nan", "short-frame", "boot-storm"}
-"""The driver itself is well with these: values that are none, one TPDO of a node that answers, what is over at once."""
+"""The driver itself reports no error for these: invalid values, one TPDO of a node that answers, short faults."""
 BRIEF = {"boot-storm"}
-"""What a program does not see: it is over before the next scan."""
+"""Faults that a program does not see, because they end before the next scan."""
 ASKED_FOR = {
     ("line", "set"): 12.5,
     ("can", "set"): -12.5,
@@ -148,7 +150,8 @@ def test_each_fault_is_seen_for_what_it_is_and_is_over_when_it_is_over() -> None
 
 
 async def _by_hand(bench: VirtualBench) -> None:
-    """What somebody sets stays set until it is taken back; what makes no sense is refused, and says what would."""
+    """A value that the user sets remains set until it is cleared; an invalid one is refused with the reason and the
+    remedy."""
     began_s = bench.now_s()
     for device, tag, value in (("probe", "temperature", 21.5), ("tilt", "slope_lateral", -30.0)):
         await bench.set_value(device, tag, value)
@@ -197,7 +200,7 @@ def _value(bench: VirtualBench, tag: str) -> Any:
 
 
 def _wrong_with_driver(row: Row, seen: Seen) -> list[str]:
-    """One object that is not read well leaves a node online, and its driver without an error."""
+    """One unreadable object leaves a node online and its driver without an error."""
     told = [text for text in seen.driver_says if "two nodes" not in text or row.name == "duplicate-node"]
     if row.wire in ("sdo", "text") or row.name in NOT_A_DRIVERS:
         return []

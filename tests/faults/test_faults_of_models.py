@@ -1,5 +1,5 @@
-"""Value faults, and values that somebody sets, in devices that are models: by a Modbus profile, a modem's mailboxes, and CANopen
-nodes with a log, with a model, or with nothing but their data sheet."""
+"""Value faults, and values set by the user, in devices with models: by a Modbus profile, the mailboxes of a modem, and
+CANopen nodes with a log, with a model, or with a data sheet only."""
 
 from __future__ import annotations
 
@@ -71,33 +71,31 @@ def test_registers_of_a_model_hold_something_else_and_their_own_again(
         put(seen.distortions, "set", "valve", value=1),
     ]
     assert decode(list(seen.read("input", 0, 2, 0)), "float32") == -2.5
-    assert list(seen.read("holding", 11, 1, 0)) == [0x8009]  # the other tag of that register is as it was
+    assert list(seen.read("holding", 11, 1, 0)) == [0x8009]  # the other tag of that register is unchanged
     assert list(seen.read("holding", 12, 1, 0)) == [123]
     assert list(seen.read("coil", 7, 1, 0)) == [1]
     seen.read("holding", 0, 2, 0)
     assert (
         decode(list(seen.read("holding", 0, 2, 2 * NS_PER_S)), "uint32") == 10150
-    )  # 995, and 20 more, by 0.1 from 5 on
+    )  # 995, and 20 more: 0.1 per second from 5 on
     assert list(seen.read("holding", 1, 1, 2 * NS_PER_S)) == [10150]  # half of it
     bank.write("holding", 0, [0, 50], 3 * NS_PER_S)
-    assert (
-        decode(list(seen.read("holding", 0, 2, 3 * NS_PER_S)), "uint32") == 350
-    )  # what a master writes drifts as well
+    assert decode(list(seen.read("holding", 0, 2, 3 * NS_PER_S)), "uint32") == 350  # written values drift as well
     for id in ids:
         seen.distortions.take_away(id)
     assert decode(list(seen.read("holding", 0, 2, 4 * NS_PER_S)), "uint32") == 50
     assert [list(seen.read(*at, 4 * NS_PER_S)) for at in (("holding", 11, 2), ("coil", 7, 1))] == [[0x8002, 0], [0]]
     held = [h.raw.hex() for h in bank.journal.since(0) if h.tag == "mode"]
-    assert held == ["8002", "8009", "8002"]  # the oracle knows what was held
+    assert held == ["8002", "8009", "8002"]  # the oracle has the values of the device
 
 
 def test_a_read_of_a_distorted_tag_has_its_effects_once(tank: tuple[StatedRegisters, DistortedRegisters]) -> None:
     _, seen = tank
     put(seen.distortions, "drift", "alarm", per_s=1.0)
     assert list(seen.read("holding", 10, 1, 0)) == [3]
-    assert list(seen.read("holding", 10, 1, 5 * NS_PER_S)) == [5]  # 0 since it was read, and five seconds of drift
+    assert list(seen.read("holding", 10, 1, 5 * NS_PER_S)) == [5]  # 0 since it was read, plus five seconds of drift
     put(seen.distortions, "nan", "mode")
-    assert list(seen.read("holding", 11, 1, 0)) == [0x8002]  # no bits say "no number"
+    assert list(seen.read("holding", 11, 1, 0)) == [0x8002]  # no bit pattern means "not a number"
     with pytest.raises(IllegalAddress):
         seen.check_read("holding", 9, 1, 0)
 
@@ -125,7 +123,7 @@ def node(tmp_path: Path, log: str = "", profile: str = "inclinometer-cia410") ->
 
 
 def held(made: EmulatedNode, index: int, now_ns: int) -> float:
-    """What an SDO client gets of an object of 16 bits."""
+    """Return what an SDO client reads from an object of 16 bits."""
     request = CanFrame(0x605, b"\x40" + index.to_bytes(2, "little") + bytes(5), t_ns=now_ns)
     (reply,) = [f for f in made.node.feed(request, now_ns) if f.can_id == 0x585]
     assert reply.data[0] == 0x4B, reply

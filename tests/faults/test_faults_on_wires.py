@@ -1,4 +1,4 @@
-"""Faults on this computer's wires: a reset is one, a port dies and comes back, strangers on a link are struck."""
+"""Faults on real wires: a real TCP reset, a port that dies and returns, third-party programs on a link that get faults."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def at_once(*said: dict[str, Any], framing: Framing = Framing.MBAP) -> Any:
 
 
 async def answers(connection: ByteConnection) -> None:
-    """A device that answers whatever it hears."""
+    """A device that answers every received frame."""
     with contextlib.suppress(ConnectionLost):
         while True:
             await connection.read()
@@ -45,7 +45,7 @@ async def answers(connection: ByteConnection) -> None:
 
 @contextlib.asynccontextmanager
 async def device(faults: Any) -> Any:
-    """On a socket, behind faults; yields how to connect to it."""
+    """The device on a socket, with faults; yields a function that connects to it."""
 
     async def client(connection: ByteConnection) -> None:
         end = FaultyEnd(connection, faults)
@@ -80,7 +80,7 @@ def test_a_reset_is_one_inside_the_frame() -> None:
             assert await reader.readexactly(len(REPLY)) == REPLY
             writer.write(REQUEST)
             with pytest.raises(ConnectionResetError):
-                await reader.read()  # up to the end, which is none
+                await reader.read()  # up to the end of file, which does not exist
             again, writer = await connect()
             writer.write(REQUEST)
             assert await again.readexactly(len(REPLY)) == REPLY
@@ -153,7 +153,7 @@ def test_a_pty_hears_what_the_fault_makes_of_it(tmp_path: Path) -> None:
 
 @contextlib.asynccontextmanager
 async def linked(stranger: Any, faults: Any) -> Any:
-    """A client of `stranger`'s server, through a link with `faults`."""
+    """A client of the server `stranger`, through a link with `faults`."""
     server = await asyncio.start_server(stranger, "127.0.0.1", 0)
     far = Endpoint.parse(f"tcp://127.0.0.1:{server.sockets[0].getsockname()[1]}")
     link = Link(Endpoint.parse("tcp://127.0.0.1:0?listen=1"), far, faults=faults)
@@ -190,7 +190,7 @@ def test_a_link_puts_faults_between_strangers() -> None:
 
 
 def test_a_link_puts_faults_between_two_programs_with_serial_ports(tmp_path: Path) -> None:
-    """Masters are at the near one: what comes in there is a request."""
+    """Clients are on the near side; data arriving there is a request."""
 
     async def main() -> None:
         near, far = (Endpoint("pty", path=str(tmp_path / name)) for name in ("master", "device"))
@@ -218,7 +218,7 @@ def test_a_link_puts_faults_between_two_programs_with_serial_ports(tmp_path: Pat
 
 
 def test_a_link_strikes_whole_frames_of_a_stream_in_whatever_pieces_they_come() -> None:
-    """A digital thread over TCP: half a frame that is passed on by and by, or struck, would be the end of the stream."""
+    """A digital thread over TCP: a frame that is forwarded in parts, or damaged, would corrupt the stream."""
 
     async def main() -> None:
         sent = [bytes([n]) * 3000 for n in range(40)]
@@ -236,7 +236,7 @@ def test_a_link_strikes_whole_frames_of_a_stream_in_whatever_pieces_they_come() 
         faults = wire_faults(said, Framing.THREAD, 1, 0)
         async with linked(stranger, faults) as (reader, _):
             got: list[int] = []
-            while not got or got[-1] != 38:  # 39 is the fortieth, and lost
+            while not got or got[-1] != 38:  # 39 is the fortieth, which is lost
                 data = await reader.readexactly(int.from_bytes(await reader.readexactly(2)))
                 assert data == data[:1] * 3000
                 got.append(data[0])

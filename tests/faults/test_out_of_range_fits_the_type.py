@@ -1,8 +1,8 @@
 """The fault `out-of-range` gives a value that the tag's type can carry and that its range excludes, or it is refused.
 
-Observed before: its value was 1e9 for every tag. A 16-bit register was limited to 32767, and a part of a register
-(`bits`) wrapped, so that the "value out of range" was inside of the range. An explicit value without `register` was
-unchecked, and so was one of `emulate --faults`. Random faults of values had a key that no fault of values takes.
+Defects: its value was 1e9 for every tag. A 16-bit register was limited to 32767, and a part of a register (`bits`)
+wrapped, so the "value out of range" was inside the range. An explicit value without `register` was unchecked, also in
+`emulate --faults`. Random value faults had a key that no value fault accepts.
 """
 
 from __future__ import annotations
@@ -144,7 +144,7 @@ def test_random_value_faults_are_all_accepted(tmp_path: Path) -> None:
     wanted = RandomFaults(20.0, kinds=("out-of-range", "stuck", "nan"))
     chosen = [fault for seed in range(5) for fault in random_schedule(system, seed, 3600, wanted)]
     for fault in chosen:
-        target(system, parse_fault(fault))  # raises for one that cannot be put in
+        target(system, parse_fault(fault))  # raises if the value does not fit
     assert {fault["name"] for fault in chosen} == set(wanted.kinds)
     hit = {fault["register"] for fault in chosen if fault["name"] == "out-of-range"}
     assert hit == set(EXPECTED)

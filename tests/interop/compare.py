@@ -1,11 +1,12 @@
-"""Two conversations with the same device compared field by field. Pure: conversations and rules in, differences out.
+"""Compare two conversations with the same device field by field. Pure: conversations and rules in, differences out.
 
-All is equal unless a rule says otherwise, and every rule says why (tolerances.yaml). A rule cannot excuse a request whose
-bytes differ, a reply of another length or function, or another exception or abort code: there is no word for that.
+Everything must be equal unless a rule (tolerances.yaml) allows a difference and gives the reason. The rules have no key
+to allow a request with different bytes, a reply of a different length or function, or a different exception or abort
+code.
 
-A conversation is taken apart into *polls* (cyclic reads: how often and between which others one comes is timing; what they were
-answered, repeats collapsed, is not), *streams* (requests in an order of their own, their place among the others is timing),
-the *script* (everything else, in order), and what was *heard* unasked.
+A conversation consists of *polls* (cyclic reads: their number and position are timing and are ignored; their replies,
+with repetitions collapsed, are compared), *streams* (requests that are ordered among themselves only), the *script*
+(all other requests, in order), and *heard* frames, which were received without a request.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ class Strict(BaseModel):
 
 
 class Field(Strict):
-    """A number inside a reply or frame that may differ: `at` bytes from its start, a `struct` format, by how much, and why."""
+    """A number in a reply or frame that may differ: `at` bytes from its start, a `struct` format, the tolerance, and
+    the reason."""
 
     name: str
     at: int
@@ -43,14 +45,14 @@ class Field(Strict):
 
 
 class Spare(Strict):
-    """Up to so many more on one side than on the other."""
+    """The maximum surplus on one side."""
 
     most: int = 0
     why: str = ""
 
 
 class Rule(Strict):
-    """A poll or a stream, told by how its requests begin (hex, from the unit id or COB-ID on)."""
+    """A poll or a stream, identified by the first bytes of its requests (hex, from the unit ID or COB-ID on)."""
 
     request: str
     why: str
@@ -64,7 +66,8 @@ class Rule(Strict):
 
 
 class HeardRule(Strict):
-    """Frames with one COB-ID. `collapse`: a state told again and again; otherwise a series, compared one by one."""
+    """Frames with one COB-ID. `collapse`: repetitions of a state are ignored; otherwise a series that is compared frame
+    by frame."""
 
     cob_id: str
     why: str
@@ -74,7 +77,7 @@ class HeardRule(Strict):
 
 
 class DeviceRules(Strict):
-    """What may differ between two conversations with one device."""
+    """The permitted differences between two conversations with one device."""
 
     polls: tuple[Rule, ...] = ()
     streams: tuple[Rule, ...] = ()
@@ -88,7 +91,7 @@ Tolerances = dict[str, DeviceRules]
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """What differs: where (a request in hex, or a COB-ID), what, what was expected and what was found."""
+    """A difference: where (a request in hex, or a COB-ID), what, the expected and the actual value."""
 
     device: str
     where: str
@@ -101,7 +104,7 @@ class Difference:
 
 
 class Comparison:
-    """Compares `other` with `reference`; the result is in `differences`, how much was compared in `compared`."""
+    """Compare `other` with `reference`; `differences` has the result, `compared` the amount of data compared."""
 
     def __init__(self, reference: Conversation, other: Conversation, rules: DeviceRules) -> None:
         self.differences: list[Difference] = []
@@ -134,7 +137,8 @@ class Comparison:
     # -- requests and replies -------------------------------------------------------------------------------------------
 
     def _sequence(self, one: list[Exchange], two: list[Exchange], fields: Sequence[Field], spare: int) -> None:
-        """Exchanges in order. The first request that differs ends it: what follows is out of step."""
+        """Compare exchanges in order. The first request that differs ends the comparison, because the rest is out of
+        step."""
         for a, b in zip(one, two, strict=False):
             self.compared += 1
             if a.request != b.request:
@@ -159,7 +163,8 @@ class Comparison:
             self._close(where, "median interval in ms", _interval(a), _interval(b), rule.interval_within_ms)
 
     def _replies(self, rule: Rule, one: list[bytes], two: list[bytes]) -> None:
-        """Every distinct reply of one side must have been given by the other too; but the last of the side with more."""
+        """Require that every distinct reply of one side also occurs on the other, except the last one of the longer
+        side."""
         a, b = list(dict.fromkeys(one)), list(dict.fromkeys(two))
         self.compared += len(a) + len(b)
         for mine, others, mine_is_reference in ((a, b, True), (b, a, False)):
@@ -194,17 +199,17 @@ class Comparison:
 
 
 def compare(reference: Conversation, other: Conversation, rules: DeviceRules) -> list[Difference]:
-    """What differs, in order; empty when nothing does."""
+    """Return the differences in order; empty if there are none."""
     return Comparison(reference, other, rules).differences
 
 
 def reply_differences(expected: bytes, got: bytes, fields: Iterable[Field]) -> list[tuple[str, str, str]]:
-    """What, expected and got, for each thing that two replies differ in."""
+    """Return the kind, expected and actual value of each difference of two replies."""
     return list(_structure(expected, got)) or frame_differences(expected, got, fields)
 
 
 def frame_differences(expected: bytes, got: bytes, fields: Iterable[Field]) -> list[tuple[str, str, str]]:
-    """As `reply_differences`, for bytes of which nothing is known but the fields."""
+    """As `reply_differences`, for bytes of which only the fields are known."""
     if len(expected) != len(got):
         return [("length", f"{len(expected)} bytes", f"{len(got)} bytes")]
     found = []
@@ -219,7 +224,7 @@ def frame_differences(expected: bytes, got: bytes, fields: Iterable[Field]) -> l
 
 
 def _structure(expected: bytes, got: bytes) -> Iterator[tuple[str, str, str]]:
-    """Is there a reply, of the same function, the same code where it refuses, the same length."""
+    """Return whether there is a reply of the same function and length, with the same code if it is an error."""
     if expected == got:
         return
     if not expected or not got:
@@ -233,19 +238,20 @@ def _structure(expected: bytes, got: bytes) -> Iterator[tuple[str, str, str]]:
 
 
 def _is_sdo(reply: bytes) -> bool:
-    """COB-ID 581h to 5FFh and eight bytes."""
+    """Return whether it is COB-ID 581h to 5FFh with eight bytes."""
     return len(reply) == 10 and 0x581 <= int.from_bytes(reply[:2]) <= 0x5FF
 
 
 def _refusal(reply: bytes) -> str:
-    """The exception code of a Modbus reply (AP 7) or the abort code of an SDO (CiA 301, 7.2.4.3.17); "" for neither."""
+    """Return the exception code of a Modbus reply (AP 7) or the abort code of an SDO (CiA 301, 7.2.4.3.17); "" if
+    neither."""
     if _is_sdo(reply):
         return f"abort {int.from_bytes(reply[6:10], 'little'):08X}h" if reply[2] == 0x80 else ""
     return f"exception {reply[2]:02X}h" if len(reply) >= 3 and reply[1] & 0x80 else ""
 
 
 def _nearest(reply: bytes, others: Sequence[bytes], fields: Sequence[Field]) -> bytes:
-    """The reply of `others` that differs least from `reply`."""
+    """Return the reply of `others` that differs least from `reply`."""
     return min(others, key=lambda o: (len(reply_differences(o, reply, fields)), _bytes_apart(o, reply)), default=b"")
 
 
@@ -258,11 +264,11 @@ def _latency(talk: Conversation) -> float | None:
 
 
 def _interval(items: Sequence[Exchange] | Sequence[Heard]) -> float | None:
-    """The median time between one and the next, in ms."""
+    """Return the median interval in ms."""
     gaps = [(b.t_ns - a.t_ns) / 1e6 for a, b in pairwise(items)]
     return median(gaps) if gaps else None
 
 
 def load_tolerances(text: dict[str, Any]) -> Tolerances:
-    """The reviewed file's content, checked: a misspelt word is an error, not a missing rule."""
+    """Return the checked content of the reviewed file. A misspelt key is an error, not a missing rule."""
     return {device: DeviceRules.model_validate(rules) for device, rules in text.items()}

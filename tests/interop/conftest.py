@@ -1,4 +1,4 @@
-"""The flagship's conversations, held once a session and looked at by several tests."""
+"""The conversations of the flagship test, made once per session for several tests."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MISSING = [p for p in ("socat",) if shutil.which(p) is None] + ([] if find_libra
 
 @pytest.fixture(scope="session")
 def short_dir() -> Iterator[Callable[[], Path]]:
-    """Makes directories whose paths are short enough for Unix sockets."""
+    """Create directories with paths short enough for Unix sockets."""
     made: list[Path] = []
 
     def make() -> Path:
@@ -46,7 +46,7 @@ def with_emulators(short_dir: Callable[[], Path]) -> Held:
 
 @pytest.fixture(scope="session")
 def against_strangers(short_dir: Callable[[], Path], with_emulators: Held) -> Callable[..., Held]:
-    """(b): the observatory against the independent devices, with differences planted in them or not."""
+    """(b): the observatory against the independent devices, with or without planted differences."""
     if MISSING:
         pytest.skip(f"not installed: {', '.join(MISSING)}")
     samples = samples_like(with_emulators.talks["ctd"])
@@ -65,5 +65,5 @@ def against_strangers(short_dir: Callable[[], Path], with_emulators: Held) -> Ca
 
 @pytest.fixture(scope="session")
 def with_strangers(against_strangers: Callable[..., Held]) -> Held:
-    """(b), as the devices are."""
+    """(b), without planted differences."""
     return against_strangers()

@@ -1,7 +1,8 @@
-"""What a capture says, per device, in a form that two captures can be compared in: exchanges, and what was heard unasked.
+"""The content of a capture per device, in a form suited for comparison: exchanges, and frames received without a
+request.
 
-Reads frames by itself (check sums included) and knows nothing of drivers, emulators or profiles: what is compared must not be
-seen through the eyes of what is tested.
+It parses frames itself, including checksums, and uses no driver, emulator or profile, because the comparison must be
+independent of the code under test.
 """
 
 from __future__ import annotations
@@ -18,9 +19,9 @@ SDO_REPLY, SDO_REQUEST, NMT = 0x580, 0x600, 0x000
 
 @dataclass(frozen=True, slots=True)
 class Exchange:
-    """A request and its reply, both from the address on: unit id and PDU, or COB-ID (two bytes) and data.
+    """A request and its reply, both from the address on: unit ID and PDU, or COB-ID (two bytes) and data.
 
-    `reply` is empty where none came. `latency_ms` is from the request to the last byte of the reply.
+    `reply` is empty if none arrived. `latency_ms` is measured from the request to the last byte of the reply.
     """
 
     t_ns: int
@@ -31,7 +32,7 @@ class Exchange:
 
 @dataclass(frozen=True, slots=True)
 class Heard:
-    """A frame that nobody asked for: a TPDO, a heartbeat, an EMCY."""
+    """A frame without a request: a TPDO, a heartbeat, an EMCY."""
 
     t_ns: int
     cob_id: int
@@ -40,7 +41,8 @@ class Heard:
 
 @dataclass
 class Conversation:
-    """One device's. `faults` says what no frame of its protocol may be: a bad CRC, a reply that answers nothing."""
+    """The conversation of one device. `faults` lists violations of its protocol: a wrong CRC, a reply without a
+    request."""
 
     device: str
     exchanges: list[Exchange] = field(default_factory=list)
@@ -49,7 +51,7 @@ class Conversation:
 
 
 def rtu_conversation(device: str, captured: Iterable[Captured]) -> Conversation:
-    """Of a serial line with one unit on it: what came between two requests is the reply to the first (SL 2.4.1)."""
+    """Parse a serial line with one unit: bytes between two requests are the reply to the first (SL 2.4.1)."""
     talk = Conversation(device)
     for sent, received in _turns(captured):
         reply = b"".join(_bytes(c) for c in received)
@@ -62,7 +64,7 @@ def rtu_conversation(device: str, captured: Iterable[Captured]) -> Conversation:
 
 
 def tcp_conversation(device: str, captured: Iterable[Captured]) -> Conversation:
-    """Of a Modbus/TCP connection with one request under way at a time. Transaction ids must match, and are dropped."""
+    """Parse a Modbus TCP connection with one outstanding request. Transaction ids must match, and are dropped."""
     talk = Conversation(device)
     for sent, received in _turns(captured):
         request, reply = _bytes(sent), b"".join(_bytes(c) for c in received)
@@ -77,7 +79,8 @@ def tcp_conversation(device: str, captured: Iterable[Captured]) -> Conversation:
 
 
 def canopen_conversation(device: str, captured: Iterable[Captured], node: int) -> Conversation:
-    """Of a node: SDO requests with their replies, NMT commands and whatever else was sent (without replies), and the rest."""
+    """Parse the frames of a node: SDO requests with replies, NMT commands and other sent frames (without replies), and
+    the rest."""
     talk = Conversation(device)
     for c in captured:
         frame = c.item
@@ -109,7 +112,7 @@ def _bytes(captured: Captured) -> bytes:
 
 
 def _turns(captured: Iterable[Captured]) -> list[tuple[Captured, list[Captured]]]:
-    """Every chunk sent with all that came until the next one."""
+    """Return every sent chunk with the bytes received until the next one."""
     turns: list[tuple[Captured, list[Captured]]] = []
     for c in captured:
         if c.direction is Direction.SENT:

@@ -1,7 +1,7 @@
-"""The observatory's own gateway and PLC against a target, by a script, with every byte captured.
+"""Run the observatory's gateway and PLC against a target, by a script, and capture every byte.
 
-What is started here is the plant's software with the plant's file. A target only says where each of the plant's endpoints is to
-be opened, and can have a period commanded from the far side.
+This starts the plant's software with the plant's file. A target only states where each endpoint of the plant is opened,
+and can have a remote client command a period.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ from fieldtwin.twin.site.system import System, load_system
 
 SYSTEM = Path(__file__).parents[2] / "profiles/systems/observatory.yaml"
 SAMPLES = 2
-"""How many samples are relayed before the stop is commanded."""
+"""Number of relayed samples before the stop command."""
 
 
 class Target(Protocol):
-    """What the plant's endpoints are mapped to, and the far side of the modem."""
+    """The mapping of the plant's endpoints, and the remote client of the modem."""
 
     mapping: dict[Endpoint, Endpoint]
 
@@ -52,7 +52,8 @@ class Target(Protocol):
 
 @dataclass
 class Run:
-    """What a run left behind. `refused`: what came of each request that a device must refuse; `stuck`: a step without end."""
+    """The results of a run. `refused`: the result of each request that a device must refuse; `stuck`: a step that did
+    not end."""
 
     system: System
     captured: list[Captured] = field(default_factory=list)
@@ -61,12 +62,12 @@ class Run:
     requests: dict[str, int] = field(default_factory=dict)
 
     def of_bus(self, bus: str) -> list[Captured]:
-        """What went over one bus."""
+        """Return the traffic of one bus."""
         return [c for c in self.captured if c.endpoint == self.system.buses[bus].endpoint]
 
 
 async def converse(target: Target, run_dir: Path, patience_s: float = 15.0) -> Run:
-    """Run the script against `target`. A step that does not end within `patience_s` ends the script and is named."""
+    """Run the script against `target`. A step longer than `patience_s` ends the script and is named."""
     system = load_system(str(SYSTEM))
     run = Run(system)
     clock, tap = WallClock(), CaptureTap(100_000)
@@ -101,12 +102,13 @@ async def converse(target: Target, run_dir: Path, patience_s: float = 15.0) -> R
 
 
 def sum_of(totals: dict[str, int]) -> int:
-    """Requests that the gateway counted on a bus."""
+    """Return the number of requests that the gateway counted on a bus."""
     return totals.get("requests", 0) or totals.get("sdo_requests", 0)
 
 
 async def _until_quiet(tap: CaptureTap, within_s: float) -> None:
-    """The node was told to leave OPERATIONAL: wait for the heartbeat that says so, however the run went."""
+    """After the node was told to leave OPERATIONAL, wait for the heartbeat that confirms it, whatever the result of the
+    run."""
 
     def told() -> bool:
         beats = [c.item for c in tap.captured if isinstance(c.item, CanFrame) and c.item.can_id == 0x705]
@@ -115,11 +117,11 @@ async def _until_quiet(tap: CaptureTap, within_s: float) -> None:
     try:
         await eventually(told, within_s=min(within_s, 2.0))
     except AssertionError:
-        pass  # a planted fault may have kept the node from being started
+        pass  # a planted fault may have prevented the start of the node
 
 
 class Script:
-    """The steps: up, period 1, samples relayed, period 0, then what the devices must refuse."""
+    """The steps: start, period 1, relayed samples, period 0, then requests that the devices must refuse."""
 
     def __init__(self, gateway: Gateway, target: Target, tap: CaptureTap, run: Run) -> None:
         self.gateway, self.target, self.tap, self.run = gateway, target, tap, run
@@ -140,7 +142,7 @@ class Script:
         ]
 
     async def _until(self, condition: Callable[[], bool]) -> None:
-        await eventually(condition, within_s=3600)  # the caller has the bound
+        await eventually(condition, within_s=3600)  # the caller limits the time
 
     def _value(self, tag: str) -> object:
         value = self.gateway.tags.current(tag, self.gateway.clock.monotonic_ns())
@@ -165,7 +167,7 @@ class Script:
         await self._until(lambda: self.period.held == period_s and self.gateway.outputs.settled)
 
     async def refusals(self) -> None:
-        """Requests outside what the devices' manuals allow, over the running gateway's own queues."""
+        """Send requests that the devices' manuals forbid, through the queues of the running gateway."""
         ctd, incl = self.gateway.drivers["ctd"], self.gateway.drivers["inclinometer"]
         assert isinstance(ctd, RegisterDriver)
         assert isinstance(incl, CanopenDriver)
@@ -204,7 +206,7 @@ class Script:
 
 
 async def converse_on_can(target: Endpoint, run_dir: Path, patience_s: float = 15.0) -> list[Captured]:
-    """The inclinometer's part alone, where a kernel's CAN stands in: brought up, heard, and told to stop."""
+    """Run the part of the inclinometer alone on a kernel's CAN: start, receive, and stop."""
     system = load_system(str(SYSTEM))
     plant, config = system.buses["can0"], system.devices["inclinometer"]
     clock, tap = WallClock(), CaptureTap(100_000)
@@ -222,7 +224,7 @@ async def converse_on_can(target: Endpoint, run_dir: Path, patience_s: float = 1
                 try:
                     await driver.master.sdo_upload(driver.node, index, subindex)
                 except DeviceRefused:
-                    pass  # as it must: the comparison looks at the abort code
+                    pass  # expected: the comparison checks the abort code
             await bus.stop_nodes(1.0)
             await _until_quiet(tap, patience_s)
     finally:
@@ -231,7 +233,7 @@ async def converse_on_can(target: Endpoint, run_dir: Path, patience_s: float = 1
 
 
 def heard(tap: CaptureTap, cob_id: int) -> int:
-    """How many frames with this COB-ID were received."""
+    """Return the number of received frames with this COB-ID."""
     return sum(
         isinstance(c.item, CanFrame) and c.item.can_id == cob_id and c.direction is Direction.RECEIVED
         for c in tap.captured

@@ -1,4 +1,4 @@
-"""A run of the flagship and what was said in it, for the tests that look at it."""
+"""A run of the flagship and its conversations, for the tests that examine it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from flagship import Run
 
 @dataclass
 class Held:
-    """A run and what was said in it, by device."""
+    """A run and its conversations by device."""
 
     run: Run
     talks: dict[str, Conversation]

@@ -1,4 +1,5 @@
-"""A TCP server of pymodbus 3.9.2 as a program of its own, with the units of its first argument (``5,9``). Prints its port.
+"""A TCP server of pymodbus 3.9.2 in a separate program, with the units of its first argument (``5,9``). It prints its
+port.
 
 This release answers a request to a unit that it does not have as unit 0, with function 80h and exception 0B.
 """
@@ -16,7 +17,7 @@ from pymodbus.server import ModbusTcpServer
 
 async def main() -> None:
     logging.getLogger("pymodbus.logging").setLevel(logging.CRITICAL)
-    old: Any = datastore  # its names are those of the old release
+    old: Any = datastore  # names of the old release
     block = old.ModbusSequentialDataBlock
     units = {int(unit): old.ModbusSlaveContext(hr=block(1, [17] * 100)) for unit in sys.argv[1].split(",")}
     context: Any = old.ModbusServerContext(slaves=units, single=False)

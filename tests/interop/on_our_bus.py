@@ -1,8 +1,9 @@
 """A pytest plugin that runs the tests of other packages on the software CAN bus (`scripts/test-third-party-can`).
 
-python-can's interface `virtual` becomes the interface `fieldtwin`: each channel name is a bus of its own at 500 kbit/s, in this
-process. Tests that are expected to fail are listed with their reasons in the file that FIELDTWIN_EXPECTED names; one that is
-listed and passes is a failure, unless the entry says `sometimes`, and so is an entry that fits no test.
+It replaces python-can's interface `virtual` by the interface `fieldtwin`: each channel name is a separate bus at 500
+kbit/s, in this process. The file named by FIELDTWIN_EXPECTED lists the tests that are expected to fail, with reasons. A
+listed test that passes is a failure, unless the entry says `sometimes`; an entry that matches no test is also a
+failure.
 """
 
 from __future__ import annotations
@@ -24,8 +25,8 @@ from fieldtwin.gateway.core.endpoint import Endpoint
 
 BITRATE = 500_000
 PATIENCE_S = 1.0
-"""How long python-can's back-to-back tests wait for a message, and canopen's SDO client for a reply. Their own 0.1 s and 0.3 s
-are less than a loaded computer may take."""
+"""Timeouts of python-can's back-to-back tests for a message and of canopen's SDO client for a reply. Their defaults of
+0.1 s and 0.3 s are too short on a loaded computer."""
 
 _loop = asyncio.new_event_loop()
 _servers: dict[Any, SoftBusServer] = {}
@@ -34,7 +35,7 @@ threading.Thread(target=_loop.run_forever, daemon=True).start()
 
 
 class OnOurBus(SoftBus):
-    """What programs get that ask for the interface `virtual`."""
+    """The bus for programs that request the interface `virtual`."""
 
     def __init__(self, channel: Any = None, can_filters: Any = None, **options: Any) -> None:
         with _opening:
@@ -43,7 +44,7 @@ class OnOurBus(SoftBus):
                 _servers[channel] = asyncio.run_coroutine_threadsafe(opening, _loop).result(30)
         host, port = _servers[channel].bound.address
         super().__init__(f"{host}:{port}", can_filters, **options)
-        self._channel = channel  # as messages name it
+        self._channel = channel  # the name in messages
 
 
 SdoClient.RESPONSE_TIMEOUT = PATIENCE_S
@@ -52,7 +53,7 @@ can.interfaces.BACKENDS["virtual"] = (__name__, OnOurBus.__name__)
 
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the expected failures, and give the back-to-back tests more time."""
+    """Mark the expected failures, and extend the timeout of the back-to-back tests."""
     expected = tomllib.loads(Path(os.environ["FIELDTWIN_EXPECTED"]).read_text())
     suite = os.environ["FIELDTWIN_SUITE"]
     left = {entry["test"]: entry for entry in expected.get(suite, [])}

@@ -1,7 +1,9 @@
-"""Plays the rows of tests/vectors/modbus_slave.toml on a server of another make, over real ptys and sockets, all at once.
+"""Run the rows of tests/vectors/modbus_slave.toml on third-party servers, over real ptys and sockets, all at the same
+time.
 
-Only what a master can see is asked: bytes, pauses, cells that can be read, and whether the wire is wedged afterwards. Counters,
-strict timing and settings of our own are not. What a peer does otherwise is told in one line that is the same each time.
+Only behaviour visible to a client is tested: bytes, pauses, readable cells, and whether the wire is still usable
+afterwards. Counters, strict timing and our own settings are not. Each deviation of a peer is described in one line that
+is the same each time.
 """
 
 from __future__ import annotations
@@ -23,15 +25,15 @@ from fieldtwin.gateway.protocols.modbus.crc import with_crc
 HERE = Path(__file__).parent
 VECTORS = HERE.parent / "vectors"
 PEERS = {"pymodbus": ("rtu", "ascii", "mbap", "udp"), "libmodbus": ("rtu", "mbap")}
-"""Which wires each has a server for."""
+"""The wires that each peer can serve."""
 REPLY_WITHIN_S = 1.5
 SILENCE_S = 0.5
 STAGGER_S = 0.01
-"""From the beginning of one row to that of the next: what many do at once would look like a peer that thinks for long."""
+"""Interval between the starts of two rows. With many simultaneous rows, a peer would seem slow to answer."""
 PAUSE_S = 0.8
-"""Longer than any of the peers waits for the rest of a frame."""
+"""Longer than any peer waits for the rest of a frame."""
 APART_S = 0.1
-"""At least this between two pieces that a row has apart: how they are read must not depend on the machine's load."""
+"""Minimum pause between two pieces that a row separates, so that the result does not depend on the machine's load."""
 READ_COIL = b"\x01\x00\x00\x00\x01"
 
 Row = dict[str, Any]
@@ -47,7 +49,7 @@ def wire_of(row: Row) -> str:
 
 
 def asked_of(peer: str, row: Row, not_asked: dict[str, str]) -> bool:
-    """Whether the row can be played on the peer: it has the wire, and needs no setting that is our emulator's own."""
+    """Return whether the row applies to the peer: the peer has the wire, and the row needs no setting of our emulator."""
     own = {"even_only", "max_in_flight"} & set(row)
     return wire_of(row) in PEERS[peer] and not own and row["id"] not in not_asked
 
@@ -62,7 +64,7 @@ def shown(row: Row, data: bytes | bytearray) -> str:
 
 
 def framed(row: Row, pdu: bytes) -> bytes:
-    """A request to unit 1 in the row's framing."""
+    """Return a request to unit 1 in the row's framing."""
     if wire_of(row) in ("mbap", "udp"):
         return b"\x77\x77\x00\x00" + (len(pdu) + 1).to_bytes(2, "big") + b"\x01" + pdu
     frame = b"\x01" + pdu
@@ -72,7 +74,7 @@ def framed(row: Row, pdu: bytes) -> bytes:
 
 
 class Wire:
-    """A pty's own side or a connected socket, as a file descriptor: what was heard, and whether it is closed."""
+    """Our side of a pty or a connected socket, as a file descriptor, with the received bytes and whether it is closed."""
 
     def __init__(self, fd: int) -> None:
         self.fd = fd
@@ -100,13 +102,13 @@ class Wire:
             self.closed = True
 
     async def take(self, count: int) -> bytes:
-        """What was heard, once it is `count` bytes or more, the wire is closed or time is up."""
+        """Return the received bytes when they are at least `count`, the wire is closed or the time is over."""
         try:
             async with asyncio.timeout(REPLY_WITHIN_S):
                 while len(self.heard) < count and not self.closed:
                     self._more.clear()
                     await self._more.wait()
-            await asyncio.sleep(APART_S)  # what is said besides comes along
+            await asyncio.sleep(APART_S)  # also collects surplus bytes
         except TimeoutError:
             pass
         data = bytes(self.heard)
@@ -118,18 +120,18 @@ class Wire:
 
 
 class Play:
-    """One row on one server."""
+    """Run one row on one server."""
 
     def __init__(self, row: Row, wire: Wire) -> None:
         self.row, self.wire = row, wire
 
     async def after(self, delay_s: float) -> str:
-        """`difference`, begun a little later."""
+        """Run `difference`, delayed."""
         await asyncio.sleep(delay_s)
         return await self.difference()
 
     async def difference(self) -> str:
-        """What the server does otherwise than the row says; empty when nothing."""
+        """Return the deviation of the server from the row; empty if there is none."""
         said_ms = 0.0
         for step in self.row["steps"]:
             if step["at_ms"] > said_ms:
@@ -143,7 +145,7 @@ class Play:
                 return f"{self.said(found)} instead of {shown(self.row, wanted)}"
         await asyncio.sleep(SILENCE_S)
         if self.wire.heard:
-            # The same words as above: it is a matter of load which of the two sees it.
+            # the same text as above, because the load decides which of the two detects it
             return f"sends {shown(self.row, self.wire.heard)} unasked"
         return await self.afterwards() or await self.cells()
 
@@ -153,7 +155,7 @@ class Play:
         return "closes the connection" if self.wire.closed else "silent"
 
     async def send(self, data: bytes) -> None:
-        """In one piece; in the row that is about bytes, byte by byte."""
+        """Send in one piece, or byte by byte if the row tests that."""
         size = 1 if "byte by byte" in self.row["id"] else 1000
         for i in range(0, len(data), size):
             self.wire.send(data[i : i + size])
@@ -165,7 +167,7 @@ class Play:
         return await self.wire.take(len(framed(self.row, pdu[:1] + b"\x01\x00" + b"\x00" * (pdu[0] == 3))))
 
     async def afterwards(self) -> str:
-        """Whether a request after a pause is answered; where the row says `closed`, nothing may be."""
+        """Return whether a request after a pause is answered; if the row says `closed`, it must not be."""
         await asyncio.sleep(PAUSE_S)
         answer = await self.ask(READ_COIL)
         if self.row.get("closed"):
@@ -176,7 +178,7 @@ class Play:
         return f"afterwards {self.said(answer)}"
 
     async def cells(self) -> str:
-        """The cells that can be read as the row says they are (of unit 1)."""
+        """Return whether the readable cells of unit 1 have the values of the row."""
         for table, function in (("coil", 1), ("holding", 3)):
             for address, value in self.row.get(table, []):
                 answer = await self.ask(bytes([function]) + address.to_bytes(2, "big") + b"\x00\x01")
@@ -187,7 +189,7 @@ class Play:
 
 
 class Stage:
-    """The wires of all rows, and the program that serves on the other side of them."""
+    """The wires of all rows, and the program that serves them."""
 
     def __init__(self, peer: str, rows: list[Row], stack: ExitStack) -> None:
         self.peer, self.rows, self.stack = peer, rows, stack
@@ -200,7 +202,7 @@ class Stage:
         ]
 
     def line(self, number: int, row: Row) -> str:
-        """A pty for the row, the far side of which stays open here too: nobody sees a hang-up."""
+        """A pty for the row. Its far side remains open here, so that no peer sees a hang-up."""
         if wire_of(row) not in ("rtu", "ascii"):
             return ""
         near, far = os.openpty()
@@ -225,7 +227,7 @@ class Stage:
 
 
 async def play_on(peer: str, rows: list[Row]) -> dict[str, str]:
-    """What `peer` does otherwise, row by row; rows that pass have ''."""
+    """Return the deviations of `peer` by row; '' for rows that pass."""
     with ExitStack() as stack:
         stage = Stage(peer, rows, stack)
         jobs = json.dumps(stage.jobs()).encode() + b"\n"

@@ -1,7 +1,7 @@
-"""Masters of other makes as programs of their own, each holding the same conversation: ``strange_masters.py NAME WIRE WHERE``.
+"""Third-party clients in separate programs, each with the same conversation: ``strange_masters.py NAME WIRE WHERE``.
 
-WIRE is ``rtu``, ``ascii`` or ``tcp``; WHERE a serial port or a TCP port on this machine. Prints as JSON what each step gave, and
-nothing else. It knows none of our code.
+WIRE is ``rtu``, ``ascii`` or ``tcp``; WHERE is a serial port or a local TCP port. The program prints only the result of
+each step, as JSON. It uses none of our code.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ BAUD_RATE = 115200
 
 
 class Master(Protocol):
-    """`read` and `write` by the numbers of the functions; `refused` is the code of the exception that a read met."""
+    """`read` and `write` by function code; `refused` returns the exception code of a read."""
 
     def read(self, function: int, address: int, count: int) -> list[int]: ...
     def write(self, function: int, address: int, values: list[int]) -> None: ...
@@ -67,7 +67,7 @@ class Minimalmodbus:
 
         self.master = minimalmodbus.Instrument(where, UNIT, mode=wire)
         port: Any = self.master.serial
-        port.baudrate, port.timeout = BAUD_RATE, 0.5  # which it waits out when the reply is an exception
+        port.baudrate, port.timeout = BAUD_RATE, 0.5  # it waits for this time if the reply is an exception
 
     def read(self, function: int, address: int, count: int) -> list[int]:
         read = self.master.read_bits if function < 3 else self.master.read_registers
@@ -119,7 +119,7 @@ class PyModbusTCP:
 
 
 class Umodbus:
-    """Reads and writes by one name for both wires."""
+    """Read and write with the same functions for both wires."""
 
     def __init__(self, wire: str, where: str) -> None:
         self.wire: Any

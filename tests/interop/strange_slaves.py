@@ -1,11 +1,11 @@
-"""Servers of other makes as a program of its own: one child process a row, each with the device of the rows, fresh.
+"""Third-party servers in a separate program: one child process per row, each with a fresh device.
 
 Standard input: one line of JSON, a list of ``{"row": n, "wire": "rtu" | "ascii" | "mbap" | "udp", "line": path of a
-serial port or "", "units": [1]}``. Standard output: ``n port`` a row once it serves (port 0 on a line). Ends, with all
-its children, when its standard input does. A child a row, because pymodbus keeps its diagnostics once a process and
-libmodbus answers one master at a time; forked, because that takes milliseconds.
+serial port or "", "units": [1]}``. Standard output: ``n port`` per row when it serves (port 0 on a line). The program
+ends, with all its children, at the end of standard input. Each row has a child, because pymodbus keeps its diagnostics
+per process and libmodbus answers one client at a time. The children are forked, because that takes milliseconds.
 
-It knows nothing of our code: what it serves is written down here a second time.
+It uses none of our code: it has a separate definition of the served device.
 """
 
 from __future__ import annotations
@@ -55,7 +55,8 @@ def serve_pymodbus(job: dict[str, Any]) -> None:
 
     async def main() -> None:
         server: ModbusSerialServer | ModbusTcpServer | ModbusUdpServer
-        if job["wire"] in ("rtu", "ascii"):  # on a line others' requests are silently ignored and 0 is a broadcast
+        # on a line, requests to other units are ignored silently, and 0 is a broadcast
+        if job["wire"] in ("rtu", "ascii"):
             server = ModbusSerialServer(
                 devices, framer=FramerType(job["wire"]), port=job["line"], baudrate=BAUD_RATE, identity=names,
                 ignore_missing_devices=True, broadcast_enable=True,
@@ -90,7 +91,7 @@ class Mapping(ctypes.Structure):
 
 
 def serve_libmodbus(job: dict[str, Any]) -> None:
-    """As its own example servers do: a frame that was none is passed over on a line and ends a TCP connection."""
+    """Behave like libmodbus's example servers: an invalid frame is ignored on a line and ends a TCP connection."""
     lib = ctypes.CDLL(find_library("modbus"), use_errno=True)
     for name in ("modbus_new_tcp", "modbus_new_rtu"):
         getattr(lib, name).restype = ctypes.c_void_p
@@ -170,7 +171,7 @@ def serve_umodbus(job: dict[str, Any]) -> None:
         server.route([1], reads, list(cells))(read)
         server.route([1], writes, list(cells))(write)
     say(job["row"], port)
-    server.serve_forever(poll_interval=0.05)  # also how long it waits for the rest of a frame on a line
+    server.serve_forever(poll_interval=0.05)  # also the timeout for the rest of a frame on a line
 
 
 SERVERS: dict[str, Callable[[dict[str, Any]], None]] = {
@@ -183,7 +184,7 @@ SERVERS: dict[str, Callable[[dict[str, Any]], None]] = {
 
 def main() -> None:
     serve = SERVERS[sys.argv[1]]
-    if serve is serve_pymodbus:  # once for all children
+    if serve is serve_pymodbus:  # shared by all children
         import pymodbus.server
         import pymodbus.simulator  # noqa: F401
     children = []

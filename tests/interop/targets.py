@@ -1,8 +1,8 @@
 """The two targets of the flagship test: our emulators, and an independent implementation of the same devices.
 
-Both are processes of their own on real wires. The independent ones get their samples as tables of numbers: the rows of the
-shipped recordings at the times at which the emulators played them, so that both conversations are about the same sea. How
-numbers become bytes is each side's own affair.
+Both are separate processes on real wires. The independent devices get their samples as tables of numbers: the rows of
+the shipped recordings at the times at which the emulators replayed them, so that both conversations contain the same
+values. Each side encodes the numbers itself.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ SYSTEM = ROOT / "profiles/systems/observatory.yaml"
 
 
 class EmulatedTarget:
-    """Our emulators, as ``fieldtwin run --prototype`` starts them, with the far end served by its own driver."""
+    """Our emulators, as ``fieldtwin run --prototype`` starts them, with the remote client served by its own driver."""
 
     def __init__(self, mapping: dict[Endpoint, Endpoint], shore: Shore) -> None:
         self.mapping = mapping
@@ -53,7 +53,8 @@ class EmulatedTarget:
 
 @contextlib.asynccontextmanager
 async def field_side(run_dir: Path, **listen: str) -> AsyncIterator[dict[str, Any]]:
-    """The observatory's emulators as a process, `listen` saying where a bus's listen elsewhere; their status."""
+    """Run the observatory's emulators as a process. `listen` gives the endpoints of a bus in a different place; yields
+    their status."""
     config = run_dir / "field.json"
     config.write_bytes(msgspec.json.encode(FieldConfig(system=str(SYSTEM), run_dir=str(run_dir), listen=listen)))
     field = Child("field", "fieldtwin.twin.prototype.field_process", config, run_dir)
@@ -68,7 +69,7 @@ async def field_side(run_dir: Path, **listen: str) -> AsyncIterator[dict[str, An
 
 @contextlib.asynccontextmanager
 async def emulated(run_dir: Path) -> AsyncIterator[EmulatedTarget]:
-    """Every emulator, and the far end."""
+    """Every emulator, and the remote client."""
     system = load_system(str(SYSTEM))
     async with field_side(run_dir) as status:
         mapping = {}
@@ -83,7 +84,7 @@ async def emulated(run_dir: Path) -> AsyncIterator[EmulatedTarget]:
 
 
 class IndependentTarget:
-    """libmodbus on a pty, a socket that speaks a table of bytes, and python-can on a bus."""
+    """libmodbus on a pty, a socket that answers from a table of bytes, and python-can on a bus."""
 
     def __init__(self, mapping: dict[Endpoint, Endpoint], modem: asyncio.subprocess.Process) -> None:
         self.mapping = mapping
@@ -99,7 +100,7 @@ class IndependentTarget:
 async def independent(
     run_dir: Path, samples: list[list[float]], slopes: list[list[int]], plants: dict[str, str] | None = None
 ) -> AsyncIterator[IndependentTarget]:
-    """`plants` names, by device, a difference to plant in it."""
+    """`plants` names, by device, a difference to plant."""
     system, planted = load_system(str(SYSTEM)), plants or {}
     samples_file, slopes_file = run_dir / "samples.json", run_dir / "slopes.json"
     samples_file.write_text(json.dumps(samples))
@@ -156,7 +157,7 @@ async def socat_pair(one: Path, other: Path) -> AsyncIterator[None]:
 async def device(
     name: str, *arguments: object, path: Sequence[Path] = ()
 ) -> AsyncIterator[tuple[asyncio.subprocess.Process, str]]:
-    """One of the programs in devices/, and the line with which it said that it is ready. `path` is its PYTHONPATH."""
+    """Run one of the programs in devices/; yields its line of readiness. `path` is its PYTHONPATH."""
     process = await asyncio.create_subprocess_exec(
         sys.executable,
         str(DEVICES / f"{name}.py"),
@@ -175,7 +176,8 @@ async def device(
 
 
 def entry_point(folder: Path) -> Path:
-    """A folder from which python-can learns of the software bus, installed or not: the entry point of pyproject.toml."""
+    """Create a folder that makes the software bus known to python-can, installed or not: the entry point of
+    pyproject.toml."""
     declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"]["can.interface"]
     info = folder / "fieldtwin_checkout-0.dist-info"
     info.mkdir()
@@ -195,14 +197,14 @@ async def _end(process: asyncio.subprocess.Process) -> None:
 
 
 def recording(name: str) -> list[list[float]]:
-    """The rows of a recording of signals, read as JSON Lines and no more."""
+    """Return the rows of a signal recording, parsed as plain JSON Lines."""
     with (RECORDINGS / name).open(encoding="utf-8") as file:
         next(file)
         return [json.loads(line) for line in file]
 
 
 def at_time(rows: list[list[float]], t_s: float) -> list[float]:
-    """All signals at a time, on the straight line between the rows before and after."""
+    """Interpolate all signals linearly at a time between two rows."""
     for (t0, *before), (t1, *after) in pairwise(rows):
         if t0 <= t_s < t1:
             share = (t_s - t0) / (t1 - t0)
@@ -211,7 +213,8 @@ def at_time(rows: list[list[float]], t_s: float) -> list[float]:
 
 
 def samples_like(talk: Conversation, count: int = 6) -> list[list[float]]:
-    """Rows for the ctd, from the recording at the times that the first sample of `talk` says, and every second after."""
+    """Return rows for the ctd, from the recording at the times of the first sample of `talk`, and every second after
+    it."""
     taken: list[tuple[int, int]] = []
     for e in talk.exchanges:
         if e.request == bytes.fromhex("01 04 0000 000A") and len(e.reply) == 23:
@@ -223,7 +226,8 @@ def samples_like(talk: Conversation, count: int = 6) -> list[list[float]]:
 
 
 def slopes_like(talk: Conversation) -> list[list[int]]:
-    """Rows for the inclinometer: the recording from where the TPDOs of `talk` began in it, in hundredths of a degree."""
+    """Return rows for the inclinometer, from the position in the recording where the TPDOs of `talk` began, in
+    hundredths of a degree."""
     heard = [struct.unpack("<hh", h.data) for h in talk.heard if h.cob_id == 0x185][:20]
     rows: list[Any] = [[round(100 * a), round(100 * b)] for _, a, b in recording("incl.jsonl")[:-1]]
 

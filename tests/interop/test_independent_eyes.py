@@ -1,4 +1,5 @@
-"""tshark reads what was captured: no malformed frame, good check sums, function codes and COB-IDs as we count them."""
+"""tshark decodes the captures without malformed frames or wrong checksums, and its function codes and COB-IDs match our
+counts."""
 
 from __future__ import annotations
 
@@ -23,7 +24,7 @@ pytestmark = [pytest.mark.interop, pytest.mark.timeout(120), needs_tshark]
 
 @pytest.fixture(params=["with_emulators", "with_strangers"])
 def held(request: pytest.FixtureRequest) -> Held:
-    """Both of the flagship's conversations."""
+    """Both conversations of the flagship test."""
     found: Held = request.getfixturevalue(request.param)
     return found
 
@@ -77,26 +78,26 @@ def test_canopen(held: Held, tmp_path: Path) -> None:
 
 
 def functions(held: Held, device: str) -> Counter[str]:
-    """How often we sent each function code, as tshark writes it."""
+    """Return how often each function code was sent, as tshark writes it."""
     return Counter(str(e.request[1]) for e in held.talks[device].exchanges)
 
 
 @pytest.mark.parametrize("bus", ["line1", "lan"])
 def test_tshark_would_see_a_broken_frame(bus: str, with_emulators: Held, tmp_path: Path) -> None:
-    """The eyes are open: a byte changed in one reply is remarked on."""
+    """tshark reports a byte changed in one reply, so its silence elsewhere is meaningful."""
     endpoint = with_emulators.run.system.buses[bus].endpoint
     captured = [c for c in with_emulators.run.captured if c.endpoint == endpoint]
     path, fields = tmp_path / "broken.pcap", ["mbrtu.crc16.status", "mbtcp.trans_id"]
     if bus == "line1":  # a byte of the data, so that the CRC is wrong
         with pytest.raises(AssertionError, match="packet 2"):
             dissect(path, changed(captured, endpoint, 3), endpoint, fields)
-    else:  # the protocol id of the MBAP header: no Modbus at all
+    else:  # the protocol id of the MBAP header: not Modbus at all
         packets = dissect(path, changed(captured, endpoint, 3), endpoint, fields)
         assert [i for i, p in enumerate(packets, 1) if not p["mbtcp.trans_id"]] == [1, 2, 3, 5]
 
 
 def changed(captured: list[Captured], endpoint: Endpoint, spot: int) -> list[Captured]:
-    """The same with one byte of the second chunk, the first reply, changed."""
+    """Return the capture with one byte of the second chunk, the first reply, changed."""
     reply = captured[1]
     assert isinstance(reply.item, bytes)
     item = reply.item[:spot] + bytes([reply.item[spot] ^ 1]) + reply.item[spot + 1 :]
@@ -104,7 +105,7 @@ def changed(captured: list[Captured], endpoint: Endpoint, spot: int) -> list[Cap
 
 
 def test_what_a_run_captures(short_dir: Callable[[], Path], tmp_path: Path) -> None:
-    """``fieldtwin run --capture FILE``, as a user starts it: every wire in the file is readable for tshark."""
+    """``fieldtwin run --capture FILE`` from the command line: tshark can read every wire in the file."""
     capture = tmp_path / "capture.jsonl"
     command = [sys.executable, "-m", "fieldtwin", "run", "observatory", "--prototype", "--for", "3s"]
     ran = subprocess.run(

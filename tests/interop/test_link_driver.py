@@ -50,7 +50,7 @@ async def process(*command: str) -> AsyncIterator[asyncio.subprocess.Process]:
 
 
 async def sample_twice(port: Path) -> list[bytes]:
-    """Identify the ctd at `port`, have it sample every second, and stop it after two samples; the samples as emitted."""
+    """Identify the ctd at `port`, make it sample every second, and stop it after two samples; return the samples as emitted."""
     clock, system = WallClock(), load_system(str(SYSTEM))
     tags = TagTable(clock)
     driver = SensorDriver(system.devices["ctd"], tags)
@@ -103,7 +103,7 @@ def test_socat_on_the_drivers_side(short_dir: Callable[[], Path]) -> None:
 
 @pytest.mark.skipif(find_library("modbus") is None, reason="libmodbus is not installed")
 def test_socat_on_the_devices_side(short_dir: Callable[[], Path]) -> None:
-    """Driver, `fieldtwin link` as a command, TCP, socat, and a ctd that is not ours."""
+    """Driver, `fieldtwin link` as a command, TCP, socat, and an independent ctd."""
 
     async def main() -> None:
         folder = short_dir()

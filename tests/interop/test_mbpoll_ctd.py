@@ -1,4 +1,4 @@
-"""mbpoll, a program of libmodbus' own world, reads and commands the emulated ctd; what it prints is what the ctd holds."""
+"""mbpoll, a program based on libmodbus, reads and commands the emulated ctd; it prints the values that the ctd holds."""
 
 from __future__ import annotations
 
@@ -34,18 +34,18 @@ pytestmark = [
 ROOT = Path(__file__).parents[2]
 PLANT = Endpoint.parse("rtu:/dev/ttyS0?baudrate=19200&frame=8E1")
 HOUR = "3600"
-"""A period so long that the first sample, taken at once, stays the only one."""
+"""A period so long that the first sample, taken at once, remains the only one."""
 
 
 class Master:
-    """mbpoll with the arguments of one wire."""
+    """mbpoll with the arguments for one wire."""
 
     def __init__(self, sensor: SampledSensor, *wire: str) -> None:
         self.sensor = sensor
         self._wire = wire
 
     async def __call__(self, kind: str, first: int, *values: str, count: int = 1) -> list[str]:
-        """Read `count` values from reference `first`, or write `values`; what was read, as printed, or the complaint."""
+        """Read `count` values from reference `first`, or write `values`; return the printed values, or the error message."""
         what = ["-t", kind, "-r", str(first), "-B", "-1", "-o", "2"]
         reading = [] if values else ["-c", str(count)]
         process = await asyncio.create_subprocess_exec(
@@ -59,7 +59,7 @@ class Master:
         return re.findall(r"^\[\d+\]:\s+(\S+)", text, re.MULTILINE)
 
     def held(self, tag: str) -> bytes:
-        """The bytes that the sensor held last for a tag."""
+        """Return the last bytes that the sensor held for a tag."""
         return [h.raw for h in self.sensor.journal.since(0) if h.tag == tag][-1]
 
 
@@ -116,8 +116,8 @@ def test_mbpoll_is_refused_as_the_profile_says(wire: str, tmp_path: Path) -> Non
             assert "Illegal data address" in (await mbpoll("4", 50))[0]
             assert "Illegal data value" in (await mbpoll("3", 1, count=61))[0]
             assert "Illegal function" in (await mbpoll("0", 1))[0]
-            assert "Illegal data address" in (await mbpoll("4", 1, "1"))[0]  # the status is the ctd's own
-            assert await mbpoll("4", 2, "65535") == []  # -1, as mbpoll takes it
+            assert "Illegal data address" in (await mbpoll("4", 1, "1"))[0]  # the status comes from the ctd itself
+            assert await mbpoll("4", 2, "65535") == []  # -1, as mbpoll accepts it
             assert mbpoll.held("sample_period_s") == b"\xff\xff"
             assert await mbpoll("4", 1) == ["2"]  # off
 

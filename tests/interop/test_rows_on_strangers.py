@@ -1,4 +1,4 @@
-"""The rows for slaves on pymodbus's and libmodbus's servers: what they do otherwise is known, row by row, and nothing else is."""
+"""The server rows on pymodbus's and libmodbus's servers: their deviations are listed, row by row, and there are no others."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _found: dict[str, dict[str, str]] = {}
 
 
 def version_of(peer: str) -> str:
-    """The peer's version here, empty where it is not installed."""
+    """Return the installed version of the peer, or an empty text."""
     if peer == "pymodbus":
         return version("pymodbus")
     if (name := find_library("modbus")) is None:
@@ -31,7 +31,7 @@ def version_of(peer: str) -> str:
 
 
 def found_on(peer: str) -> dict[str, str]:
-    """Played once, all rows of all peers at the same time: most of it is waiting for who says nothing."""
+    """Run once, all rows of all peers at the same time, because they mostly wait for silent servers."""
 
     async def main() -> list[dict[str, str]]:
         return await asyncio.gather(*(play_on(name, ROWS[name]) for name in here))
@@ -59,7 +59,9 @@ def test_row(peer: str, row_id: str) -> None:
         pytest.skip(f"{peer} is not installed")
     known = {entry["id"]: entry["instead"] for entry in KNOWN[peer]["known"]}
     found = found_on(peer)[row_id]
-    if found != known.get(row_id, ""):  # all rows at once load the host, and a stranger's timers with it: again, alone
+    if found != known.get(
+        row_id, ""
+    ):  # all rows together load the host and delay the timers of the servers: repeat alone
         [row] = [row for row in ROWS[peer] if row["id"] == row_id]
         found = asyncio.run(play_on(peer, [row]))[row_id]
     if here == KNOWN[peer]["version"]:

@@ -1,4 +1,4 @@
-"""`scan` and `identify` on servers that we did not write: pymodbus's and libmodbus's, on a line and on TCP."""
+"""`scan` and `identify` on third-party servers, pymodbus's and libmodbus's, on a line and on TCP."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ SHIPPED = [load_profile(path) for path in sorted((HERE.parents[1] / "profiles/de
 
 @contextlib.asynccontextmanager
 async def serving(peer: str, wire: str, units: list[int], line: str = "") -> AsyncIterator[int]:
-    """The server, and its port."""
+    """Start the server and return its port."""
     job: dict[str, Any] = {"row": 0, "wire": wire, "units": units, "line": line}
     program = await asyncio.create_subprocess_exec(
         sys.executable, str(HERE / "strange_slaves.py"), peer, stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE

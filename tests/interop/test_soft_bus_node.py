@@ -1,4 +1,4 @@
-"""A bare python-can program commands the emulated inclinometer over the software bus, knowing nothing but CiA 301."""
+"""A bare python-can program commands the emulated inclinometer over the software bus, using CiA 301 only."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.interop
 
 
 class Program:
-    """Blocking python-can calls, as any such program makes them."""
+    """Blocking python-can calls, like those of any such program."""
 
     def __init__(self, bus: can.BusABC) -> None:
         self.bus = bus
@@ -28,7 +28,7 @@ class Program:
         self.bus.send(can.Message(arbitration_id=cob_id, data=bytes.fromhex(data), is_extended_id=False), 2.0)
 
     def next(self, cob_id: int) -> bytes:
-        """The data of the next frame with this COB-ID."""
+        """Return the data of the next frame with this COB-ID."""
         while (frame := self.bus.recv(5.0)) is not None:
             if frame.arbitration_id == cob_id:
                 return bytes(frame.data)
@@ -50,10 +50,10 @@ def session(program: Program) -> None:
     slopes = [[round(100 * a), round(100 * b)] for _, a, b in recording("incl.jsonl")]
     for _ in range(5):
         long, lateral = struct.unpack("<hh", program.next(0x185))
-        # a point of the recording, or between two that are next to each other: 100 ms move it by 0.4 degrees at most
+        # a recorded point, or between two adjacent ones: 100 ms change it by 0.4 degrees at most
         assert min(abs(long - a) + abs(lateral - b) for a, b in slopes) <= 40
     while program.next(0x705) != b"\x05":
-        pass  # beats that were under way when it was started
+        pass  # heartbeats that were on their way when it was started
     program.send(0x000, "80 05")
     while program.next(0x705) != b"\x7f":
         pass

@@ -1,4 +1,5 @@
-"""Masters of five other makes on one emulated unit, over pty and TCP: the values are the unit's, and tshark reads every frame."""
+"""Five third-party clients on one emulated unit, over pty and TCP: they read the unit's values, and tshark decodes every
+frame."""
 
 from __future__ import annotations
 
@@ -55,7 +56,7 @@ def have(name: str) -> None:
 
 
 async def talk(name: str, wire: str, where: str) -> dict[str, Any]:
-    """The program's conversation; what it says was given to it."""
+    """Run the program's conversation; return the values that it printed."""
     program = await asyncio.create_subprocess_exec(
         *(sys.executable, str(PROGRAM), name, wire, where),
         stdout=asyncio.subprocess.PIPE,

@@ -1,6 +1,6 @@
-"""Our master on servers of four other makes, over a null modem and TCP: what it read is theirs, and tshark reads every frame.
+"""Our client on four third-party servers, over a null modem and TCP: it reads their values, and tshark decodes every frame.
 
-What each of them can besides is asked in tests/wires/test_modbus_servers.py.
+tests/wires/test_modbus_servers.py tests their other functions.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ FUNCTIONS = Counter({"4": 1, "2": 1, "3": 4, "6": 1, "16": 1, "5": 1, "15": 1, "
 
 
 class Eyes:
-    """Keeps what goes over the wire."""
+    """Record the traffic."""
 
     def __init__(self) -> None:
         self.captured: list[Captured] = []
@@ -55,7 +55,7 @@ class Eyes:
 
 @contextmanager
 def null_modem() -> Iterator[tuple[str, str]]:
-    """Two ptys joined byte for byte; their far ends stay open, so that nobody sees a hang-up."""
+    """Two ptys joined byte for byte; their far sides remain open, so that neither program sees a hang-up."""
     pairs = [os.openpty(), os.openpty()]
     loop = asyncio.get_running_loop()
     for _, far in pairs:
@@ -78,7 +78,7 @@ def null_modem() -> Iterator[tuple[str, str]]:
 
 @asynccontextmanager
 async def served(name: str, wire: str, line: str) -> AsyncIterator[int]:
-    """The program with one unit; gives its port."""
+    """Start the program with one unit; return its port."""
     program = await asyncio.create_subprocess_exec(
         *(sys.executable, str(PROGRAM), name), stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE
     )
@@ -94,7 +94,7 @@ async def served(name: str, wire: str, line: str) -> AsyncIterator[int]:
 
 
 async def converse(name: str, wire: str) -> list[Captured]:
-    """The conversation; what of it was on the wire."""
+    """Run the conversation; return its traffic."""
     eyes = Eyes()
     with null_modem() as (near, far):
         async with served(name, wire, far if wire == "rtu" else "") as port:
@@ -140,7 +140,7 @@ def test_a_strange_slave_is_read_and_written(name: str, wire: str, tmp_path: Pat
 
 def seen_by_tshark(captured: list[Captured], path: Path) -> None:
     endpoint = captured[0].endpoint
-    if endpoint.scheme == "tcp":  # the pcap file stands for a conversation with port 502
+    if endpoint.scheme == "tcp":  # the pcap file represents a conversation with port 502
         fields = ["modbus.func_code", "modbus.exception_code", "mbtcp.trans_id", "tcp.dstport"]
     else:
         fields = ["modbus.func_code", "modbus.exception_code", "mbrtu.crc16.status"]

@@ -1,6 +1,6 @@
 """The shipped SunSpec inverter against pysunspec2, the SunSpec Alliance's own client.
 
-Observed before: the profile had neither "SunS" nor model headers nor the end model, so that a scan by pysunspec2 failed.
+Defect: the profile had neither "SunS" nor model headers nor the end model, so that a scan by pysunspec2 failed.
 """
 
 from __future__ import annotations

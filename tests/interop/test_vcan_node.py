@@ -1,4 +1,5 @@
-"""On the kernel's CAN: candump and cansend talk to the emulated inclinometer, and the driver cannot tell it from a stranger's."""
+"""On the kernel's CAN: candump and cansend talk to the emulated inclinometer, and the driver cannot distinguish it from an
+independent device."""
 
 from __future__ import annotations
 
@@ -30,7 +31,7 @@ VCAN0 = Endpoint.parse(CAN0)
 
 
 class Candump:
-    """What candump prints of vcan0, as COB-ID#DATA."""
+    """The output of candump for vcan0, as COB-ID#DATA."""
 
     def __init__(self, process: asyncio.subprocess.Process) -> None:
         self._process = process
@@ -44,7 +45,7 @@ class Candump:
             self.frames.append(found[1].decode())
 
     async def sees(self, frame: str) -> None:
-        """Wait until a frame that begins so was seen, and forget it and all before it."""
+        """Wait for a frame with this beginning, and remove it and all earlier ones."""
         await eventually(lambda: any(f.startswith(frame) for f in self.frames), within_s=60, what=f"{frame} on vcan0")
         first = next(i for i, f in enumerate(self.frames) if f.startswith(frame))
         del self.frames[: first + 1]
@@ -58,7 +59,7 @@ async def candump() -> AsyncIterator[Candump]:
     try:
 
         async def listens() -> bool:
-            await cansend("7E5#00")  # nobody's: it is listening once it shows it
+            await cansend("7E5#00")  # an unused identifier: when candump shows it, candump is ready
             return bool(dump.frames)
 
         await eventually(listens, within_s=60)
@@ -97,7 +98,7 @@ def test_candump_and_cansend_talk_to_the_node(short_dir: Callable[[], Path]) -> 
 
 
 def test_the_driver_cannot_tell_an_emulator_from_the_device(short_dir: Callable[[], Path]) -> None:
-    """The flagship's CAN part, with nothing of ours on the bus but the driver, or the driver and the emulator."""
+    """The CAN part of the flagship test, where only the driver, or the driver and the emulator, is ours."""
 
     async def hold(folder: Path) -> Conversation:
         return canopen_conversation("inclinometer", await converse_on_can(VCAN0, folder, patience_s=100), 5)
@@ -114,7 +115,7 @@ def test_the_driver_cannot_tell_an_emulator_from_the_device(short_dir: Callable[
 
     ours, theirs = run(main(), timeout_s=280)
     text = yaml.safe_load((Path(__file__).parent / "tolerances.yaml").read_text(encoding="utf-8"))
-    # A virtual machine without hardware support is ten times slower than its host; what is said is compared all the same.
+    # A virtual machine without hardware support is ten times slower than its host; the frames are compared nevertheless.
     rules = load_tolerances(text)["inclinometer"].model_copy(update={"latency_within_ms": 500.0})
     rules = rules.model_copy(
         update={"heard": tuple(h.model_copy(update={"interval_within_ms": 200.0}) for h in rules.heard)}

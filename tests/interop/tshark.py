@@ -1,4 +1,4 @@
-"""tshark as an independent pair of eyes: a pcap file in, chosen fields of every packet out."""
+"""Decode with tshark, as an independent dissector: a pcap file in, chosen fields of every packet out."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ OPTIONS = {
     "can": ["-d", "can.subdissector,canopen"],
 }
 REMARKS = ("_ws.malformed", "_ws.expert.severity", "_ws.expert.message")
-"""tshark's own remarks: retransmissions, bad check sums, broken frames."""
+"""tshark's own diagnostics: retransmissions, wrong checksums, malformed frames."""
 CHAT = 0x200000
-"""The severity of what is no trouble, such as "connection establish request"; notes, warnings and errors are above it."""
+"""The severity of harmless remarks such as "connection establish request"; notes, warnings and errors are above it."""
 
 
 def dissect(path: Path, captured: list[Captured], endpoint: Endpoint, fields: list[str]) -> list[dict[str, str]]:
-    """Write what was captured of `endpoint` and have tshark dissect it; `fields` of every packet, missing ones empty.
+    """Write the capture of `endpoint` and dissect it with tshark; return `fields` of every packet, missing ones empty.
 
-    Fails on a packet that tshark has a remark on.
+    Fails if tshark has a remark on a packet.
     """
     count = write_pcap(path, captured, endpoint)
     wanted = [*fields, *REMARKS, "_ws.col.Protocol"]
@@ -43,7 +43,7 @@ def dissect(path: Path, captured: list[Captured], endpoint: Endpoint, fields: li
         text=True,
         check=True,
         timeout=60,
-        env={**os.environ, "HOME": str(path.parent)},  # no preferences but those said here
+        env={**os.environ, "HOME": str(path.parent)},  # no preferences except these
     )
     packets = [dict(zip(wanted, line.split("|"), strict=True)) for line in out.stdout.splitlines()]
     assert len(packets) == count, out.stderr

@@ -1,7 +1,7 @@
-"""A hundred seeded hours of the observatory at a scan of 100 ms, under random faults: no wrong value is published as good,
-nothing is lost or stuck.
+"""A hundred seeded hours of the observatory at a scan of 100 ms, under random faults: no wrong value is published as good, and
+nothing is lost or blocked.
 
-`scripts/test --long` runs this; FIELDTWIN_LONG_HOURS makes it longer or shorter.
+`scripts/test --long` runs this; FIELDTWIN_LONG_HOURS changes the number of hours.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ SLOWER = (
 
 
 def slow_scan(folder: Path) -> Path:
-    """The shipped system with a scan of 100 ms, its sensors asked each second."""
+    """The shipped system with a scan of 100 ms and sensors polled every second."""
     text = (SHIPPED / "observatory.yaml").read_text()
     for old, new in SLOWER:
         assert text.count(old) == 1, old
@@ -58,10 +58,10 @@ def run_hours(path: Path, hours: int, *, random_faults: bool) -> None:
 
 @pytest.fixture(autouse=True, scope="module")
 def behind_all_else() -> Iterator[None]:
-    """Virtual time can wait; what runs beside it in other processes is judged by a clock."""
+    """Run with low priority, because tests in other processes depend on real time."""
     os.setpriority(os.PRIO_PROCESS, 0, 10)
     yield
-    with contextlib.suppress(PermissionError):  # only root goes back
+    with contextlib.suppress(PermissionError):  # only root may raise the priority again
         os.setpriority(os.PRIO_PROCESS, 0, 0)
 
 
@@ -70,5 +70,5 @@ def test_hours_in_peace(tmp_path: Path) -> None:
 
 
 def test_hours_under_random_faults(tmp_path: Path) -> None:
-    """And two minutes after the last fault every device is good again."""
+    """Two minutes after the last fault, every device is good again."""
     run_hours(slow_scan(tmp_path), HOURS, random_faults=True)

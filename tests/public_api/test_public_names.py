@@ -1,4 +1,4 @@
-"""The public Python API is a test: what it holds, and that importing it costs nothing."""
+"""The public Python API: its names, and the cost of its import."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def python(code: str) -> str:
 
 
 def test_the_names_are_these() -> None:
-    """A name more is a decision; a name less breaks somebody's program."""
+    """A new name needs a decision; a removed name breaks user programs."""
     assert sorted(fieldtwin.__all__) == [
         "FieldtwinError", "RunOptions", "RunSession", "__version__", "load_profile", "load_prototype", "load_system",
         "scan_can_bus", "summarise",

@@ -1,4 +1,4 @@
-"""Packets for captures of tests: made here, byte by byte, and a stranger to what reads them."""
+"""Packets for captures in tests, built byte by byte, independent of the code that reads them."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ def tcp(
     flags: int = ACK,
     ack: int = 0,
 ) -> bytes:
-    """An IPv4 packet with a TCP segment, behind an Ethernet header, padded as short frames are."""
+    """An IPv4 packet with a TCP segment, after an Ethernet header, padded as short frames are."""
     ip = struct.pack(">BBHHHBBH", 0x45, 0, 40 + len(data), 0, 0x4000, 64, 6, 0) + source + target
     head = struct.pack(">HHIIBBHHH", *ports, sequence % 2**32, ack % 2**32, 0x50, flags, 0xFFFF, 0, 0)
     return (bytes(12) + b"\x08\x00" + ip + head + data).ljust(60, b"\0")
 
 
 def udp6(hosts: tuple[int, int], ports: tuple[int, int], data: bytes) -> bytes:
-    """An IPv6 packet with a datagram, behind an Ethernet header with a VLAN tag."""
+    """An IPv6 packet with a datagram, after an Ethernet header with a VLAN tag."""
     body = struct.pack(">HHHH", *ports, 8 + len(data), 0) + data
     ip = struct.pack(">IHBB", 6 << 28, len(body), 17, 64) + bytes((*bytes(15), hosts[0], *bytes(15), hosts[1]))
     return bytes(12) + b"\x81\x00\x00\x05\x86\xdd" + ip + body
@@ -81,7 +81,7 @@ class Talk:
         self, port: int = 502, client_port: int = 50_000, server: bytes = SERVER, *, opened: bool = True
     ) -> None:
         self._server, self._ports = server, (client_port, port)
-        self._next = {True: 1000, False: 2**32 - 5}  # the server's wraps around soon
+        self._next = {True: 1000, False: 2**32 - 5}  # the server's number wraps around soon
         self.packets: list[bytes] = []
         if opened:
             self.packets += [self._segment(True, b"", SYN), self._segment(False, b"", SYN | ACK)]
@@ -93,7 +93,7 @@ class Talk:
         self._next[sent] += len(data)
 
     def lose(self, sent: bool, size: int) -> None:
-        """Bytes that were said and are not in the capture."""
+        """Omit bytes from the capture."""
         self._next[sent] += size
 
     def acknowledge(self, sent: bool) -> None:
@@ -106,6 +106,6 @@ class Talk:
 
 
 def write(path: Path, data: bytes) -> Path:
-    """The file with these bytes."""
+    """Return a file with these bytes."""
     path.write_bytes(data)
     return path

@@ -1,4 +1,4 @@
-"""What counts as alike: tolerances by tag and by word, counters that have grown, latencies, messages of a CAN bus."""
+"""Rules of equality: tolerances by tag and by word, increased counters, latencies, messages of a CAN bus."""
 
 from __future__ import annotations
 

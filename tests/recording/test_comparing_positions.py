@@ -1,6 +1,7 @@
-"""`compare` with an emulator of the recording does not depend on earlier reads, and never turns a frozen or wrong device green.
+"""`compare` with an emulator of the recording does not depend on earlier reads, and never accepts a frozen or wrong device.
 
-Defect: the replay's position moves with each read. The same emulator was 100 % alike at first, and 50 % after it had been read.
+Defect: the position of the replay moves with each read. The same emulator matched 100 % at first, and 50 % after it had been
+read.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ RAMP = talk(READ, [registers(7, value) for value in (10, 20, 30, 40, 50, 60)])
 
 
 class Replayed:
-    """An asker of an emulator in memory, or of any device given as a function."""
+    """A function that asks an emulator in memory, or any device given as a function."""
 
     def __init__(self, respond: Callable[[int, bytes], bytes | None]) -> None:
         self.respond = respond
@@ -100,7 +101,7 @@ def test_bits_are_aligned_too() -> None:
 def test_a_frozen_device_is_never_met(value: int) -> None:
     result = compared(RAMP, lambda unit, pdu: registers(7, value))
     assert not result.met
-    if value != 60:  # 60 is also what an emulator holds that was read to its end
+    if value != 60:  # an emulator that was read to its end also holds 60
         assert result.by_kind
         assert not result.inconclusive
 
@@ -142,7 +143,7 @@ def test_with_most_the_rest_of_the_recording_is_looked_through() -> None:
 
 
 def test_differences_after_left_out_writes_are_named_as_such() -> None:
-    """Defect: `compare` counted left-out writes, and said nothing of the differences that they cause."""
+    """Defect: `compare` counted omitted writes, but did not mention the differences that they cause."""
     write = bytes.fromhex("06 0001 0005")
     recorded = [
         *talk(READ, [registers(7, 1)]), *talk(write, [write]), *talk(READ, [registers(7, 5)]),

@@ -1,4 +1,4 @@
-"""Foreign files in and out: CSV, CAN logs of other programs, what mbpoll prints, pcap that tshark opens; and what is damaged."""
+"""Foreign files in and out: CSV, CAN logs of other programs, output of mbpoll, pcap that tshark opens; and damaged files."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def test_a_flaw_in_a_table_is_told_with_its_line_and_leaves_nothing(tmp_path: Pa
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_logs_that_python_can_writes_become_candump_logs(tmp_path: Path, suffix: str) -> None:
-    """But for what these formats lose: .trc has no remote frames' lengths."""
+    """Except for losses of these formats: .trc has no length of remote frames."""
     path = tmp_path / f"bus{suffix}"
     with can.Logger(path) as log:
         for n, f in enumerate(FRAMES):
@@ -277,7 +277,7 @@ def test_tshark_opens_what_is_exported(tmp_path: Path) -> None:
 
 
 def made(folder: Path, kind: str) -> bytes:
-    """A good file of that kind."""
+    """Return a valid file of that kind."""
     if kind in (".asc", ".blf", ".trc"):
         path = folder / f"good{kind}"
         if not path.exists():

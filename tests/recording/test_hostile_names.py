@@ -1,6 +1,6 @@
-"""Names and texts out of files stay names and texts: markup, control characters and formulas, in each kind of output file.
+"""Names and texts from files are escaped in each kind of output file: markup, control characters and formulas.
 
-Before, a signal named `=HYPERLINK(...)` was a formula in an exported table, which a spreadsheet runs when somebody opens it.
+Defect: a signal named `=HYPERLINK(...)` was a formula in an exported table, which a spreadsheet executes when a user opens it.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def test_an_exported_table_has_no_cell_that_is_a_formula(tmp_path: Path) -> None
         names, values = csv.reader(file)
     assert [name for name in names if name.startswith("'")] == [f"'{name}" for name in FORMULAS]
     assert not [name for name in names if name[0] in "=+-@\t\r"]
-    assert values[1:] == ["-1.5"] * len(FORMULAS)  # a number stays a number
+    assert values[1:] == ["-1.5"] * len(FORMULAS)  # a number remains a number
 
 
 class _Tags(HTMLParser):
@@ -58,4 +58,4 @@ def test_a_name_is_text_in_a_page_in_junit_and_in_metrics(name: str) -> None:
     assert [e.tag for e in junit.iter()] == [e.tag for e in ET.fromstring(render_junit(plain)).iter()]
     family = Family("x", "gauge", name)
     family.add(1.0, device=name)
-    assert len(render([family]).rstrip("\n").split("\n")) == 3  # help, type and one sample: no line of its own
+    assert len(render([family]).rstrip("\n").split("\n")) == 3  # help, type and one sample: no injected line

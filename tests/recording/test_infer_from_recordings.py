@@ -1,4 +1,4 @@
-"""`infer` reads recordings: what one client asked of a unit, at whatever periods, is as good as a dump."""
+"""`infer` reads recordings: the requests of one client to a unit, at any periods, are as useful as a dump."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ FAST, SLOW = bytes.fromhex("0300000002"), bytes.fromhex("0400100001")
 
 
 def polled(rounds: int, unit: int = 7) -> list[Exchange]:
-    """A counter of two words each second, its low word first, and a temperature each fifth second."""
+    """A counter of two words each second, its low word first, and a temperature every five seconds."""
     found = []
     for n in range(rounds):
         count = 65_400 + 37 * n

@@ -1,4 +1,4 @@
-"""A node of which there is nothing but a log: it holds the objects that the log has, and sends what it sent."""
+"""A node described only by a log: it has the objects in the log, and sends the recorded frames."""
 
 from __future__ import annotations
 

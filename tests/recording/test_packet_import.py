@@ -1,4 +1,4 @@
-"""Captures of traffic become recordings: TCP in any order, any port, any link; malformed frames kept and counted."""
+"""Captures of traffic become recordings: TCP in any order, any port, any link; malformed frames are kept and counted."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def exchanges(path: Path) -> list[Exchange]:
 
 
 def imported(folder: Path, capture: bytes, ports: tuple[int, ...] = ()) -> tuple[PacketSummary, list[Exchange]]:
-    """The summary, and the exchanges of the only recording."""
+    """Return the summary, and the exchanges of the only recording."""
     summary = PacketImport(write(folder / "c.pcap", capture), folder / "r.jsonl", ports).run()
     assert len(summary.made) == 1, summary
     return summary, exchanges(folder / "r.jsonl")
@@ -138,7 +138,7 @@ def pieces(packet: bytes, size: int) -> list[bytes]:
 
 def test_ip_packets_in_pieces_are_put_together(tmp_path: Path) -> None:
     packets = []
-    for n, packet in enumerate(polls()):  # each with an identification of its own
+    for n, packet in enumerate(polls()):  # each with a separate identification
         numbered = packet[:18] + n.to_bytes(2) + packet[20:]
         found = pieces(numbered, 24)
         packets += found[::-1] if n % 2 else found

@@ -1,4 +1,4 @@
-"""Requests and replies of others become exchanges, however they were cut, mixed and damaged."""
+"""Requests and replies of third parties become exchanges, even if they are cut, mixed and damaged."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def crc(data: bytes) -> bytes:
 
 
 def run(wire: Pairer, *steps: tuple[bool, bytes]) -> list[Exchange]:
-    """The exchanges of chunks that are a millisecond apart."""
+    """Return the exchanges of chunks that are a millisecond apart."""
     found = [e for i, (sent, data) in enumerate(steps) for e in wire.feed(sent, data, i * MS)]
     return found + wire.finish()
 

@@ -1,4 +1,4 @@
-"""The verbs as a person calls them: a device is recorded, emulated and compared; what is said, and with what exit code."""
+"""The recording commands from the command line: a device is recorded, emulated and compared; output and exit codes."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ ROOT = Path(__file__).parents[2]
 
 @contextmanager
 def emulated(*words: str) -> Iterator[None]:
-    """`fieldtwin emulate` with these words, once it serves."""
+    """Start `fieldtwin emulate` with these arguments; yields when it serves."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     emulate = [sys.executable, "-m", "fieldtwin", "emulate", *words]
     process = subprocess.Popen(emulate, stderr=subprocess.PIPE, cwd=ROOT, env=environment)
@@ -50,7 +50,7 @@ def emulated(*words: str) -> Iterator[None]:
 
 
 def called(command: Any, *words: object) -> tuple[int, dict[str, Any]]:
-    """The exit code, and what was printed with --json."""
+    """Return the exit code, and the output with --json."""
     done = CliRunner().invoke(command, [*map(str, words), "--json"], standalone_mode=False)
     if done.exception is not None:
         raise done.exception

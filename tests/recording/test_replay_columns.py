@@ -1,4 +1,4 @@
-"""Long recordings in columns: each cell in recorded order whatever it was read with, bounded, and what lies between cells."""
+"""Long recordings in columns: each cell in recorded order for any read, memory bounds, and unrecorded cells between others."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ outcomes = st.sampled_from(["values", "values", "values", "02", "03", "silence",
 def test_every_cell_goes_on_in_recorded_order_whatever_it_was_read_with(
     steps: list[tuple[tuple[int, int], str, bool]],
 ) -> None:
-    """Against a list for each cell, filled by hand; some reads are written between, to a register that is never read."""
+    """Compare with a handwritten list per cell; some writes occur between reads, to a register that is never read."""
     model: dict[int, list[int]] = {}
     recorded = []
     for n, ((address, count), outcome, bits) in enumerate(steps):
-        if bits:  # another table, which must not be mixed in
+        if bits:  # another table, whose values must not appear here
             recorded.append(asked(read(address, count, 1), bytes((1, 1, n & 7))))
         reply: bytes | None = None
         if outcome == "values":
@@ -54,7 +54,7 @@ def test_every_cell_goes_on_in_recorded_order_whatever_it_was_read_with(
     replay = ExchangeReplay(recorded)
     shapes = {step[0] for step in steps}
     for address, wanted in model.items():
-        if (address, 1) in shapes:  # answered as it was, errors too
+        if (address, 1) in shapes:  # answered as before, errors included
             continue
         got = [words(replay, address)[0] for _ in range(len(wanted) + 2)]
         assert got == [*wanted, wanted[-1], wanted[-1]]

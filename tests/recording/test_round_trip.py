@@ -1,4 +1,4 @@
-"""record, emulate, record, compare: nothing is lost on the way, over a serial line, TCP and CAN; and a tap keeps every byte."""
+"""record, emulate, record, compare: nothing is lost over a serial line, TCP and CAN; a tap keeps every byte."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def write(path: Path, exchanges: Iterable[Exchange]) -> Path:
 
 
 def shipped(folder: Path) -> Path:
-    """The shipped recording of a drive, with outcomes of all kinds behind it; short, and without its latencies."""
+    """The shipped recording of a drive, followed by results of all kinds; shortened, and without its latencies."""
     drive = [
         Exchange(e.t_s, e.unit, e.request, e.reply) for e in exchanges_of(ROOT / "recordings" / "delta-vfd-e.jsonl")
     ][:44]
@@ -118,7 +118,7 @@ def compared(one: Path, two: Path, rules: Rules = UNTIMED) -> Comparison:
 
 
 class AsRecorded:
-    """Every recorded request, in order, repeated ones too."""
+    """Send every recorded request in order, repeated ones included."""
 
     def __init__(self, path: Path) -> None:
         self._exchanges = list(exchanges_of(path))
@@ -165,7 +165,7 @@ def _free_port() -> int:
 
 
 def test_a_server_of_somebody_else_is_recorded_and_its_emulator_is_as_good(tmp_path: Path) -> None:
-    """pymodbus's: 100 registers that count, and exception 02 behind them."""
+    """A pymodbus server: 100 registers that count, then exception 02."""
     requests = ["0300000064", "0300000001", "0300630001", "0300640001", "03005f000a"]
     wanted = write(tmp_path / "wanted.jsonl", [Exchange(0, 1, bytes.fromhex(r), b"\x83\x01") for r in requests])
     theirs, ours = _free_port(), _free_port()
@@ -207,7 +207,7 @@ def test_a_planted_difference_of_each_kind_is_found(tmp_path: Path) -> None:
 
 
 def test_a_profile_is_polled_in_few_reads_with_what_is_refused_in_parts(tmp_path: Path) -> None:
-    """The device has a gap where the profile reads over it: the exception is recorded, too, and asked for once."""
+    """The device has a gap where the profile reads across it: the exception is recorded too, and requested once."""
     profile_path = tmp_path / "p.yaml"
     profile_path.write_text(
         'device: a/b\nsource: ""\nprotocol: modbus\ntags:\n  one: {at: "holding:0"}\n  two: {at: "holding:4"}\n'
@@ -374,7 +374,7 @@ def test_a_node_is_recorded_emulated_and_compared(tmp_path: Path) -> None:
 
 
 def test_a_bus_is_followed_frame_by_frame_and_nothing_is_sent(tmp_path: Path) -> None:
-    """What others say on a bus stands in the log, in order; what we are on the bus for does not show there."""
+    """The log contains foreign frames on the bus, in order; the recorder's own role on the bus does not appear."""
     said = [CanFrame(0x185, bytes([n & 0xFF])) for n in range(300)] + [CanFrame(0x123456, b"x", extended=True)]
 
     async def main() -> int:
@@ -403,11 +403,11 @@ def test_a_bus_is_followed_frame_by_frame_and_nothing_is_sent(tmp_path: Path) ->
     assert [(f.can_id, f.extended, f.data) for f in logged] == [(f.can_id, f.extended, f.data) for f in said]
 
 
-# -- days, and what ends them ------------------------------------------------------------------------------------------------
+# -- long recordings and interruptions -----------------------------------------------------------------------------------
 
 
 def test_a_killed_recorder_loses_the_last_record_at_most(tmp_path: Path) -> None:
-    """Records are counted by their content; the recorder says each number before it writes it."""
+    """Records are counted by their content; the recorder prints each number before it writes the record."""
     program = (
         "import sys; from pathlib import Path\n"
         "from fieldtwin.capture.recordings.rotating_file import RotatingFile\n"
@@ -444,7 +444,7 @@ def test_parts_are_bounded_and_the_oldest_go(tmp_path: Path) -> None:
     assert all(path.stat().st_size <= 1000 and path.read_bytes().startswith(head) for path in parts_of(out))
     times = [e.t_s for e in exchanges_of(out)]
     assert times == [float(n) for n in range(200 - len(times), 200)]
-    part(out, 9999).touch()  # a recorder was killed when it had made the next part and not yet written to it
+    part(out, 9999).touch()  # a recorder was killed after it created the next part and before it wrote to it
     assert [e.t_s for e in exchanges_of(out)] == times
     assert file.removed > 3
     with RotatingFile(tmp_path / "t.jsonl", head, max_s=10.0) as file:

@@ -1,4 +1,4 @@
-"""`record --sniff PORT`: one adapter that listens to a line between other devices becomes a recording.
+"""`record --sniff PORT`: one adapter that listens to a line between other devices makes a recording.
 
 Defect: requests and replies arrive on one stream there, and 58 frames became "0 records, 58 answers to nothing".
 """
@@ -53,7 +53,7 @@ def test_requests_and_replies_are_told_apart_however_the_bytes_come(piece: int) 
 
 
 def test_a_line_between_other_devices_becomes_a_recording(tmp_path: Path) -> None:
-    """The program listens at a pty on which the frames of both sides come, as an RS-485 adapter hears them."""
+    """The program listens on a pty that receives the frames of both sides, as an RS-485 adapter does."""
 
     async def main() -> None:
         port = Endpoint.parse(f"rtu:{tmp_path / 'bus'}?baudrate=19200&frame=8E1")

@@ -1,4 +1,4 @@
-"""Judging a scenario in virtual time on a bench that says how late its host is."""
+"""Run a scenario in virtual time on a bench that reports the lateness of its host."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""A scenario's own rules, and the invariants of the system file, are judged while faults strike that each seed chooses.
+"""A scenario's rules and the invariants of the system file are checked while faults chosen by each seed are active.
 
-Observed before: random faults belonged to ``run --virtual``, which judges published values only. A campaign never found a pump
-that runs on while its level sensor is silent (no dry-run protection).
+Defect: random faults were only available in ``run --virtual``, which checks published values only. A campaign never found a
+pump that runs on while its level sensor is silent (no dry-run protection).
 """
 
 from __future__ import annotations
@@ -130,7 +130,7 @@ def test_a_missing_dry_run_protection_is_found_and_shrunk_and_the_repaired_progr
     assert cases[0].get("name") == "the pump never runs dry [4 seeds]"
     assert (
         sum(case.find("failure") is not None for case in cases) >= 3
-    )  # the campaign, a seed, and what it was shrunk to
+    )  # the campaign, a seed, and the result of shrinking it
     assert any(
         "silence" in (one.get("value") or "") or "fault" in (one.get("name") or "")
         for one in ET.parse("r.xml").iter("property")
@@ -148,7 +148,7 @@ def test_a_missing_dry_run_protection_is_found_and_shrunk_and_the_repaired_progr
 def test_an_invariant_of_the_system_file_holds_in_scenarios_campaigns_and_runs(folder: Path) -> None:
     (folder / "plant.yaml").write_text(PLANT + INVARIANTS)
     code, told = judge("plain.scenario.yaml")
-    assert code == 0, told  # nothing strikes: the sensor stays good
+    assert code == 0, told  # no fault is active: the sensor stays good
     code, told = judge("plain.scenario.yaml", "--seeds", "1..4", *RANDOM)
     assert code == 1
     assert "invariant within 1: not well.runs within 1 s after quality(sensor.level) == 'bad'" in told
@@ -194,7 +194,7 @@ def test_under_random_faults_steps_only_drive(folder: Path) -> None:
     step = next(check for check in result.checks if check.number == "3")
     assert (result.verdict, step.verdict) == (Verdict.PASSED, Verdict.SKIPPED)
     assert "not judged under random faults" in step.got
-    assert judge("dry.scenario.yaml", "--seeds", "1..2")[0] == 1  # without them they are judged
+    assert judge("dry.scenario.yaml", "--seeds", "1..2")[0] == 1  # without faults they are checked
 
 
 def test_a_rule_that_no_seed_judged_and_faults_that_never_struck_are_inconclusive(folder: Path) -> None:

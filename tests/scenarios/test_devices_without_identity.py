@@ -1,6 +1,6 @@
-"""A device whose prototype states no identity is read with an empty one, and that is what it held.
+"""A device whose prototype states no identity is read with an empty identity, which counts as the value it held.
 
-Observed before: a virtual run of a device with a `serial` register, and without `identity` in the prototype file, was not ok:
+Defect: a virtual run of a device with a `serial` register, and without `identity` in the prototype file, was not ok:
 "ctd.serial was published as '' (...): the device held no such thing".
 """
 

@@ -1,4 +1,4 @@
-"""The scenario on the page about scenarios runs, and passes."""
+"""The scenario on the page docs/scenarios.md runs and passes."""
 
 from __future__ import annotations
 

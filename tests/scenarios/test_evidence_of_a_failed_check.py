@@ -1,4 +1,4 @@
-"""A scenario that did not pass shows what was on the wire before the failed check: in terminal, JSON, JUnit and pytest."""
+"""A scenario that did not pass shows the traffic before the failed check: in terminal, JSON, JUnit and pytest."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def test_terminal_json_and_junit_show_the_last_exchanges_and_how_many_were_left_
     assert lines[0] == heading[0]
     assert int(heading[1]) + MOST == pytest.approx(
         5 * (10 + 1), abs=3
-    )  # ten polls of the level and one of the PIN each second
+    )  # each second: ten polls of the level and one of the PIN
     failed_s = plain["checks"][-1]["t_s"]
     for line in lines[1:]:
         at, request, _ = re.fullmatch(r"([\d.]+) s  (.+) -> (.+)", line).groups()  # type: ignore[union-attr]
@@ -102,7 +102,7 @@ def test_a_check_that_names_no_device_shows_all_of_them(tmp_path: Path) -> None:
     assert plain["on_the_wire"][0].startswith("exchanges with other, sensor in the 5 s")
     (plain,) = json.loads(said(str(plant(tmp_path, "  - pause: 10s\n")), "--json"))
     assert plain["verdict"] == "inconclusive"
-    assert plain["on_the_wire"] == []  # it expects nothing, so that no check failed
+    assert plain["on_the_wire"] == []  # it has no expectation, so no check can fail
 
 
 def test_a_wire_on_which_nothing_was_seen_is_said_to_be_silent(tmp_path: Path) -> None:

@@ -1,7 +1,7 @@
-"""How often each fault struck: a scenario whose fault never struck has tested nothing.
+"""Scenarios report how often each fault took effect; a fault that never took effect has tested nothing.
 
-Observed before: faults that struck no frame at all left the scenario PASSED, and a campaign whose random schedules were all empty
-ended with "ok".
+Defect: faults that matched no frame left the scenario PASSED, and a campaign whose random schedules were all empty ended with
+"ok".
 """
 
 from __future__ import annotations

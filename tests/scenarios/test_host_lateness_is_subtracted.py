@@ -1,6 +1,6 @@
-"""A deadline is prolonged by the lateness of the host that the judge measured, and by no more than that.
+"""A deadline is extended by the measured lateness of the host, and by no more.
 
-Observed: on a loaded host one of three scenarios with `--target local` was INCONCLUSIVE, so that CI could not use it.
+Defect: on a loaded host one of three scenarios with `--target local` was INCONCLUSIVE, so that CI could not use it.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ REACTS = "steps:\n  - pause: 1s\n  - send: {period_s: 1}\n  - expect: {that: \"r
 
 
 def judge(folder: Path, text: str, own_s: float, any_s: float, target: str = "local") -> ScenarioResult:
-    """The verdict on a host that was so late, in virtual time, where the system is exactly as quick as ever."""
+    """Return the verdict on a host with this lateness, in virtual time, where the system is always equally fast."""
 
     class LateBench(VirtualBench):
         can = VirtualBench.can - {Can.EXACT_TIME}
@@ -42,7 +42,7 @@ def judge(folder: Path, text: str, own_s: float, any_s: float, target: str = "lo
 
 @pytest.fixture(scope="module")
 def takes_s(tmp_path_factory: pytest.TempPathFactory) -> float:
-    """How long the system takes to react to a command, in seconds of virtual time."""
+    """Return how long the system takes to react to a command, in seconds of virtual time."""
     check = judge(tmp_path_factory.mktemp("takes"), REACTS % "30s", 0, 0).checks[-1]
     assert check.verdict is Verdict.PASSED
     assert check.t_ns is not None
@@ -64,7 +64,7 @@ def test_a_miss_by_more_than_the_lateness_fails(tmp_path: Path, takes_s: float) 
 
 
 def test_lateness_that_may_be_the_system_s_own_never_passes(tmp_path: Path, takes_s: float) -> None:
-    """A gateway that is stuck answers late, and that is no lateness of the host."""
+    """A blocked gateway answers late, and that does not count as lateness of the host."""
     result = judge(tmp_path, REACTS % f"{takes_s * 0.6:.3f}s", 0, takes_s * 0.8)
     assert result.verdict is Verdict.INCONCLUSIVE, result.checks
     assert "host or system, nobody knows" in result.checks[-1].got
@@ -103,7 +103,7 @@ def test_a_rule_of_the_whole_run_is_prolonged_too(tmp_path: Path, takes_s: float
 
 def test_only_what_was_late_after_the_begin_counts() -> None:
     late = HostLateness()
-    late.slept(1.0, 0.004)  # what sleeps do
+    late.slept(1.0, 0.004)  # lateness of sleeps
     late.slept(2.0, 0.505)
     late.slept(5.0, 1.005)
     late.waited(6.0, 2.0)
@@ -115,7 +115,7 @@ def test_only_what_was_late_after_the_begin_counts() -> None:
 
 
 def attempts_of(monkeypatch: pytest.MonkeyPatch, verdicts: list[Verdict]) -> list[Verdict]:
-    """Let attempts end like this; what is left of them when it is over tells how many there were."""
+    """Let attempts end with these verdicts; the number of remaining verdicts shows how many attempts were made."""
     left = list(verdicts)
 
     def attempt(scenario: object, target: object, trace_file: object) -> ScenarioResult:
@@ -177,7 +177,7 @@ def test_retries_are_reported_in_text_json_junit_and_html(tmp_path: Path, monkey
     page = render_html(Report("r", [failed]))
     assert (
         page.count("attempt 1 of 2 was inconclusive: step &lt;1&gt;: too late") == 2
-    )  # in the table, and where it failed
+    )  # in the table, and at the failed step
 
 
 def test_what_is_written_to_a_plant_is_not_repeated(tmp_path: Path) -> None:

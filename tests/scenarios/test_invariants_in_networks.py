@@ -1,4 +1,4 @@
-"""Invariants and campaigns in networks and with every target: they are judged, or the combination is refused with the reason."""
+"""Invariants and campaigns in networks and with every target are checked, or the combination is refused with the reason."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A host that was late has proved nothing; a failure that somebody answers for is skipped until its day."""
+"""A late host proves nothing; an accepted failure with an owner is skipped until its expiry date."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from fieldtwin.scenarios.judging.waiving import all_well, waive
 
 
 class LateBench(VirtualBench):
-    """Says that its host was 300 ms late just now, and scans 7 ms."""
+    """A bench whose host was 300 ms late just now, with scans of 7 ms."""
 
     can = VirtualBench.can - {Can.EXACT_TIME}
 

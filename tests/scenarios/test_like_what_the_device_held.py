@@ -1,7 +1,8 @@
-"""``like: recording`` compares a tag with what its device held when the tag was read, also if that was first held long before.
+"""``like: recording`` compares a tag with the value of its device when the tag was read, even if the device held it long
+before.
 
-Observed before, on a loaded host with ``--target local``: "4.58; the device holds 4.92" made a scenario FAILED although the
-device had held 4.58 when it was read. That value was sampled just before the time that was looked at, and a newer one followed.
+Defect, on a loaded host with ``--target local``: "4.58; the device holds 4.92" made a scenario FAILED although the device had
+held 4.58 when it was read. That value was sampled just before the examined time, and a newer one followed.
 """
 
 from __future__ import annotations

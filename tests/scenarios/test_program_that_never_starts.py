@@ -27,7 +27,7 @@ steps:
 def test_it_fails_before_and_after_the_timeout(tmp_path: Path, during: str, told: str) -> None:
     hall(tmp_path)
     profile = tmp_path / "thermometer.yaml"
-    profile.write_text(profile.read_text().replace("unit: degC", "unit: degC, range: [0, 10]"))  # it says 21.6
+    profile.write_text(profile.read_text().replace("unit: degC", "unit: degC, range: [0, 10]"))  # the sensor reads 21.6
     file = tmp_path / "silent.scenario.yaml"
     file.write_text(STEPS % during)
     result = run_virtual(load_scenario(file, []))

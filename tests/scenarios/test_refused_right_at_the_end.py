@@ -1,8 +1,8 @@
-"""A scenario that is met at once still sees what the PLC makes of it.
+"""A scenario that is met at once still detects refused outputs of the first scan.
 
-Observed: its only step was met after 4 ms, so that it passed three times out of four although the program commanded an output
-that was refused in its first scan. In virtual time the same scenario failed because the program "waits for" an input that had
-been read: its first scan was still to come.
+Defect: its only step was met after 4 ms, so it passed three times out of four although the program commanded an output that
+was refused in its first scan. In virtual time the same scenario failed because the program "waits for" an input that had been
+read: its first scan was still to come.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""What a report says is true of the trace: headlines, times, values, counts and "never published".
+"""The statements of a report agree with the trace: headlines, times, values, counts and "never published".
 
-Observed before: the headline named a step that was not due when a `within` rule broke; "never published" stood beside a value
-that was quoted; a probe that could not be reached was reported as "plc.running: never published".
+Defects: the headline named a step that was not yet due when a `within` rule broke; "never published" was printed next to a
+quoted value; an unreachable probe was reported as "plc.running: never published".
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ RULES = st.lists(
 
 
 class Past:
-    """What was known when, by the trace alone."""
+    """Return the values known at each time, from the trace alone."""
 
     def __init__(self, scenario: Scenario, trace: Sequence[Event]) -> None:
         self.scenario = scenario
@@ -120,7 +120,7 @@ QUOTE = re.compile(
 
 
 def check_quotes(past: Past, check: CheckResult) -> None:
-    """Each value that is quoted was the last one in the trace; what was never published is not in it."""
+    """Each quoted value was the last one in the trace; a value reported as never published is not in the trace."""
     assert check.t_ns is not None
     at_s = check.t_ns / NS
     for found in QUOTE.finditer(check.got):
@@ -137,7 +137,7 @@ def check_quotes(past: Past, check: CheckResult) -> None:
 
 
 def check_rule(past: Past, check: CheckResult) -> None:
-    """What a broken rule says of times and counts."""
+    """Times and counts in the message of a broken rule."""
     word, _, number = check.number.partition(" ")
     form = past.scenario.form
     if word in ("always", "never") and "age(" not in check.text:
@@ -169,7 +169,7 @@ def check_rule(past: Past, check: CheckResult) -> None:
 
 
 def check_step(past: Past, result: ScenarioResult, check: CheckResult) -> None:
-    """A step that failed was due: it began after the one before it, and the trace has its begin and its verdict."""
+    """A failed step was due: it began after the previous one, and the trace has its start and its verdict."""
     marks = [e for e in past.trace if e.kind is Kind.STEP and e.where == check.number]
     assert [e.t_ns for e in marks] == [check.since_ns, check.t_ns]
     assert marks[-1].data["verdict"] == check.verdict.value
@@ -187,7 +187,7 @@ def check_step(past: Past, result: ScenarioResult, check: CheckResult) -> None:
             if x.device == expect.wire and since_ns <= x.t_ns <= (check.t_ns or 0)
         ]
         over = [x for x in seen if x.reply_text != "no reply"]
-        assert len(over) <= int(check.got.partition(":")[0]) <= len(seen)  # one may not have been answered yet
+        assert len(over) <= int(check.got.partition(":")[0]) <= len(seen)  # one request may still be unanswered
 
 
 def check_headline(result: ScenarioResult) -> None:
@@ -229,7 +229,7 @@ def test_what_a_report_says_is_true_of_the_trace(
             check_step(past, result, check)
         elif check.verdict is Verdict.FAILED:
             check_rule(past, check)
-    for check in result.checks:  # whether the programs run is no line of the scenario
+    for check in result.checks:  # whether the programs run is not a line of the scenario
         assert check.verdict is not Verdict.FAILED or check.where.startswith(str(path)) or check.number == "running"
 
 

@@ -1,7 +1,6 @@
 """A report of scenarios of several systems shows each scenario with its own system: its secrets, devices and name.
 
-Observed before: the HTML report used the first file's system for all. Secret tags of the others were shown in
-diagrams and frames.
+Defect: the HTML report used the first file's system for all. Secret tags of the others were shown in diagrams and frames.
 """
 
 from __future__ import annotations
@@ -90,7 +89,7 @@ def test_each_scenario_is_shown_with_its_own_system(tmp_path: Path, turned: bool
     assert "tank.pin" in shown["second"]
     assert not SECRET.search(shown["second"]), "a secret of the second system is shown"
     assert not SECRET.search(done.output[done.output.index("the level of second") :].partition("the level of first")[0])
-    assert "48813" in shown["first"]  # no secret there
+    assert "48813" in shown["first"]  # not a secret there
     assert "first-tank" in page
     assert "second-tank" in page
     for name in ("first", "second"):

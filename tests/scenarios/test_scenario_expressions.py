@@ -1,4 +1,4 @@
-"""What scenarios assert: read strictly, evaluated without executing anything, unknown where nothing is known."""
+"""Scenario conditions are parsed strictly, evaluated without executing code, and unknown if a value is unknown."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def look(function: str, name: str) -> Any:
         ("-ctd.pressure * 2 == -11", True),
         ("plc.late < 5 ms", True),
         ("command pending and updates(ctd.pressure) == 7", True),
-        ("ctd.status > 0", None),  # nothing is known of it
+        ("ctd.status > 0", None),  # it has no known value
         ("ctd.status == 0", None),
         ("ctd.status != 0", None),
         ("not (ctd.status > 0)", None),

@@ -1,4 +1,5 @@
-"""Scenarios against the observatory in virtual time: what passes, what fails and says why, what is refused before it starts."""
+"""Scenarios against the observatory in virtual time: passing ones, failing ones with their reasons, and those refused at the
+start."""
 
 from __future__ import annotations
 
@@ -188,7 +189,7 @@ def test_what_expects_nothing_has_not_passed(tmp_path: Path) -> None:
 
 
 BITS = "  - fault: {id: bits, name: corrupt-bits, device: modem, function: 3, from: 1s, until: 3s}\n"
-"""Nobody can notice them: Modbus TCP has no check sum."""
+"""These faults cannot be detected: Modbus TCP has no checksum."""
 
 
 @pytest.mark.parametrize(("steps", "verdict"), [("", Verdict.PASSED), (BITS, Verdict.FAILED)])

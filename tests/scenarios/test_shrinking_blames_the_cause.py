@@ -1,7 +1,7 @@
 """A schedule that a campaign shrinks names the cause of the failure, and the written scenario is confirmed.
 
-Observed before: schedules of systems without a transmitter contained ``send`` steps and could never pass, and the shrinker never
-tried a run without faults, so that a crash in the first scan was blamed on a fault at 244 s.
+Defect: schedules of systems without a transmitter contained ``send`` steps and could never pass. The shrinker never tried a
+run without faults, so a crash in the first scan was attributed to a fault at 244 s.
 """
 
 from __future__ import annotations

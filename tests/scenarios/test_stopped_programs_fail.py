@@ -1,6 +1,6 @@
-"""A program that stopped fails every scenario that did not ask for it.
+"""A stopped program fails every scenario that does not expect it.
 
-Observed before: ST logic divided by zero in its first scan, and ``expect: {that: "not pump.fault", during: 30s}`` passed.
+Defect: ST logic divided by zero in its first scan, and ``expect: {that: "not pump.fault", during: 30s}`` passed.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ NO_FAULT = "  - expect: {that: 'not pump.fault', during: 30s}\n"
 
 
 def plant(folder: Path, logic: str, steps: str, head: str = "") -> Path:
-    module = f"pump_{abs(hash(folder))}"  # a module is imported once in a process
+    module = f"pump_{abs(hash(folder))}"  # a module is imported once per process
     source = f'"python: {module}:Pump"' if "class" in logic else "pump.st"
     (folder / (f"{module}.py" if "class" in logic else "pump.st")).write_text(logic)
     write_plant(folder, PLANT.replace("pump.st", source))

@@ -1,7 +1,7 @@
-"""Three-valued logic: what is unknown stays unknown, and no expectation passes on it.
+"""Three-valued logic: unknown values stay unknown, and no expectation passes because of them.
 
-Observed before: ``not (sensor.level > 1)`` was true while the tag had never been read, and ``quality(x) == 'bad'`` passed for a
-tag that was never published.
+Defect: ``not (sensor.level > 1)`` was true while the tag had never been read, and ``quality(x) == 'bad'`` passed for a tag
+that was never published.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def known_values(value: Any) -> tuple[Any, ...]:
 @given(EXPRESSIONS, VALUES, VALUES, VALUES)
 @settings(max_examples=400, deadline=None)
 def test_a_known_verdict_holds_whatever_the_unknown_values_are(text: str, x: Any, y: Any, z: Any) -> None:
-    """The soundness of Kleene's logic: true or false is only said if no value of the unknown tags could change it."""
+    """Kleene's logic is sound: the result is true or false only if no value of the unknown tags could change it."""
     said = truth(text, {"a.x": x, "b.y": y, "c.z": z})
     if said is None:
         return
@@ -166,7 +166,7 @@ def test_a_rule_is_judged_from_when_it_is_known(tmp_path: Path, head: str, verdi
 
 
 def test_a_rule_that_becomes_unknown_is_inconclusive_and_says_since_when(tmp_path: Path) -> None:
-    """The temperature is 0 for a while, so that a quotient by it has no value."""
+    """The temperature is 0 for a while, so a quotient by it has no value."""
     steps = (
         "  - send: {period_s: 1}\n  - wait: {until: \"quality(ctd.pressure) == 'good'\", within: 15s}\n  - pause: 3s\n"
         "  - set: {tag: ctd.temperature, value: 0}\n  - wait: {until: 'ctd.temperature == 0', within: 5s}\n  - pause: 1s\n"

@@ -1,6 +1,6 @@
 """``set`` on an object that the simulation does not feed, or that a sampling sensor counts itself.
 
-Observed before: such a ``set`` had no effect and gave no message.
+Defect: such a ``set`` had no effect and gave no message.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def test_an_object_that_no_simulation_feeds_can_be_set_and_given_back(tmp_path: 
 
 
 def test_a_value_that_never_took_effect_is_said(tmp_path: Path) -> None:
-    """The sensor is in standby: it samples nothing, so that its signal is never what was set."""
+    """The sensor is in standby and takes no samples, so its signal never gets the set value."""
     steps = "  - wait: {until: \"quality(inclinometer.slope_long) == 'good'\", within: 5s}\n"
     result = run(tmp_path, "observatory", steps + "  - set: {tag: ctd.pressure, value: 5}\n  - pause: 2s\n")
     assert result.verdict is Verdict.INCONCLUSIVE
@@ -81,7 +81,7 @@ def test_a_value_that_never_took_effect_is_said(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("tag", "value", "effect"), [("serial", 5, False), ("slope_long", 5, True)])
 def test_an_object_takes_effect_when_the_node_has_sent_it(tmp_path: Path, tag: str, value: int, effect: bool) -> None:
-    """Observed: a serial number, which the gateway reads once at the start, was set in the middle of a scenario that passed."""
+    """Defect: a serial number, which the gateway reads once at the start, was set in the middle of a scenario that passed."""
     steps = (
         "  - wait: {until: \"quality(inclinometer.slope_long) == 'good'\", within: 5s}\n"
         f"  - set: {{tag: inclinometer.{tag}, value: {value}}}\n"

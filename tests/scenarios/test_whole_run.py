@@ -1,4 +1,4 @@
-"""What a scenario wants of the whole run, and probes, in virtual time: what holds; what is broken says when and what."""
+"""Rules of a scenario for the whole run, and probes, in virtual time: rules that hold, and broken ones with time and reason."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""What a failed step and a waiting program say: "now" instead of "within 0 s", and the remedy for a program that waits for what
-only its own command brings about."""
+"""Messages of a failed step and of a waiting program: "now" instead of "within 0 s", and the remedy for a program that waits
+for an input that only its own command changes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A clock by hand and what a plant reports, for the tests of shadow and twin."""
+"""A manual clock and the reports of a plant, for the tests of shadow and twin."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ NOW_MS = 1_790_000_000_000
 
 
 class Hands:
-    """A clock whose hands the test moves."""
+    """A clock that the test sets."""
 
     def __init__(self) -> None:
         self.now_ms = NOW_MS
@@ -32,7 +32,7 @@ class Hands:
 
 
 def status(period_s: int, state: str = "", t_ms: int = NOW_MS) -> Event:
-    """A report of the state machine `relay`; of the state that follows from the period unless another is said."""
+    """A report of the state machine `relay`; the state follows from the period unless it is given."""
     return Event(1, t_ms, Kind.STATE, "relay", encode_status(state or delta(period_s).name, period_s).data)
 
 

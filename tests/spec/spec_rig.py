@@ -1,4 +1,4 @@
-"""The observatory's prototype in this process: the very drivers, emulators and wires of a run, without its processes."""
+"""The observatory's prototype in this process: the drivers, emulators and wires of a run, without its processes."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def observatory() -> tuple[System, Prototype]:
 
 @dataclass
 class Rig:
-    """Emulators that listen, and the drivers of the same system, attached to them."""
+    """Listening emulators, and the drivers of the same system, attached to them."""
 
     twin: DigitalTwinPrototype
     field: FieldSide
@@ -58,7 +58,7 @@ class Rig:
 async def rig(
     run_dir: Path, prototype: Prototype | None = None, carried: dict[str, Endpoint] | None = None
 ) -> AsyncIterator[Rig]:
-    """`carried` says where a bus is opened that is not opened where its emulator listens (a link lies between)."""
+    """`carried` gives the endpoint of a bus that is opened in a different place than its emulator's (through a link)."""
     system, shipped = observatory()
     twin = DigitalTwinPrototype(system, prototype or shipped, CLOCK)
     field = twin.field(run_dir)
@@ -89,7 +89,7 @@ async def rig(
 
 
 def copy_systems(folder: Path) -> Path:
-    """The shipped profiles and recordings in `folder`, for a test to change; the folder of the systems."""
+    """Copy the shipped profiles and recordings to `folder`, for a test to change; return the folder of the systems."""
     shutil.copytree(CHECKOUT / "profiles", folder / "profiles")
     shutil.copytree(CHECKOUT / "recordings", folder / "recordings")
     return folder / "profiles" / "systems"

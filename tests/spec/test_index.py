@@ -1,4 +1,4 @@
-"""No row of the specification is without a test here: the schemas that docs/paper.md has in its table, the prose, the rulings."""
+"""Every row of the specification has a test here: the schemas in the table of docs/paper.md, the prose, the rulings."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ def test_index_every_row_of_the_prose_has_a_test() -> None:
 
 
 def rulings_named(text: str) -> set[int]:
-    """The numbers behind ``ruling`` and ``rulings``: ``ruling 7``, ``Rulings 8 and 16``, ``Rulings 1, 2 and 5``."""
+    """Return the numbers after ``ruling`` and ``rulings``: ``ruling 7``, ``Rulings 8 and 16``, ``Rulings 1, 2 and 5``."""
     said = re.findall(r"\b[Rr]ulings? (\d+(?:(?:, | and )\d+)*)", text)
     return {int(number) for words in said for number in re.findall(r"\d+", words)}
 
 
 def test_index_every_ruling_is_named_by_a_test_that_shows_it() -> None:
-    """In the test itself: its docstring, or the words of an assertion."""
+    """In the test itself: its docstring, or the text of an assertion."""
     page = (HERE.parents[1] / "docs" / "paper.md").read_text(encoding="utf-8")
     rulings = {int(number) for number in re.findall(r"^\*\*(\d+)\. ", page[page.index("## Rulings") :], re.M)}
     assert rulings == set(range(1, RULINGS + 1))

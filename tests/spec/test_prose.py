@@ -1,4 +1,4 @@
-"""SPEC part 2, rows 2, 3 and 11, and that a plant needs no emulators: whole runs of `fieldtwin`, looked at from outside."""
+"""SPEC part 2, rows 2, 3 and 11, and a plant without emulators: whole runs of `fieldtwin`, observed from outside."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ def _hook(event, args):
             os.write(_log, f"{' '.join(sys.orig_argv)}\\t{os.path.realpath(path)}\\n".encode())
 sys.addaudithook(_hook)
 """
-"""A `sitecustomize` that every process of a run imports first: which process opened which YAML file."""
+"""A `sitecustomize` that every process of a run imports first. It records which process opened which YAML file."""
 
 
 class Ended:
-    """A run that ended: exit code, summary, talk, and (process, file) for each YAML file that was opened."""
+    """A finished run: exit code, summary, console output, and (process, file) for each YAML file that was opened."""
 
     def __init__(self, folder: Path, *args: str, code: Path = CHECKOUT) -> None:
         folder.mkdir()
@@ -62,13 +62,13 @@ class Ended:
         self.opened = [(line.partition("\t")[0], Path(line.partition("\t")[2])) for line in lines]
 
     def files_of(self, module: str) -> set[str]:
-        """Names of the files that the processes of a module opened."""
+        """Return the names of the files that the processes of a module opened."""
         return {path.name for process, path in self.opened if f" {module} " in f"{process} "}
 
 
 @pytest.fixture
 def deserted(tmp_path: Path) -> Path:
-    """The observatory's file for a plant where nothing is there, with its prototype file beside it; its path."""
+    """The observatory's file for a plant without hardware, with its prototype file; return its path."""
     systems = tmp_path / "systems"
     systems.mkdir()
     shutil.copy(SYSTEMS / "observatory.prototype.yaml", systems)
@@ -89,7 +89,7 @@ def deserted(tmp_path: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def standby(tmp_path_factory: pytest.TempPathFactory) -> Ended:
-    """A prototype that nobody commands; its wires are captured, and it has a thread that nobody asks for."""
+    """A prototype without commands; its wires are captured, and it has a thread that no client requests."""
     folder = tmp_path_factory.mktemp("standby") / "run"
     more = ("--capture", "wires.jsonl", "--thread", "tcp://127.0.0.1:0")
     return Ended(folder, "observatory", "--prototype", "--commands", "none", "--for", "3s", *more)
@@ -126,7 +126,7 @@ def test_prose_2_the_plants_run_never_opens_a_prototype_file(deserted: Path, tmp
     assert ended.files_of("fieldtwin.twin.plant.controller") >= {
         "observatory.yaml",
         "ctd-reference.yaml",
-    }  # the witness was there
+    }  # the recorder was active
     assert [path for _, path in ended.opened if path.name.endswith(".prototype.yaml")] == []
 
 
@@ -137,7 +137,7 @@ def test_prose_2_what_is_emulated_is_known_to_the_field_side_alone(standby: Ende
 
 
 def test_prose_2_the_emulated_connection_belongs_to_neither_device_nor_driver() -> None:
-    """Neither side can import the other's half of the wire, nor what joins them (import contracts hold the rest)."""
+    """Neither side can import the other's half of the wire, nor the code that connects them (import contracts cover the rest)."""
     for folder, strangers in (("gateway", ("emulators", "twin")), ("emulators", ("gateway.devices", "twin"))):
         for path in (CHECKOUT / folder).rglob("*.py"):
             text = path.read_text(encoding="utf-8")
@@ -149,7 +149,7 @@ def test_prose_2_the_emulated_connection_belongs_to_neither_device_nor_driver() 
 def test_DigitalTwinPrototype_values_are_simply_good_and_what_its_run_leaves_says_that_it_was_one(
     standby: Ended, tmp_path: Path
 ) -> None:
-    """Ruling 15: summary, store, knowledge, capture, and what is recorded from that."""
+    """Ruling 15: summary, store, knowledge, capture, and the data recorded from it."""
     assert standby.code == 0, standby.summary["errors"]
     qualities = {name: tag["quality"] for name, tag in standby.summary["tags"].items()}
     assert qualities["inclinometer.slope_long"] == qualities["ctd.sample_period_s"] == "good"
@@ -199,7 +199,7 @@ def test_prose_3_ACTIVE_samples_at_the_commanded_period_and_OFF_and_STANDBY_take
     assert count(start_ns + 10 * NS_PER_S) == 0
     begun_ns = start_ns + 20 * NS_PER_S
     sensor.write(at.table, at.address, [period_s], begun_ns)
-    taken = 1 + seconds // period_s  # the first at once
+    taken = 1 + seconds // period_s  # the first one at once
     stopped_ns = begun_ns + seconds * NS_PER_S
     assert count(stopped_ns) == taken
     sensor.write(at.table, at.address, [stop_s & 0xFFFF], stopped_ns)
@@ -272,11 +272,12 @@ def test_prose_11_devices_are_added_one_at_a_time(tmp_path: Path) -> None:
 
 
 def test_prose_2_a_plant_needs_no_emulators(deserted: Path, tmp_path: Path) -> None:
-    """With that folder removed, a plant with no hardware behaves as with it: same exit code, same words."""
+    """With that folder removed, a plant without hardware behaves as with it: same exit code, same output."""
     bare = tmp_path / "bare"
     bare.mkdir()
     for folder in ("gateway", "plc", "twin", "fieldtwin", "profiles", "recordings"):
-        shutil.copytree(CHECKOUT / folder, bare / folder, symlinks=True)  # with what was compiled: times and sizes stay
+        # including the compiled files: times and sizes remain
+        shutil.copytree(CHECKOUT / folder, bare / folder, symlinks=True)
     without = Ended(tmp_path / "without", str(deserted), "--plant", "--for", "2s", code=bare)
     whole = Ended(tmp_path / "with", str(deserted), "--plant", "--for", "2s")
     assert without.code == whole.code == 1, without.err

@@ -1,4 +1,4 @@
-"""SPEC part 2, rows 1 and 4 to 10, each in small: what whole runs show of them is in tests/interop and tests/system."""
+"""SPEC part 2, rows 1 and 4 to 10, each on a small scale; tests/interop and tests/system test them with whole runs."""
 
 from __future__ import annotations
 
@@ -55,11 +55,11 @@ from fieldtwin.twin.thread.frames import ACK, ASK, REFUSED
 from fieldtwin.twin.thread.tcp import WHO, TcpListening
 from fieldtwin.twin.thread.thread import schema_of
 
-# -- 1: the driver cannot tell an emulator from the device ----------------------------------------------------------------
+# -- 1: the driver cannot distinguish an emulator from the device -----------------------------------------------------
 
 
 async def mailbox_talk(r: Rig) -> None:
-    """What a transmitter's driver does: it finds out what was taken, takes a message, acknowledges it, sends one."""
+    """The work of a transmitter's driver: it reads which messages were taken, takes a message, acknowledges it, sends one."""
     driver = r.register_driver("modem")
     assert isinstance(driver, TransmitterDriver)
     ear: Consumer[COMMAND] = Consumer(driver.emitter.event)
@@ -84,7 +84,7 @@ def swapped(pdu: bytes) -> bytes:
 
 
 async def both_talks(folder: Path, spoilt: object = bytes) -> tuple[Crossed, Crossed]:
-    """The same driver, the same configuration, against our emulator and against a device that is none of ours."""
+    """The same driver with the same configuration, against our emulator and against an independent device."""
     async with (
         rig(folder) as emulated,
         relay(with_message(emulated)) as emulator,
@@ -101,7 +101,7 @@ async def both_talks(folder: Path, spoilt: object = bytes) -> tuple[Crossed, Cro
 
 
 def exchanges(crossed: Crossed) -> list[Exchange]:
-    """The conversation, one by one."""
+    """Return the exchanges of the conversation, one by one."""
     found = []
     for request, reply in zip(adus(crossed.there), adus(crossed.back), strict=True):
         assert request[:2] == reply[:2], "of one transaction"
@@ -118,7 +118,7 @@ def adus(stream: bytearray) -> list[bytes]:
 
 
 def test_prose_1_the_same_driver_asks_emulator_and_device_the_same_and_is_answered_alike(tmp_path: Path) -> None:
-    """The flagship, which compares a whole system with tolerances in a reviewed file, is tests/interop/test_flagship.py."""
+    """The flagship test, which compares a whole system with tolerances in a reviewed file, is tests/interop/test_flagship.py."""
     emulator, stranger = run(both_talks(tmp_path))
     assert emulator.there == stranger.there, "request bytes are identical"
     assert emulator.back == stranger.back
@@ -134,7 +134,8 @@ def test_prose_1_a_planted_difference_is_seen(tmp_path: Path) -> None:
 
 
 def test_prose_4_the_shadows_modules_load_nothing_that_could_send() -> None:
-    """By construction: what is not imported is not held. The contract of the same name is checked at every commit."""
+    """By construction: the shadow's modules import nothing that sends. The import contract of the same name is checked at
+    every commit."""
     program = "import sys, fieldtwin.twin.model.shadow; print(*sys.modules)"
     loaded = subprocess.run(
         [sys.executable, "-c", program], cwd=CHECKOUT, capture_output=True, text=True, check=True, timeout=30
@@ -155,7 +156,7 @@ def test_prose_4_the_shadows_modules_load_nothing_that_could_send() -> None:
 def test_prose_4_a_wire_capture_towards_the_plant_holds_no_command(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A shadow as `fieldtwin shadow` runs it, opposite a plant that tells it everything, commands that came included."""
+    """A shadow as `fieldtwin shadow` runs it, with a plant that reports everything, received commands included."""
     monkeypatch.setenv("FIELDTWIN_RUN", str(tmp_path))
     system = observatory()[0]
     schema = schema_of(system)
@@ -188,7 +189,7 @@ def test_prose_4_a_wire_capture_towards_the_plant_holds_no_command(
     while at < len(crossed.there):
         size = int.from_bytes(crossed.there[at : at + 2])
         said = crossed.there[at + 2 : at + 2 + size]
-        if not said.startswith(WHO):  # the link's own word, in which a shadow says that it is itself
+        if not said.startswith(WHO):  # a message of the link protocol, in which a shadow identifies itself as one
             kinds.append(said[0] & 0x0F)
         at += 2 + size
     assert set(kinds) <= {ACK, ASK, REFUSED}, "acknowledgements and questions, which ruling 16 lists"
@@ -227,7 +228,7 @@ def test_prose_5_all_that_a_shadow_receives_updates_its_model_and_a_difference_i
 
 
 def test_prose_5_it_reuses_the_physical_twins_event_handlers_and_message_types() -> None:
-    """And its transmitter driver: test_schema_digital_thread."""
+    """The transmitter driver is tested in test_schema_digital_thread."""
     shadow = DigitalShadow(ReceivingEnd("from the plant"), Hands(), declared=())
     assert issubclass(SeenStatus, STATUS)
     assert issubclass(SeenMeasurement, MEASUREMENT)
@@ -276,7 +277,7 @@ def test_prose_8_the_prototypes_digital_model_is_another_instance_than_the_shado
 
 
 def test_prose_8_a_digital_twin_asks_a_prototype_what_if_with_the_full_software_stack() -> None:
-    """The gateway, the PLC and the emulators of a run, ahead in virtual time, from what the twin knows."""
+    """The gateway, the PLC and the emulators of a run, ahead in virtual time, from the twin's knowledge."""
     stays = ("relay.state == 'ACTIVE'", "quality(ctd.pressure) == 'good'")
     known = {"ctd.pressure": 50.0}
     question = Asked("observatory", 8.0, (), stays, 1.0, period_s=1, values=known, programs={"relay": of_period(3)})
@@ -286,7 +287,7 @@ def test_prose_8_a_digital_twin_asks_a_prototype_what_if_with_the_full_software_
 
 
 def test_prose_8_a_prototype_can_serve_as_the_digital_twin_itself() -> None:
-    """It goes on from the plant's state and samples as the plant does. Opposite a digital twin in CI: tests/system."""
+    """It continues from the plant's state and samples as the plant does. tests/system tests it with a digital twin in CI."""
     state = KnownState({"ctd.pressure": 50.0}, {"relay": of_period(2)})
     outcome = answer(Fork("observatory", state, 10.0), Plan("goes on"))
     assert outcome.error == ""
@@ -319,10 +320,10 @@ def test_prose_9_virtual_context_is_recorded_data_or_a_simulation(name: str) -> 
 
 
 def test_prose_9_a_recording_from_the_field_goes_back_into_CI(tmp_path: Path) -> None:
-    """What went over the wire between the driver and a real device is what an emulator answers from then on, in its order."""
+    """An emulator answers from the recorded traffic between the driver and a real device, in the recorded order."""
     _, stranger = run(both_talks(tmp_path))
     seen = exchanges(stranger)
-    changing = bytes.fromhex("0300320001")  # a register that was another one each time
+    changing = bytes.fromhex("0300320001")  # a register with a different value each time
     seen += [Exchange(100.0 + n, seen[0].unit, changing, bytes([3, 2, 0, n])) for n in (7, 1, 9)]
     header = RecordingHeader(version=1, device="x/modem", kind="exchanges", source="measured")
     with RecordingWriter(tmp_path / "field.jsonl", header) as writer:

@@ -1,4 +1,4 @@
-"""Rulings that no schema has a row for: ChangeBehavior (14), and what is safe and what is lost (18)."""
+"""Rulings without a row in a schema: ChangeBehavior (14), and the safe state and losses (18)."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ PROFILES = sorted((CHECKOUT / "profiles" / "devices").glob("*.yaml"))
 
 
 def test_ChangeBehavior_maps_a_name_to_commands_by_the_map_in_the_device_profile(tmp_path: Path) -> None:
-    """Ruling 14: the driver's, and the commands go the way of every other."""
+    """Ruling 14: it belongs to the driver, and its commands take the same path as all others."""
 
     async def main() -> None:
         async with rig(tmp_path) as r:
@@ -113,7 +113,7 @@ def driver_of(path: Path) -> Any:
 
 
 class Watched:
-    """The observatory in virtual time, with a shadow that is told what its process image shows."""
+    """The observatory in virtual time, with a shadow that receives the contents of its process image."""
 
     def __init__(self, system: System, plant: VirtualPrototype, shore: Shore) -> None:
         self.plant, self.shore = plant, shore
@@ -132,7 +132,7 @@ class Watched:
         return next(iter(unit.bank.read("holding", 1, 1, self.plant.loop.now_ns)))
 
     async def pass_s(self, seconds: float) -> None:
-        """So much later, the shadow looked at twenty times a second."""
+        """Let time pass, with the shadow polled twenty times a second."""
         for _ in range(round(seconds * 20)):
             await asyncio.sleep(0.05)
             self._image.look(*(reader.snapshot() for reader in self._readers))
@@ -204,7 +204,7 @@ def test_PhysicalTwin_of_which_the_controller_is_dead_has_safe_outputs_and_the_m
 
 
 def test_PhysicalTwin_of_which_a_device_is_dead_has_bad_tags_and_the_model_says_so(tmp_path: Path) -> None:
-    """Ruling 18: that device's, with a reason and the last value; and good again when it is back."""
+    """Ruling 18: the tags of that device, with a reason and the last value; good again when it returns."""
 
     async def main(watched: Watched) -> None:
         last = watched["ctd.pressure"].value

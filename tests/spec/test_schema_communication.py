@@ -56,7 +56,7 @@ def test_Communication_of_every_shipped_device_holds() -> None:
 def test_Communication_that_differs_is_refused_when_the_system_is_put_together(
     tmp_path: Path, old: str, new: str
 ) -> None:
-    """Ruling 12: derived from the profiles on both sides; the error names what is missing on either."""
+    """Ruling 12: derived from the profiles on both sides; the error names the commands missing on either."""
     systems = copy_systems(tmp_path)
     devices = systems.parent / "devices"
     other = (devices / "ctd-reference.yaml").read_text(encoding="utf-8").replace(old, new)
@@ -99,8 +99,8 @@ def test_Communication_ReadFromDevice_and_ReadFromDriver(tmp_path: Path) -> None
 
 
 def test_EmulatedCommunication_goes_both_ways_through_an_EmulatedConnection(tmp_path: Path) -> None:
-    """emulator <-> EmulatedConnection <-> driver: a virtual serial port that is carried over TCP. The driver opens the plant's
-    endpoint; the emulator's device still hangs on RS232."""
+    """emulator <-> EmulatedConnection <-> driver: a virtual serial port carried over TCP. The driver opens the plant's
+    endpoint; the emulator's device is still connected by RS232."""
 
     async def main() -> None:
         system, prototype = observatory()
@@ -113,7 +113,7 @@ def test_EmulatedCommunication_goes_both_ways_through_an_EmulatedConnection(tmp_
                 async with rig(tmp_path / "b", None, {"line1": Endpoint("pty", path=str(tmp_path / "port"))}) as near:
                     crossed = Rig(near.twin, far_side.field, near.tags, near.drivers)
                     await both_ways(crossed)
-                    assert near.unit("ctd").counters.requests == 0  # the emulator here was not asked
+                    assert near.unit("ctd").counters.requests == 0  # this emulator received no request
                 assert link.connection.type is PROTOCOL.TCP
                 assert link.connection.protocol is PROTOCOL.RS232
                 assert far_side.unit("ctd").emulator.connection.type is PROTOCOL.RS232

@@ -1,6 +1,6 @@
-"""Schemas Connection, RS232Connection, TCPConnection; CAN is ours (ruling 13).
+"""Schemas Connection, RS232Connection, TCPConnection; CAN is our addition (ruling 13).
 
-The asynchronous connection that drivers hold wraps this very stream: `test_Connection_is_what_an_opened_wire_reads_from`.
+The asynchronous connection of drivers wraps this stream: `test_Connection_is_what_an_opened_wire_reads_from`.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def test_Connection_loses_and_changes_nothing(kind: type[Connection[bytes]], ste
 
 @given(there=st.lists(st.binary(max_size=4)), back=st.lists(st.binary(max_size=4)))
 def test_Connection_is_a_duplex_medium_with_two_ends(there: list[bytes], back: list[bytes]) -> None:
-    """Ruling 4: device and driver each hold an end; neither reads what it wrote itself."""
+    """Ruling 4: device and driver each hold an end; neither reads its own output."""
     one, other = wire(RS232Connection)
     for item in there:
         one.write(item)

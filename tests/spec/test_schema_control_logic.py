@@ -19,7 +19,7 @@ PAYLOADS = st.lists(st.binary(max_size=20), max_size=10)
 
 
 class Ears:
-    """A control logic, and consumers of what it emits."""
+    """A control logic, and consumers of its events."""
 
     def __init__(self) -> None:
         self.logic = ControlLogic()
@@ -84,7 +84,7 @@ def test_ControlLogic_LogData_needs_a_positive_period(period_s: int, data: bytes
 
 @given(periods=st.lists(PERIODS, max_size=20))
 def test_ControlLogic_sendCmd_drains_the_transmitter_queue_and_relays_every_command(periods: list[int]) -> None:
-    """Rulings 1 and 5: always relayed, also 0 and negative; emitting never waits for the log."""
+    """Rulings 1 and 5: a period is always relayed, also 0 and negative; emitting never waits for the log."""
     ears = Ears()
     ears.send(*periods)
     assert not ears.logic.transmitter.queue
@@ -126,7 +126,7 @@ def test_ControlLogic_sendRsp_drains_the_sensor_queue_and_emits_payloads_unalter
 
 @given(bits=st.binary(max_size=5).filter(lambda b: len(b) != 2))
 def test_ControlLogic_what_is_no_command_changes_nothing(bits: bytes) -> None:
-    """Ruling 11: what the paper leaves out surfaces as a typed error, here a count and an entry in the log."""
+    """Ruling 11: a case that the paper omits gives a typed error, here a count and an entry in the log."""
     ears = Ears()
     ears.send(3)
     with pytest.raises(Desync):

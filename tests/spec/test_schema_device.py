@@ -1,4 +1,4 @@
-"""Schemas Device, Sensor, Transmitter, on the emulated units that the field side serves: those are our Devices."""
+"""Schemas Device, Sensor, Transmitter, on the emulated units of the field simulator, which are our Devices."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ NO_COMMAND = bytes.fromhex("04 1000 0001")
 
 
 def ctd_device() -> tuple[SensorEmulator, End[bytes], ModbusUnit]:
-    """The ctd over plain registers, the driver's end of its wire, and the unit behind it."""
+    """The ctd over plain registers, the driver's end of its wire, and the unit that serves it."""
     bank = MapBank([Span("input", 0, 10), Span("holding", 0, 2), Span("holding", 100, 4)])
     unit = ModbusUnit(bank)
     end, drivers_end = wire(RS232Connection)
@@ -36,7 +36,7 @@ def ctd_device() -> tuple[SensorEmulator, End[bytes], ModbusUnit]:
 
 
 class Thermometer(Sensor):
-    """A sensor of hardware, as one would write it who had it: the paper's Sensor is abstract in what it does."""
+    """A sensor as a user with hardware would write it: the paper's Sensor is abstract in its operations."""
 
     def recognise(self, data: bytes) -> COMMAND:
         return COMMAND(data, "read" if data == b"?" else "")
@@ -80,7 +80,7 @@ def test_Device_ExecuteCommand_requires_the_command_to_be_in_the_list(name: str)
     device, drivers_end, unit = ctd_device()
     with pytest.raises(UnknownCommand):
         device.execute_command(COMMAND(SET_PERIOD, name), 0)
-    assert unit.counters.requests == 0  # nothing was done
+    assert unit.counters.requests == 0  # no effect
     with pytest.raises(Bug):
         drivers_end.read()
 
@@ -106,7 +106,7 @@ def test_Device_Receive_is_Read_ExecuteCommand_Send_with_one_response_per_comman
 
 
 def test_Device_Receive_of_what_is_no_command_answers_nothing() -> None:
-    """Ruling 11: what the wire then carries is the protocol's own answer, made by the unit and not by the device."""
+    """Ruling 11: the wire then carries the protocol's own answer, made by the unit and not by the device."""
     device, drivers_end, _ = ctd_device()
     drivers_end.write(NO_COMMAND)
     with pytest.raises(UnknownCommand):

@@ -26,7 +26,7 @@ PERIODS = st.integers(-32768, 32767)
 
 
 class Rig:
-    """A shadow, what it is given, and what it says."""
+    """A shadow, its inputs, and its output."""
 
     def __init__(self) -> None:
         self.clock = Hands()
@@ -154,7 +154,7 @@ def test_DigitalShadow_has_a_model_of_its_own_processes_and_a_connection_that_on
 
 def test_DigitalShadow_can_reach_nothing_that_sends() -> None:
     """Prose, row 4, by construction: from the shadow, through every attribute, no object leads to a thread's end, a link, a
-    driver or a command. The import contract in pyproject.toml says the same of its modules."""
+    driver or a command. The import contract in pyproject.toml requires the same of its modules."""
     seen: set[int] = set()
     kinds: set[str] = set()
 
@@ -250,7 +250,7 @@ def test_DigitalShadow_what_the_system_does_not_declare_is_no_part_of_its_model_
 
 
 def test_Analyze_a_quality_and_a_reason_that_a_newer_plant_knows_are_bad_and_unnamed() -> None:
-    """Both are numbers on the wire, with room for more than are known here."""
+    """Both are numbers on the wire, whose range exceeds the known values."""
     rig = Rig()
     (told,) = rig.give(value(1.0)._replace(quality=7, reason=31))
     assert (told.finding, told.text) == ("bad", "ctd.pressure is bad: none")

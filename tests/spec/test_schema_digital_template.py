@@ -31,7 +31,7 @@ from fieldtwin.twin.template.template import (
 
 
 def template(tmp_path: Path) -> DigitalTemplate:
-    """The observatory's, with a document of each kind, read back from its package."""
+    """The observatory's template, with a document of each kind, read back from its package."""
     system, prototype = observatory()
     documents: dict[DocumentKind, tuple[Path, ...]] = {}
     for kind in DOCUMENTS:
@@ -62,7 +62,7 @@ def test_DigitalTemplate_is_documents_and_the_embedded_control_system_and_the_di
 
 
 def test_DigitalTemplate_every_part_has_its_hash_and_a_wrong_one_is_named(tmp_path: Path) -> None:
-    """System, prototype, profiles, EDS, recordings, the model, documents of each kind: one byte of each."""
+    """System, prototype, profiles, EDS, recordings, the model, documents of each kind: change one byte of each."""
     manifest = template(tmp_path).manifest
     kinds = {file.kind for file in manifest.files}
     assert kinds == {"system", "prototype", "profile", "eds", "recording", "model", "document"}
@@ -83,7 +83,7 @@ def test_DigitalTemplate_every_part_has_its_hash_and_a_wrong_one_is_named(tmp_pa
 
 
 def test_DigitalTemplate_holds_the_physical_twins_own_configuration_and_a_model_of_its_own(tmp_path: Path) -> None:
-    """Prose, rows 2 and 8: the same file, byte for byte; and another model than any twin's."""
+    """Prose, rows 2 and 8: the same file, byte for byte; and a model separate from any twin's."""
     system, prototype = observatory()
     made = template(tmp_path)
     assert made.ecs.system.path.read_bytes() == system.path.read_bytes()

@@ -127,7 +127,7 @@ def test_PTtoDTConnection_and_DTtoPTConnection_have_a_transmitter_and_collect_fr
 
 
 def test_PTtoDTConnection_reuses_the_physical_twins_own_transmitter_driver() -> None:
-    """Prose, row 5: the connection between two transmitters is served by the very driver of a run."""
+    """Prose, row 5: the driver of a run serves the connection between two transmitters."""
     assert "TransmitterDriver(" in inspect.getsource(ModemCarrier.open)
     assert inspect.getmodule(ModemCarrier).TransmitterDriver is TransmitterDriver  # type: ignore[union-attr]
 

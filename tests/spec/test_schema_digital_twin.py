@@ -28,7 +28,7 @@ RULES = (Rule("outside", "ctd.pressure", 1), Rule("inside", "ctd.pressure", 10),
 
 
 class Always:
-    """A planner in Python: whatever is found, the next of its periods."""
+    """A planner in Python: for every finding, the next of its periods."""
 
     def __init__(self, *periods: int) -> None:
         self._periods = deque(periods)
@@ -38,7 +38,7 @@ class Always:
 
 
 class Prototype:
-    """Is asked, and says what the test says: None for a while, then what speaks against the command, or nothing."""
+    """A what-if query whose answer the test sets: None for a while, then the objection to the command, or nothing."""
 
     def __init__(self) -> None:
         self.asked: list[tuple[int, Question]] = []
@@ -73,7 +73,7 @@ class Rig:
         self.twin.execute.transmitter.subscribe(self.sent)
 
     def give(self, *events: object) -> list[int]:
-        """The periods that were commanded because of these events."""
+        """Return the periods that were commanded because of these events."""
         for event in events:
             self.receiving.observe("plant:1", event)  # type: ignore[arg-type]
         self.twin.step()
@@ -113,14 +113,14 @@ def test_Plan_is_rules_over_the_analysis_of_which_the_first_that_fits_decides() 
 
 
 def test_Plan_does_nothing_about_history() -> None:
-    """What an outage kept back arrives late: nobody commands a plant because of how it was an hour ago."""
+    """Events delayed by an outage arrive late: an hour-old state must not cause a command."""
     rig = Rig()
     assert rig.give(value(150.0, NOW_MS - 3_600_000)) == []
     assert rig.twin.plan.too_old == 1
 
 
 def test_Plan_does_something_about_history_as_soon_as_it_is_the_present_too() -> None:
-    """An hour's outage of the thread: what began in it and is so still is planned for, and so is what ended in it."""
+    """An outage of the thread for an hour: a finding that began in it and persists is planned for, and one that ended in it."""
     rig = Rig(rules=(*RULES, Rule("stale", "", 0), Rule("fresh", "", 10)))
     hour_ago = NOW_MS - 3_600_000
     assert rig.give(status(60, t_ms=hour_ago), value(200.0, hour_ago)) == []
@@ -134,7 +134,7 @@ def test_Plan_does_something_about_history_as_soon_as_it_is_the_present_too() ->
 
 
 def test_DigitalTwin_begins_again_where_it_ended() -> None:
-    """What it knows of the plant is its model; what was wrong is planned for when the plant says how it is now."""
+    """The twin's knowledge of the plant is its model; a deviation is planned for when the plant reports its current state."""
     rig = Rig()
     rig.twin.recall([status(1, t_ms=NOW_MS - 60_000), value(200.0, NOW_MS - 60_000)])
     seen = rig.twin.describe()
@@ -152,7 +152,7 @@ def test_DigitalTwin_begins_again_where_it_ended() -> None:
 
 @given(x=PERIODS, before=PERIODS)
 def test_Execute_asks_the_model_first_and_emits_the_command_if_and_only_if_it_accepts(x: int, before: int) -> None:
-    """Ruling 9, and prose, row 7: no user steps in."""
+    """Ruling 9, and prose, row 7: no user intervenes."""
     model = DigitalModel()
     model.process_event(encode_period(before))
     execute = Execute(model, Hands(), bounds=Bounds(0, 3600))
@@ -234,7 +234,7 @@ def test_Plan_what_is_found_while_a_prototype_is_asked_waits_and_of_one_subject_
     rig.give(value(150.0))
     for number in (50.0, 150.0) * 20 + (50.0,):
         assert rig.give(value(number, rig.clock.now_ms)) == []
-        rig.clock.now_ms += 1000  # 41 s, which is no history: it was new when it came
+        rig.clock.now_ms += 1000  # 41 s old, but not history: it was new when it arrived
     prototype.says = ""
     assert rig.give() == [1, 10]
     assert [period_s for period_s, _ in prototype.asked] == [1, 10]
@@ -284,7 +284,7 @@ def test_DigitalTwin_changes_of_the_model_reach_the_plant_and_those_of_the_plant
 
 
 class Deep:
-    """A planner in Python that reads the model's variables: sample each second while it is below 80 dbar."""
+    """A planner in Python that reads the model's variables: sample each second while the pressure is below 80 dbar."""
 
     def plan(self, data: DATA, model: DigitalModel) -> COMMAND | None:
         pressure = model.variables["ctd.pressure"]

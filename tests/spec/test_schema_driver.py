@@ -32,7 +32,7 @@ def unattached() -> dict[str, DeviceDriver]:
 
 
 class Nowhere(ByteConnection):
-    """An open end of a kind, of which only the kind matters here."""
+    """An open connection of a kind; only the kind matters here."""
 
     async def write(self, data: bytes) -> None:
         raise AssertionError("nothing may be written")
@@ -71,7 +71,7 @@ def test_DeviceDriver_Init_takes_a_connection_that_is_initialised(tmp_path: Path
 
 
 def test_DeviceDriver_opens_nothing_itself() -> None:
-    """Who opens a wire is the connector that the runtime was given; it cannot be reached from a driver."""
+    """The connector given to the runtime opens wires; a driver has no access to it."""
     for driver in unattached().values():
         assert not any(isinstance(held, OsConnector) for held in vars(driver).values())
 
@@ -112,7 +112,7 @@ def test_DeviceDriver_Receive_is_read_then_emit(tmp_path: Path) -> None:
             ears: list[Consumer[DATA]] = [Consumer(driver.emitter.event) for _ in range(2)]
             for ear in ears:
                 driver.emitter.subscribe(ear)
-            await driver.receive("values")  # the base line: how old that sample is, nobody knows
+            await driver.receive("values")  # the reference: the age of that sample is unknown
             driver.consumer.observe(driver.command("sample_period_s", 3600))
             await driver.send()  # the first sample is taken at once
             await driver.receive("values")
@@ -159,7 +159,8 @@ def test_TransmitterDriver_is_the_driver_on_TCP_and_accepts_no_other_connection(
 @settings(max_examples=10, deadline=None)
 @given(payloads=st.lists(st.binary(min_size=1, max_size=64), min_size=1, max_size=4))
 def test_TransmitterDriver_is_a_pure_relay(tmp_path_factory: pytest.TempPathFactory, payloads: list[bytes]) -> None:
-    """Both ways, payloads unaltered, the same one twice is two (ruling 17). The link loses nothing here."""
+    """In both directions, with unaltered payloads; the same payload twice counts as two (ruling 17). The link loses nothing
+    here."""
 
     async def main() -> None:
         async with rig(tmp_path_factory.mktemp("relay")) as r:
@@ -185,7 +186,7 @@ def test_TransmitterDriver_is_a_pure_relay(tmp_path_factory: pytest.TempPathFact
                 await driver.receive("inbox")  # the same sequence again is the same message
                 await driver.acknowledge()
             assert list(ear.queue) == [COMMAND(payload) for payload in payloads]
-            assert r.unit("modem").unlisted == 0  # all that the driver asked is in the command list
+            assert r.unit("modem").unlisted == 0  # all requests of the driver are in the command list
             executed = r.unit("modem").emulator.executed
             assert set(executed) == {"send", "receive", "acknowledge"}
             assert executed["acknowledge"] == len(payloads)
@@ -198,7 +199,7 @@ def message(words: list[int], box: Box) -> bytes:
 
 
 def put_into_inbox(near: DistortedRegisters, box: Box, sequence: int, payload: bytes) -> None:
-    """What arrives over the acoustic link, without waiting for it: the cells that the modem itself sets."""
+    """Data received over the acoustic link, without waiting: the cells that the modem itself sets."""
     cells = near.bank._cells  # type: ignore[attr-defined]
     padded = payload + b"\0" * (len(payload) % 2)
     body = [int.from_bytes(padded[i : i + 2]) for i in range(0, len(padded), 2)]

@@ -99,13 +99,13 @@ def test_Emulator_virtualContext_is_a_collection_of_RECORDINGs(words: list[int])
     emulator, _ = recorded_ctd(words, WhenUsedUp.ERROR)
     context = emulator.virtual_context
     assert isinstance(context, VirtualContext)
-    assert len(context) == 2 * len(words)  # each exchange: what came of the request, and the register that it read
+    assert len(context) == 2 * len(words)  # each exchange: the result of the request, and the register read
     for command in context.command_list:
         assert isinstance(context.take(command), RECORDING)
 
 
 def test_Emulator_virtualContext_of_the_running_ctd_is_its_recorded_cast() -> None:
-    """Ruling 3: signals are read at the emulator's clock; they are recordings all the same."""
+    """Ruling 3: signals are read at the emulator's clock; they are recordings nevertheless."""
     from fieldtwin.emulators.signals import SignalTrack
 
     prototype = observatory()[1]

@@ -34,7 +34,7 @@ PERIODS = st.integers(-32768, 32767)
 
 
 def state_of(x: int) -> type[STATE]:
-    """The row, written once more: x > 0 ACTIVE, x = 0 STANDBY, x < 0 OFF."""
+    """The row of the paper, written again: x > 0 ACTIVE, x = 0 STANDBY, x < 0 OFF."""
     return ACTIVE if x > 0 else STANDBY if x == 0 else OFF
 
 
@@ -85,7 +85,7 @@ def test_EventStateMachine_what_is_no_command_changes_nothing(bits: bytes, x: in
 
 
 def test_DigitalModel_contains_one_state_machine_and_the_declared_variables_and_nothing_else() -> None:
-    """No connection to the physical twin of its own: there is no attribute in which it could hold one."""
+    """It has no connection to the physical twin: no attribute could hold one."""
     model = DigitalModel(declared_variables(observatory()[0]))
     assert DigitalModel.__slots__ == ("state_machine", "variables")
     assert type(model.state_machine) is EventStateMachine
@@ -110,7 +110,7 @@ def test_DigitalModel_ProcessEvent_delegates(events: list[int]) -> None:
 
 
 def test_DigitalModel_variables_are_those_of_the_system_and_of_its_template() -> None:
-    """With kind, unit and limits; what comes into a transmitter's inbox is a command and no variable."""
+    """With kind, unit and limits; a message in a transmitter's inbox is a command and not a variable."""
     system, _ = observatory()
     declared = DigitalModel(declared_variables(system)).variables
     assert declared["ctd.pressure"].declared() == {"kind": "real", "unit": "dbar"}
@@ -131,7 +131,7 @@ def test_DigitalModel_variables_are_those_of_the_system_and_of_its_template() ->
 def test_DigitalModel_variables_change_by_events_alone_and_the_last_counts(
     told: list[tuple[str, int | None, Quality]],
 ) -> None:
-    """Their state does not follow from them, nor they from it."""
+    """The state does not depend on the variables, nor the variables on the state."""
     model, other = (DigitalModel([Variable("a.x", "int"), Variable("a.y", "int")]) for _ in range(2))
     model.process_event(encode_period(3))
     for t_ms, (name, value, quality) in enumerate(told, 1):

@@ -1,4 +1,4 @@
-"""Schemas EmbeddedControlSystem, PhysicalTwin, DigitalTwinPrototype: what `fieldtwin run` builds a plant and a prototype from."""
+"""Schemas EmbeddedControlSystem, PhysicalTwin, DigitalTwinPrototype: the parts from which `fieldtwin run` builds both."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from fieldtwin.twin.site.system import load_system
 
 
 def gateway_of(ecs: EmbeddedControlSystem, run_dir: Path, mapping: dict[Endpoint, Endpoint] | None) -> dict[str, type]:
-    """Build the gateway as its process does, for a plant or for a prototype; the drivers that it holds."""
+    """Build the gateway as its process does, for a plant or for a prototype; return its drivers."""
     run_dir.mkdir()
     ecs.prepare(run_dir)
     audit = AuditLog(run_dir / "audit.jsonl", CLOCK)

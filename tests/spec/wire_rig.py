@@ -1,6 +1,6 @@
-"""Two things on real TCP sockets for the tests of the prose: a relay that keeps what crosses it, and a strange Modbus device.
+"""Two helpers on real TCP sockets for the tests of the prose: a recording relay, and an independent Modbus device.
 
-The device shares no code with us: Modbus TCP as its specification says, over a table of words.
+The device shares no code with us: Modbus TCP as its specification defines it, over a table of words.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from fieldtwin.gateway.core.endpoint import Endpoint
 
 @dataclass
 class Crossed:
-    """What crossed a relay: `there` towards the target, `back` from it."""
+    """The recorded bytes: `there` towards the target, `back` from it."""
 
     port: int = 0
     there: bytearray = field(default_factory=bytearray)
@@ -29,7 +29,7 @@ class Crossed:
 
 @contextlib.asynccontextmanager
 async def relay(target: Endpoint) -> AsyncIterator[Crossed]:
-    """Carries every byte on to `target`, and keeps it."""
+    """Forward every byte to `target`, and record it."""
     crossed = Crossed()
 
     async def pump(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, kept: bytearray) -> None:
@@ -50,7 +50,7 @@ async def relay(target: Endpoint) -> AsyncIterator[Crossed]:
 
 @contextlib.asynccontextmanager
 async def strange_device(words: dict[int, int], spoilt: Callable[[bytes], bytes] = bytes) -> AsyncIterator[Endpoint]:
-    """A device with holding registers `words` (others are 0). `spoilt` is what it does to each reply's PDU."""
+    """A device with holding registers `words` (all others are 0). `spoilt` modifies the PDU of each reply."""
 
     def answer(pdu: bytes) -> bytes:
         function, address, count = struct.unpack(">BHH", pdu[:5])

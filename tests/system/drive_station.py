@@ -55,7 +55,7 @@ IF pressure > 2.0 THEN
 END_IF;
 END_PROGRAM
 """
-"""Asks for 60 Hz in line 5, and starts the drive."""
+"""Request 60 Hz in line 5, and start the drive."""
 
 TOO_FAST_PYTHON = """\
 from fieldtwin.gateway.core.image.image import TagKind
@@ -85,8 +85,8 @@ def written(
     prototype: str = PROTOTYPE,
     module: str = "pump_control",
 ) -> Path:
-    """The files of a station in `folder`; the path of its system file. `module`: the name of a program in Python, which is
-    imported once in a process."""
+    """Write the files of a station into `folder`; return the path of its system file. `module` is the name of a Python
+    program, which is imported once per process."""
     python = "class Pump" in program
     (folder / "drive.yaml").write_text(PROFILE, encoding="utf-8")
     (folder / (f"{module}.py" if python else "pump.st")).write_text(program, encoding="utf-8")
@@ -97,7 +97,7 @@ def written(
 
 
 def scenario(folder: Path, steps: str = "  - pause: 2s\n", head: str = "") -> Path:
-    """A scenario of the station."""
+    """Return a scenario of the station."""
     path = folder / "pump.scenario.yaml"
     path.write_text(f"scenario: the pump\nsystem: station.yaml\n{head}steps:\n{steps}", encoding="utf-8")
     return path

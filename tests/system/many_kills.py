@@ -1,7 +1,7 @@
-"""Start one process of fieldtwin again and again without importing it each time: ``python many_kills.py MODULE ARG...``.
+"""Start one process of fieldtwin repeatedly without a new import each time: ``python many_kills.py MODULE ARG...``.
 
-Each line on standard input forks a process that runs the module as ``python -m MODULE ARG...`` does, with its output in the file
-that the line names. Its number is printed. Who kills it is the test.
+Each line on standard input forks a process that runs the module as ``python -m MODULE ARG...`` does, with its output in the
+file named by the line, and prints its process id. The test kills the process.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from pathlib import Path
 
 
 def become(module: str, args: list[str], log: str) -> None:
-    """Run the module to its end; never returns."""
+    """Run the module to its end; this never returns."""
     code = 70
     try:
         signal.signal(signal.SIGCHLD, signal.SIG_DFL)

@@ -1,4 +1,4 @@
-"""One process that is killed again and again at seeded random instants; and what it must not leave behind."""
+"""One process that is killed repeatedly at seeded random instants, and the traces that it must not leave."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from pathlib import Path
 from procs import CHECKOUT, alive, wait_for
 
 KILLS = int(os.environ.get("FIELDTWIN_KILLS", "100"))
-"""How often each process is killed."""
+"""Number of kills per process."""
 KILLS_OF_A_RUN = int(os.environ.get("FIELDTWIN_KILLS_OF_A_RUN", "12"))
-"""A whole run takes seconds to start, so that 100 of them take ten minutes: those are run by hand."""
+"""A whole run takes seconds to start, so 100 of them take ten minutes; that number is only used manually."""
 
 
 class Victim:
-    """A process of fieldtwin that can be started again at once. `rng` is the seeded chance of the test."""
+    """A process of fieldtwin that can be started again at once. `rng` is the seeded random generator of the test."""
 
     def __init__(self, module: str, *args: str, root: Path, imports: str = "", seed: int = 1) -> None:
         self.rng = random.Random(seed)
@@ -49,11 +49,11 @@ class Victim:
         return self.pid
 
     def at_some_instant(self, most_s: float) -> None:
-        """Let a random time go by: the instant of the kill is what the test is about."""
+        """Wait for a random time, because the test is about the instant of the kill."""
         time.sleep(self.rng.uniform(0, most_s))
 
     def end(self, number: int = signal.SIGKILL) -> None:
-        """Send the signal, and wait until it is gone."""
+        """Send the signal, and wait until the process has ended."""
         assert self._process.stdout is not None
         with suppress(ProcessLookupError):
             os.kill(self.pid, number)
@@ -81,7 +81,7 @@ def victim(module: str, *args: str, root: Path, imports: str = "", seed: int = 1
 
 
 def processes_of(root: Path) -> dict[int, str]:
-    """Processes that have the test's folder in their command line or as their directory, this one's descendants or not."""
+    """Return the processes with the test's folder in their command line or as their directory, descendants or not."""
     found = {}
     for folder in Path("/proc").iterdir():
         if not folder.name.isdigit() or int(folder.name) == os.getpid():
@@ -94,6 +94,7 @@ def processes_of(root: Path) -> dict[int, str]:
 
 
 def nothing_is_left(root: Path, within_s: float = 10) -> None:
-    """No process, no socket of one, and no link to a pseudo-terminal: the kernel takes that away with its last process."""
+    """Require that no process, no socket of one, and no link to a pseudo-terminal remains: the kernel removes that with its
+    last process."""
     wait_for(lambda: not processes_of(root), within_s, f"processes are left: {processes_of(root)}")
     assert [path for path in root.rglob("*") if path.is_socket() or path.is_symlink()] == []

@@ -1,4 +1,4 @@
-"""Starting `fieldtwin` as a user does, and asking what it started: for the system tests."""
+"""Start `fieldtwin` as a user does, and query the started processes, for the system tests."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ CHECKOUT = Path(__file__).resolve().parents[2]
 
 
 def wait_for(condition: Callable[[], Any], within_s: float = 10.0, what: str = "") -> Any:
-    """The first true result of `condition`, asked every 20 ms for at most `within_s` seconds."""
+    """Return the first true result of `condition`, evaluated every 20 ms for at most `within_s` seconds."""
     deadline = time.monotonic() + within_s
     while True:
         result = condition()
@@ -30,7 +30,7 @@ def wait_for(condition: Callable[[], Any], within_s: float = 10.0, what: str = "
 
 
 def every_device_online(gateway: Asking, within_s: float = 40.0) -> None:
-    """Wait until the gateway has all its devices; where it has not, say what it knows of them."""
+    """Wait until the gateway has all its devices; if it does not, report the status of each."""
     with_what: dict[str, Any] = {}
 
     def online() -> bool:
@@ -45,7 +45,7 @@ def every_device_online(gateway: Asking, within_s: float = 40.0) -> None:
 
 
 def alive(pid: int) -> bool:
-    """True while the process runs (a zombie does not)."""
+    """Return true while the process runs (a zombie does not)."""
     try:
         return Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()[0] != "Z"
     except (FileNotFoundError, ProcessLookupError):
@@ -59,7 +59,7 @@ def free_port() -> int:
 
 
 class Asking:
-    """A control channel, asked synchronously: one connection a question."""
+    """A control channel with synchronous requests: one connection per request."""
 
     def __init__(self, address: str | tuple[str, int]) -> None:
         self._address = address
@@ -80,7 +80,7 @@ class Asking:
 
 
 class Fieldtwin:
-    """One `python -m fieldtwin ...` with stdout and stderr in files. `kill` is for the end of a test that failed."""
+    """One `python -m fieldtwin ...` with stdout and stderr in files. `kill` is for the end of a failed test."""
 
     def __init__(self, run_root: Path, *args: str, name: str = "run", env: dict[str, str] | None = None) -> None:
         run_root.mkdir(exist_ok=True)
@@ -103,7 +103,7 @@ class Fieldtwin:
 
     @property
     def summary(self) -> dict[str, Any]:
-        """What `--json` printed: the whole of stdout."""
+        """Return the output of `--json`: the whole of stdout."""
         found: dict[str, Any] = json.loads(self.out)
         return found
 
@@ -114,7 +114,7 @@ class Fieldtwin:
         self.process.send_signal(number)
 
     def control(self, instance: str, process: str) -> Asking:
-        """The control channel of a process of an instance, once it is there."""
+        """Return the control channel of a process of an instance, once it exists."""
         path = self.root / instance / f"{process}.sock"
         wait_for(lambda: self._ready(path), 20, f"{path.name} of {instance}; {self.err}")
         return Asking(str(path))
@@ -129,7 +129,7 @@ class Fieldtwin:
         return int(self.control(instance, process)("ready")["pid"])
 
     def end(self) -> None:
-        """Whatever happened: nothing of it stays."""
+        """Remove all traces in every case."""
         if self.process.poll() is None:
             self.process.send_signal(signal.SIGTERM)
             with suppress(subprocess.TimeoutExpired):
@@ -141,7 +141,7 @@ class Fieldtwin:
 
 @contextmanager
 def fieldtwin(run_root: Path, *args: str, name: str = "run", env: dict[str, str] | None = None) -> Iterator[Fieldtwin]:
-    """A running `fieldtwin`, gone at the end of the block."""
+    """A running `fieldtwin`, ended at the end of the block."""
     started = Fieldtwin(run_root, *args, name=name, env=env)
     try:
         yield started
@@ -157,7 +157,7 @@ def run_to_end(run_root: Path, *args: str, name: str = "run", within_s: float = 
 
 
 def no_tracebacks(root: Path) -> None:
-    """Nothing that any process wrote may hold a traceback or a warning."""
+    """Require that no process wrote a traceback or a warning."""
     for path in [*root.glob("*.err"), *root.glob("*/*.log")]:
         text = path.read_text(encoding="utf-8", errors="replace")
         assert "Traceback" not in text, f"{path}:\n{text}"
@@ -165,11 +165,11 @@ def no_tracebacks(root: Path) -> None:
         assert "never retrieved" not in text, f"{path}:\n{text}"
 
 
-# -- the far end, spoken by hand ------------------------------------------------------------------------------------
+# -- the remote client, by hand ----------------------------------------------------------------------------------------
 
 
 def command_from_far(endpoint: str, sequence: int, period_s: int) -> None:
-    """Put a period command into the far modem's outbox (holding:100), as a stranger's Modbus TCP master would."""
+    """Put a period command into the remote modem's outbox (holding:100), as a third-party Modbus TCP client would."""
     match = re.fullmatch(r"tcp://([^:]+):([0-9]+)", endpoint)
     assert match, endpoint
     words = [sequence, 2, period_s & 0xFFFF]
@@ -186,5 +186,5 @@ def command_from_far(endpoint: str, sequence: int, period_s: int) -> None:
 
 
 def held_by(field: Asking, device: str, tag: str) -> list[str]:
-    """Every value that an emulated device's tag had, in order, as hexadecimal register bytes."""
+    """Return every value of an emulated device's tag, in order, as hexadecimal register bytes."""
     return [raw for _, name, raw, _ in field("held")[device] if name == tag]

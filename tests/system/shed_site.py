@@ -1,4 +1,4 @@
-"""A site with one tank, which has a level and a valve, and a program that does nothing; the tests judge it from outside."""
+"""A site with one tank, which has a level and a valve, and a program that does nothing; the tests check it from outside."""
 
 from __future__ import annotations
 

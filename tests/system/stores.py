@@ -1,4 +1,4 @@
-"""What the knowledge stores of a run hold, read beside it: for the system tests."""
+"""Read the knowledge stores of a run while it runs, for the system tests."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ Row = tuple[Any, ...]
 
 
 def ask(path: Path, question: str, *what: str) -> list[Row]:
-    """What a store answers; nothing where there is none yet."""
+    """Query a store; return nothing if it does not exist yet."""
     with suppress(sqlite3.OperationalError), closing(sqlite3.connect(f"file:{path}?mode=ro", uri=True)) as db:
         return db.execute(question, what).fetchall()
     return []
 
 
 def log_of(path: Path, origin: str) -> list[Row]:
-    """An origin's events as they are stored, in order."""
+    """Return an origin's events as they are stored, in order."""
     return ask(
         path,
         "SELECT sequence, t_ms, kind, text, typeof(value), value, quality, reason FROM event"
@@ -29,7 +29,7 @@ def log_of(path: Path, origin: str) -> list[Row]:
 
 
 def own(path: Path, side: str) -> str:
-    """The origin under which that side writes; empty before it has one."""
+    """Return the origin under which that side writes; empty before it has one."""
     return next(
         (str(row[0]) for row in ask(path, "SELECT name FROM origin WHERE own AND name GLOB ?", f"{side}:*")), ""
     )

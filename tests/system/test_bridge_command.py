@@ -1,4 +1,4 @@
-"""`fieldtwin bridge` as its users have it: a process of its own, a serial line behind, other people's programs in front."""
+"""`fieldtwin bridge` as users run it: a separate process, a serial line as the target, third-party clients."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ LINE = "baudrate=115200&frame=8N1"
 
 @asynccontextmanager
 async def line_of_two(tmp_path: Path) -> AsyncIterator[dict[int, MapBank]]:
-    """Units 1 and 2, whose holding registers hold 100... and 200..., on a virtual serial port."""
+    """Units 1 and 2 with holding registers 100... and 200..., on a virtual serial port."""
     banks = {n: MapBank([Span("holding", 0, 64), Span("coil", 0, 16)]) for n in (1, 2)}
     for number, bank in banks.items():
         bank.poke("holding", 0, *(100 * number + i for i in range(64)))
@@ -48,7 +48,7 @@ async def line_of_two(tmp_path: Path) -> AsyncIterator[dict[int, MapBank]]:
 
 @asynccontextmanager
 async def bridge(tmp_path: Path, *options: str) -> AsyncIterator[tuple[Fieldtwin, int]]:
-    """The program, once it listens and has its line; its port."""
+    """The program, once it listens and has its line; yields its port."""
     target = f"rtu:{tmp_path / 'line'}?{LINE}"
     program = Fieldtwin(
         tmp_path / "run", "bridge", "tcp://127.0.0.1:0", target, "--timeout", "150ms", "--instance", "b", *options

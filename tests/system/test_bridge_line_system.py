@@ -1,5 +1,5 @@
-"""A system whose bridge is asked over a serial line: a master that is not ours reads units behind TCP, while the gateway polls
-them, in a prototype and on a plant. The system file is the same, byte for byte."""
+"""A system with a bridge on a serial line: a third-party client reads units on TCP while the gateway polls them, in a
+prototype and on a plant. The system file is the same, byte for byte."""
 
 from __future__ import annotations
 
@@ -86,9 +86,9 @@ def check_a_master(port: Path) -> None:
     text = mbpoll(port, 21, 200)
     assert re.search(r"^\[200\]:\s+[01]$", text, re.MULTILINE), text
     text = mbpoll(port, 22, 200)
-    assert "Gateway path unavailable" in text, text  # what is behind that socket says so itself
+    assert "Gateway path unavailable" in text, text  # the device on that socket identifies itself
     text = mbpoll(port, 5, 200)
-    assert "timed out" in text, text  # another slave's: on a line that we share, we are not it
+    assert "timed out" in text, text  # a request to a different unit: on a shared line, the bridge ignores it
 
 
 @pytest.mark.interop
@@ -108,7 +108,10 @@ def test_a_master_on_a_line_reaches_tcp_units_of_a_prototype(tmp_path: Path) -> 
         assert status["bridge"]["door"]["noise_bytes"] == 0
         assert '"done"' in (tmp_path / "run" / "p" / "audit.jsonl").read_text("ascii")
         program.signal(signal.SIGINT)
-        assert program.wait(10) in (0, 1)  # 1: nothing came from the far end, whose messages no program takes here
+        assert program.wait(10) in (
+            0,
+            1,
+        )  # 1: no message came from the remote client, and no program takes messages here
     no_tracebacks(tmp_path / "run")
 
 

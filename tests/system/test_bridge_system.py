@@ -1,5 +1,5 @@
-"""A prototype whose file has `serve` and `bridge` sections: what an HMI reads is what the gateway knows, and its clients reach
-the units of the line while the gateway polls them."""
+"""A prototype with `serve` and `bridge` sections: an HMI reads the gateway's values, and clients of the bridge reach the units
+of the line while the gateway polls them."""
 
 from __future__ import annotations
 

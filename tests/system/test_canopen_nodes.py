@@ -1,4 +1,4 @@
-"""Nodes of the CiA device profiles as a user starts them: in a prototype run, and one by one on a bus that they share."""
+"""Nodes of the CiA device profiles as a user starts them: in a prototype run, and one by one on a shared bus."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A PLC drives CANopen nodes of a prototype: a drive to its speed and an I/O module's outputs; and a killed PLC stops both."""
+"""A PLC drives CANopen nodes of a prototype: a drive to its speed and an I/O module's outputs; killing the PLC stops both."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""The files for containers and scripts hold together: what can be told of them without a Docker engine.
+"""The container files and scripts are consistent, as far as this can be checked without a Docker engine.
 
-The containers themselves are proven by scripts/test-compose. Here: the compose file asks for no privilege, its command lines and
-variables are ones that `fieldtwin` knows, paths that it names are those of the image; and the same three
-processes, started by hand from the same prototype file, work together.
+scripts/test-compose tests the containers themselves. Here: the compose file requests no privilege, its command lines and
+variables are known to `fieldtwin`, its paths exist in the image; and the same three processes, started by hand from the same
+prototype file, work together.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ COMPOSE: dict[str, Any] = yaml.safe_load((CHECKOUT / "docker-compose.yml").read_
 SERVICES: dict[str, Any] = COMPOSE["services"]
 OURS = {name: service for name, service in SERVICES.items() if service["image"].startswith("fieldtwin")}
 VARIABLE = r"\$\{[A-Z_]+:-([^}]*)\}"
-"""As the file writes one: with what it is by default."""
+"""The variables of the file with their default values."""
 SCRIPTS = [*sorted(p for p in (CHECKOUT / "scripts").iterdir() if p.is_file() and not p.suffix), CHECKOUT / ".ci/run"]
 
 
@@ -58,7 +58,7 @@ def test_profiles_have_the_services_that_they_are_for() -> None:
 
 
 def test_who_is_waited_for_comes_up_with_the_same_profile() -> None:
-    """Both compose 1.29 and 2 refuse a service that depends on one which its profile leaves out."""
+    """Compose 1.29 and 2 both refuse a service that depends on one omitted by its profile."""
     for name, service in SERVICES.items():
         for other in service.get("depends_on", {}):
             assert set(service["profiles"]) <= set(SERVICES[other]["profiles"]), (name, other)
@@ -95,7 +95,7 @@ def test_services_wait_for_health_and_never_sleep() -> None:
     for name, service in OURS.items():
         assert (name in ended) or service["healthcheck"]["test"][:2] == ["CMD", "container-health"]
     assert "sleep" not in str(COMPOSE)
-    assert "version" not in COMPOSE  # compose 2 warns about it; 1.29 reads the file as the specification without it
+    assert "version" not in COMPOSE  # compose 2 warns about it; 1.29 reads the file by the specification without it
 
 
 def test_a_folder_that_is_mounted_is_there_and_read_only() -> None:
@@ -118,9 +118,9 @@ def test_a_service_s_command_line_and_variables_are_known_to_the_program(service
     name, *args = texts
     command = cli.get_command(click.Context(cli), name)
     assert command is not None
-    context = command.make_context(name, list(args))  # raises for an unknown option or a file that is not there
+    context = command.make_context(name, list(args))  # raises for an unknown option or a missing file
     variables = {f"FIELDTWIN_{name.upper()}_{(p.name or '').upper()}" for p in context.command.params}
-    judging = cli.get_command(click.Context(cli), "test")  # runs in a service's container, beside it
+    judging = cli.get_command(click.Context(cli), "test")  # runs in addition in the container of a service
     assert judging is not None
     variables |= {f"FIELDTWIN_TEST_{(p.name or '').upper()}" for p in judging.params}
     environment = SERVICES[service].get("environment", {})
@@ -195,7 +195,7 @@ def test_the_prototype_file_differs_from_the_shipped_one_in_where_it_listens_onl
         assert device.form.model_dump(exclude={"far"}) == ours, name
 
 
-# -- the same by hand --------------------------------------------------------------------------------------------------
+# -- the same processes, started by hand -------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -210,7 +210,7 @@ def test_the_prototype_file_differs_from_the_shipped_one_in_where_it_listens_onl
     ],
 )
 def test_a_wildcard_address_is_reached_by_the_name_of_its_host(listening: str, host: str, seen: str) -> None:
-    """By name, not by today's address: a container that was restarted may have another."""
+    """By name, not by its current address: a restarted container may have a different one."""
     assert str(reachable(Endpoint.parse(listening), host)) == seen
 
 
@@ -221,7 +221,7 @@ def test_what_stays_on_the_field_side_s_host_is_refused_elsewhere(listening: str
 
 
 def container_health(*sockets: Path) -> tuple[int, str]:
-    """What the health check of a container says."""
+    """Return the output of a container's health check."""
     done = subprocess.run(
         [sys.executable, str(CHECKOUT / "scripts" / "container-health"), *map(str, sockets)],
         capture_output=True, text=True, timeout=20, check=False,
@@ -232,7 +232,8 @@ def container_health(*sockets: Path) -> tuple[int, str]:
 @pytest.mark.timeout(150)  # a shore of 8 s and four starts: half a minute on a busy computer
 @pytest.mark.long
 def test_field_side_controller_and_shore_as_three_strangers(tmp_path: Path) -> None:
-    """The compose file's three commands on free ports: health checks, exit codes and the summary are as it relies on."""
+    """Run the compose file's three commands on free ports, and check the health checks, exit codes and the summary that it
+    relies on."""
     text = PROTOTYPE_FILE.read_text(encoding="utf-8")
     prototype = tmp_path / "any-port.yaml"
     prototype.write_text(re.sub(r"0\.0\.0\.0:\d+", "0.0.0.0:0", text), encoding="utf-8")
@@ -269,7 +270,7 @@ def test_field_side_controller_and_shore_as_three_strangers(tmp_path: Path) -> N
             summary = controller.summary
             assert summary["ok"]
             assert summary["states"]["relay"] == relay
-            assert summary["far_end"] is None  # it is the shore's; a second one would take its responses
+            assert summary["far_end"] is None  # it belongs to the shore; a second client would take its responses
         with fieldtwin(tmp_path, *run, name="again", env=run_env):
             wait_for(lambda: container_health(*sockets)[0] == 0, 20, "healthy again")
             field.process.kill()

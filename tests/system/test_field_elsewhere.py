@@ -1,4 +1,4 @@
-"""A field side that was started by hand: run after run against it, and a run that notices that it is gone."""
+"""A field simulator started by hand: several runs against it, and a run that detects its loss."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def test_one_field_side_serves_run_after_run(tmp_path: Path) -> None:
             lambda: f"fieldtwin run observatory --prototype --field localhost:{port}" in side.err, 10, "its advice"
         )
         field = ("--field", f"localhost:{port}")
-        for name in ("first", "second"):  # the second finds counters, mailboxes and journals as the first left them
+        for name in ("first", "second"):  # the second run finds counters, mailboxes and journals as the first left them
             ended = run_to_end(tmp_path, *RUN, *field, "--commands", "1", "--for", "3s", name=name)
             assert ended.process.returncode == 0, ended.out + ended.err
             summary = ended.summary
@@ -45,7 +45,7 @@ def test_one_field_side_serves_run_after_run(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_a_field_side_that_comes_back_is_found_again(tmp_path: Path) -> None:
-    """On the same ports, as in a container: a process that was killed and started again knows nothing of the first one's."""
+    """On the same ports, as in a container: a process that was killed and started again has no state of the first one."""
     port, can, lan, far = free_port(), free_port(), free_port(), free_port()
     there = tmp_path / "there"
     there.mkdir()

@@ -1,6 +1,6 @@
-"""The first writes of real processes: `--plant`, a restart of the PLC alone, and a prototype whose devices are elsewhere.
+"""The first writes of real processes: `--plant`, a restart of the PLC alone, and a prototype with remote devices.
 
-With the temperature at 21.6 and the fan's mode already 2, the audit log showed 2 to 1, and 1 to 2 150 ms later.
+Defect: with the temperature at 21.6 and the fan's mode already 2, the audit log showed 2 to 1, and 1 to 2 150 ms later.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from fan_hall import hall, writes
 
 @contextmanager
 def devices(folder: Path, **options: Any) -> Iterator[Path]:
-    """The emulated devices on the very endpoint that the system file names; gives the system file."""
+    """The emulated devices on the endpoint in the system file; yields the system file."""
     port = free_port()
     system = hall(folder, port=port, **options)
     words = ("--control", "127.0.0.1:0", "--instance", "f", "--prototype-file", str(folder / "hall.prototype.yaml"))
@@ -67,7 +67,7 @@ def test_a_restart_of_the_plc_process_alone_writes_nothing(tmp_path: Path) -> No
 
 @contextmanager
 def another_plc(run: Fieldtwin, run_dir: Path) -> Iterator[Asking]:
-    """The PLC's process, started again by hand as a supervisor would."""
+    """Start the PLC process again by hand, as a supervisor would."""
     (run_dir / "plc.sock").unlink(missing_ok=True)
     environment = {**os.environ, "PYTHONPATH": str(CHECKOUT)}
     with (run_dir / "plc-again.log").open("wb") as log:
@@ -99,7 +99,7 @@ def test_a_prototype_with_its_devices_elsewhere_is_not_written_either(tmp_path: 
 
 @pytest.mark.long
 def test_a_program_that_never_starts_is_shown_and_the_run_is_not_ok(tmp_path: Path) -> None:
-    system = hall(tmp_path, port=free_port())  # nobody answers there
+    system = hall(tmp_path, port=free_port())  # no device answers there
     words = ("run", str(system), "--plant", "--allow-writes", "--instance", "p")
     with fieldtwin(tmp_path, *words, "--for", "4s") as run:
         plc = run.control("p", "plc")
@@ -145,6 +145,6 @@ def test_what_happens_at_the_timeout_is_as_the_system_file_says(tmp_path: Path, 
         wait_for(lambda: bool(run.control("p", "gateway")("get")["plc"]["alive"]) is (state != "stopped"), 20)
         wait_for(lambda: "t=" in run.err, 20, "the run shows what it does")
         run.signal(signal.SIGINT)
-        assert run.wait(20) == 1  # nobody answers, and the program waited
+        assert run.wait(20) == 1  # no device answers, and the program waited
     assert ("PLC: program control has not started" in run.out) is (at_timeout != "start_anyway")
     assert ("program control started without sensor.temperature" in run.out) is (at_timeout == "start_anyway")

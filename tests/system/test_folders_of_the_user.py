@@ -1,7 +1,7 @@
 """A user's working directory has packages named gateway, plc, emulators, twin and tests, as a controls engineer's often has.
 
-Ours are `fieldtwin.gateway` and so on, so that neither hides the other: every command runs, and `python: plc.control:Pump` is the
-user's program. The same holds where another installed distribution brings a module `gateway`.
+Ours are `fieldtwin.gateway` and so on, so that neither hides the other: every command runs, and `python: plc.control:Pump` is
+the user's program. The same holds if a different installed distribution contains a module `gateway`.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ def site(tmp_path: Path) -> Path:
 
 @pytest.fixture(params=["folders", "distribution"])
 def environment(request: pytest.FixtureRequest, site: Path) -> dict[str, str]:
-    """Variables of the user: theirs alone, or those with which an installed distribution has a module `gateway`."""
+    """The user's variables alone, or with a path on which an installed distribution has a module `gateway`."""
     path = [str(CHECKOUT)]
     if request.param == "distribution":
         installed = site / "site-packages"
@@ -121,7 +121,7 @@ def environment(request: pytest.FixtureRequest, site: Path) -> dict[str, str]:
 
 
 def did(site: Path, environment: dict[str, str], *words: str) -> subprocess.CompletedProcess[str]:
-    """What came of `python -m WORDS` in the user's folder; Python puts that folder first on the path."""
+    """Return the result of `python -m WORDS` in the user's folder; Python puts that folder first on the path."""
     return subprocess.run(
         [sys.executable, "-m", *words],
         cwd=site,
@@ -161,7 +161,7 @@ def test_a_device_is_emulated(site: Path, environment: dict[str, str]) -> None:
         cwd=site, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
     )  # fmt: skip
     assert emulator.stderr is not None
-    said = emulator.stderr.readline() + emulator.stderr.readline()  # what it holds, and where it listens
+    said = emulator.stderr.readline() + emulator.stderr.readline()  # its values, and where it listens
     os.killpg(emulator.pid, signal.SIGINT)
     _, errors = emulator.communicate(timeout=20)
     assert "tcp://127.0.0.1:" in said, said + errors

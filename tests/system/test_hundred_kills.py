@@ -1,7 +1,7 @@
-"""Each process is killed with SIGKILL 100 times at random instants, also while it starts: what it keeps stays whole.
+"""Each process is killed with SIGKILL 100 times at random instants, also while it starts: its stored data remain consistent.
 
-The instants are seeded. FIELDTWIN_KILLS and FIELDTWIN_KILLS_OF_A_RUN say how often; a whole run is killed 12 times by default,
-because it takes seconds to start.
+The instants are seeded. FIELDTWIN_KILLS and FIELDTWIN_KILLS_OF_A_RUN set the numbers; a whole run is killed 12 times by
+default, because it takes seconds to start.
 """
 
 from __future__ import annotations
@@ -185,7 +185,7 @@ def test_simulated_field_devices_come_back_on_their_ports_and_pseudo_terminals(t
 
 
 def test_both_ends_of_a_digital_thread_have_the_same_log_in_the_end(tmp_path: Path) -> None:
-    """The plant's end and its twin are killed in turn, each 100 times."""
+    """The plant's end and its twin are killed alternately, each 100 times."""
     root, place = tmp_path / "r", f"tcp://127.0.0.1:{free_port()}"
     with fieldtwin(root, "run", "observatory", "--prototype", "--commands", "none", "--instance", "t", "--json") as run:
         gateway = run.control("t", "gateway")
@@ -216,7 +216,7 @@ def test_both_ends_of_a_digital_thread_have_the_same_log_in_the_end(tmp_path: Pa
                 if twin.starts % 3:
                     before = ask(there, "SELECT count(*) FROM event") or [(0,)]
                     wait_for(lambda: answers(thread), 20, plant.log.read_text())
-                    if twin.starts % 10 == 1:  # that something arrives
+                    if twin.starts % 10 == 1:  # some events must arrive
                         wait_for(
                             lambda past=before: (ask(there, "SELECT count(*) FROM event") or [(0,)])[0] > past[0],
                             30, twin.log.read_text(),
@@ -245,7 +245,7 @@ def test_both_ends_of_a_digital_thread_have_the_same_log_in_the_end(tmp_path: Pa
 
 
 def test_a_whole_run_leaves_no_process_and_the_next_one_starts(tmp_path: Path) -> None:
-    """The supervisor is killed: its processes make the outputs safe and end by themselves."""
+    """The supervisor is killed: its processes make the outputs safe and end."""
     root = tmp_path / "r"
     words = ("run", "observatory", "--prototype", "--commands", "none", "--json")
     imports = "fieldtwin.cli.run.run_command,fieldtwin.run.live.session"

@@ -30,7 +30,7 @@ STEP_S = 0.25
 
 
 def write_cast(path: Path) -> list[tuple[float, float, float]]:
-    """A Sea-Bird cast of our own making; its rows (pressure dbar, temperature deg C, conductivity S/m), 4 a second."""
+    """A synthetic Sea-Bird cast; its rows (pressure dbar, temperature deg C, conductivity S/m), 4 a second."""
     rows = [(2 + 0.31 * i, round(19.5 - 0.0041 * i, 4), round(4.9 - 0.00033 * i, 6)) for i in range(ROWS)]
     lines = [
         "* Sea-Bird SBE 9 Data File:",
@@ -51,7 +51,7 @@ def write_cast(path: Path) -> list[tuple[float, float, float]]:
 
 
 def expected_at(rows: list[tuple[float, float, float]], time_ms: int) -> tuple[float, ...]:
-    """The cast between its rows, at an instrument time: computed here, from the file's numbers alone."""
+    """Interpolate the cast between its rows at an instrument time, from the file's numbers alone."""
     t_s = time_ms / 1000
     before = min(bisect_right([i * STEP_S for i in range(len(rows))], t_s) - 1, len(rows) - 2)
     part = (t_s - before * STEP_S) / STEP_S
@@ -59,7 +59,7 @@ def expected_at(rows: list[tuple[float, float, float]], time_ms: int) -> tuple[f
 
 
 def samples(gateway: Asking) -> dict[int, dict[str, bytes]]:
-    """Every whole sample that was published as good, by its instrument time in ms. A sample is one transaction."""
+    """Return every complete sample published as good, by its instrument time in ms. A sample is one transaction."""
     by_time: dict[int, dict[str, bytes]] = {}
     for _, tag, raw, t_ns, _ in gateway("published")["entries"]:
         if tag.startswith("ctd."):
@@ -95,7 +95,7 @@ def test_two_instances_an_imported_cast_and_an_interrupt(tmp_path: Path) -> None
         gateway = one.control("one", "gateway")
         wait_for(lambda: len(samples(gateway)) >= 4, 10, "samples of the cast")
         for time_ms, sample in samples(gateway).items():
-            assert time_ms > 5000  # ten times as fast: a second of ours is ten of the cast's
+            assert time_ms > 5000  # ten times as fast: one second of real time is ten of the cast
             for name, value in zip(
                 ("pressure", "temperature", "conductivity"), expected_at(rows, time_ms), strict=True
             ):
@@ -107,7 +107,7 @@ def test_two_instances_an_imported_cast_and_an_interrupt(tmp_path: Path) -> None
         before = time.monotonic()
         two.signal(signal.SIGINT)  # while ACTIVE
         last = ""
-        while two.process.poll() is None:  # what the device held last, as long as somebody can say
+        while two.process.poll() is None:  # the last values of the device, while the field simulator still runs
             try:
                 last = held_by(held, "ctd", "sample_period_s")[-1]
             except OSError:
@@ -116,7 +116,7 @@ def test_two_instances_an_imported_cast_and_an_interrupt(tmp_path: Path) -> None
         assert time.monotonic() - before < 4
         assert last == "0000"
         assert two.summary["outputs_safe"] is True
-        assert one.process.poll() is None  # the other one goes on
+        assert one.process.poll() is None  # the other one continues
         one.signal(signal.SIGINT)
         one.wait(4)
     for instance in ("one", "two"):
@@ -133,7 +133,7 @@ def test_two_instances_an_imported_cast_and_an_interrupt(tmp_path: Path) -> None
 
 @pytest.mark.long
 def test_a_recording_that_was_cut_off_is_used_up_to_its_last_whole_row(tmp_path: Path) -> None:
-    """A recorder that was killed leaves half a line; what stands before it is good (DESIGN.md, decision 7)."""
+    """A killed recorder leaves half a line; the lines before it are valid (DESIGN.md, decision 7)."""
     write_cast(tmp_path / "sta1.cnv")
     assert run_to_end(tmp_path, "import", "sta1.cnv", name="import").process.returncode == 0
     whole = (tmp_path / "sta1.jsonl").read_bytes()

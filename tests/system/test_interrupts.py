@@ -1,4 +1,4 @@
-"""Ctrl-C, as a terminal sends it: to the whole process group. One line at most, nobody goes on, no traceback."""
+"""Ctrl-C, as a terminal sends it: to the whole process group. One line at most, no process continues, no traceback."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def _started(command: list[str], cwd: Path, runs: str = "") -> subprocess.Popen[
 
 
 def _interrupted(process: subprocess.Popen[str], number: int = signal.SIGINT) -> str:
-    """What it says from then on; over when the last process that holds its output is."""
+    """Return the output from then on; it ends when the last process with this output has ended."""
     os.killpg(process.pid, number)
     said, _ = process.communicate(timeout=30)
     return said
@@ -72,7 +72,7 @@ def test_a_virtual_run_ends_without_a_traceback(tmp_path: Path, number: int, cod
 def test_workers_end_with_who_started_them(tmp_path: Path, when: str) -> None:
     if when == "while they work":
         text = "import os, time\ndef work(s):\n    os.write(1, b'here\\n')\n    time.sleep(s)\n"
-    else:  # we do, then they
+    else:  # first our process, then the group
         text = "import os, time\nos.write(1, b'here\\n')\ntime.sleep(0.3)\nwork = time.sleep\n"
     (tmp_path / "slow.py").write_text(text)
     (tmp_path / "probe.py").write_text(PROBE)
@@ -86,7 +86,7 @@ def test_workers_end_with_who_started_them(tmp_path: Path, when: str) -> None:
             awaited.remove(line)
     said = _interrupted(process)
     assert process.returncode == -signal.SIGINT
-    assert said.count("Traceback") == 1, said  # of the probe itself, which does not catch it
+    assert said.count("Traceback") == 1, said  # from the probe itself, which does not catch it
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

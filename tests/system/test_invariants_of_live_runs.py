@@ -1,4 +1,4 @@
-"""Invariants of the system file are judged in runs of processes on this host, and in scenarios on the target local."""
+"""Invariants of the system file are checked in runs of processes on this host, and in scenarios on the target local."""
 
 from __future__ import annotations
 

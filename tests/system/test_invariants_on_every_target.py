@@ -1,5 +1,5 @@
-"""Invariants of the system file are judged on the targets compose and real, and in networks on local; with a controller of the
-user's own they are skipped, which is said."""
+"""Invariants of the system file are checked on the targets compose and real, and in networks on local; with the user's own
+controller they are skipped, which the output states."""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
-"""Processes that are killed mid-run, and a field side that goes away: what is left behind must be safe, and must say so.
+"""Processes that are killed mid-run, and a field simulator that disappears: the outputs must be safe, and the run must report
+it.
 
-The far end is played by hand, so that each test decides when the observatory is ACTIVE.
+The test acts as the remote client, so that each test decides when the observatory is ACTIVE.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ def state_of(plc: Asking) -> str:
 
 
 def make_active(run: Fieldtwin, instance: str, field: Asking, sequence: int = 1) -> None:
-    """Command a period of 1 s from the far end and wait until the sensor samples."""
+    """Command a period of 1 s from the remote client and wait until the sensor samples."""
     plc = run.control(instance, "plc")
     gateway = run.control(instance, "gateway")
     every_device_online(gateway)
@@ -55,7 +56,7 @@ def test_a_killed_plc_leaves_the_sensor_safe_and_the_run_says_who_died(tmp_path:
         assert status["plc"]["alive"] is False
         assert status["writes"]["safe"] is True
         assert [o["by"] for o in status["outputs"]] == ["safe: the PLC's heartbeat was lost"]
-        assert status["tags"]["inclinometer.slope_long"]["quality"] == "good"  # the others go on
+        assert status["tags"]["inclinometer.slope_long"]["quality"] == "good"  # the others continue
         run.signal(signal.SIGINT)
         assert run.wait(4) == 1
         assert held_by_file(tmp_path / "p" / "audit.jsonl")[-1] == 0
@@ -66,14 +67,14 @@ def test_a_killed_plc_leaves_the_sensor_safe_and_the_run_says_who_died(tmp_path:
 
 
 def held_by_file(audit: Path) -> list[float]:
-    """The values of the writes that were confirmed, by the audit log."""
+    """Return the values of the confirmed writes in the audit log."""
     entries = [json.loads(line) for line in audit.read_text(encoding="utf-8").splitlines()]
     return [e["new"] for e in entries if e["action"] == "write" and e["result"] == "done"]
 
 
 @pytest.mark.long
 def test_a_threads_process_that_is_killed_is_there_again_and_its_twin_misses_nothing(tmp_path: Path) -> None:
-    """Whoever watches holds nothing up, and is not held up: a plant of which nobody keeps anything is a loss each second."""
+    """The thread process is restarted, because a plant loses events every second without it. It blocks no other process."""
     args = (*PROTOTYPE, "--instance", "t", "--thread", "tcp://127.0.0.1:0")
     with fieldtwin(tmp_path, *args) as run:
         thread = run.control("t", "thread")
@@ -98,7 +99,7 @@ def test_a_threads_process_that_is_killed_is_there_again_and_its_twin_misses_not
 
 
 def answered(asking: Asking, key: str) -> Any:
-    """What is said under that key; 0 while nobody answers."""
+    """Return the value of that key; 0 if the channel does not answer."""
     with suppress(OSError):
         return asking("get")[key] or 0
     return 0
@@ -128,7 +129,7 @@ def test_a_killed_gateway_turns_the_plcs_inputs_bad(tmp_path: Path) -> None:
 
 
 def test_a_field_side_that_dies_and_comes_back_and_a_parent_that_is_killed(tmp_path: Path) -> None:
-    """One system through it all: lost, back, written again; then the parent dies and the gateway leaves safe outputs."""
+    """One system through all stages: lost, returned, written again; then the parent dies and the gateway leaves safe outputs."""
     ports = {name: free_port() for name in ("control", "lan", "can", "far")}
     prototype = tmp_path / "fixed.prototype.yaml"
     shipped = Path(__file__).resolve().parents[2] / "profiles" / "systems" / "observatory.prototype.yaml"

@@ -1,4 +1,4 @@
-"""A prototype on a line that echoes: what its device teaches in one run is known in the next, and said at the end."""
+"""A prototype on a line that echoes: facts learned about its device in one run are used in the next, and listed at the end."""
 
 from __future__ import annotations
 
@@ -69,4 +69,4 @@ def test_what_is_learnt_in_one_run_is_known_in_the_next(tmp_path: Path) -> None:
         (kept,) = tmp_path.rglob("learnt.prototype.json")
         written.append(kept.stat().st_mtime_ns)
     assert json.loads(kept.read_text())["meter"]["gaps"] == ["holding:2..4"]
-    assert written[0] == written[1]  # nothing was learnt in the second run
+    assert written[0] == written[1]  # the second run learned nothing

@@ -1,6 +1,7 @@
-"""A judge that the host does not serve measures that, and subtracts it from a deadline: real processes, a judge that is stopped.
+"""A scenario process that gets no CPU time measures that, and subtracts it from a deadline: real processes, the scenario's is
+stopped.
 
-The system under test is not late in these tests. So what is subtracted is exactly what the judge measured of itself.
+The system under test is not late in these tests, so exactly the measured lateness is subtracted.
 """
 
 from __future__ import annotations
@@ -29,8 +30,8 @@ steps:
 
 @pytest.mark.parametrize("stopped", [True, False])
 def test_the_lateness_of_the_judge_is_subtracted_and_that_of_the_system_is_not(tmp_path: Path, stopped: bool) -> None:
-    """The level rises after the deadline. Where the judge was stopped for that time, it cannot know that, and passes; where it
-    was served all the time, the same rise fails."""
+    """The level rises after the deadline. If the scenario process was stopped for that time, it cannot know that, and passes;
+    if it ran all the time, the same rise fails."""
     write_shed(tmp_path)
     (tmp_path / "a.scenario.yaml").write_text(SCENARIO)
     port = free_port()

@@ -1,4 +1,4 @@
-"""A network as processes on this host: nine of them, three ptys, and the water on a socket between them."""
+"""A network as processes on this host: nine processes, three ptys, and the acoustic channel on a socket between them."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_a_scenario_of_a_network_runs_unchanged_as_processes(tmp_path: Path) -> 
 
 
 def test_a_run_of_a_network_says_what_became_of_each(tmp_path: Path) -> None:
-    """Also of faults: one system is struck for a while, and the water where the western one listens."""
+    """Also of faults: one system has a fault for a while, and the acoustic channel at the western receiver."""
     (tmp_path / "f.yaml").write_text(
         "faults:\n  - {name: silence, device: east.current, from: 0, until: 2}\n  - {name: drop, bus: water, device: west}\n"
     )

@@ -1,4 +1,4 @@
-"""The same system with its lines in other framings: Modbus ASCII on the serial port, Modbus over UDP to the modem."""
+"""The same system with different framings: Modbus ASCII on the serial port, Modbus over UDP to the modem."""
 
 from __future__ import annotations
 

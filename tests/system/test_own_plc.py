@@ -1,4 +1,4 @@
-"""Somebody else's controller opposite an emulated field side: a libmodbus master, compiled here, judged by probes alone."""
+"""A third-party controller of the simulated field devices: a libmodbus client, compiled here, checked by probes alone."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def compiled(source: str, to: Path) -> Path:
 
 
 def judged(tmp_path: Path, source: str) -> dict[str, Any]:
-    """The scenario's verdict on the controller that `source` is."""
+    """Return the scenario's verdict on the controller compiled from `source`."""
     loop = compiled(source, tmp_path / "loop")
     shutil.copytree(HERE, tmp_path / "site")
     field_port, own_port, control = free_port(), free_port(), free_port()
@@ -93,7 +93,7 @@ def test_nobody_says_of_another_s_scans_that_they_were_in_time(tmp_path: Path) -
 
 
 def test_the_foreign_controller_s_text_is_our_program_s() -> None:
-    """The numbers of sampling.st are those of loop.c and of the scenario."""
+    """sampling.st has the same numbers as loop.c and the scenario."""
     text = (HERE / "sampling.st").read_text(encoding="utf-8")
     for value in re.findall(r"pressure [<>] (\d+)\.0", text):
         assert f"{value}.0f" in (HERE / "loop.c").read_text(encoding="utf-8")

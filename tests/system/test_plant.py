@@ -1,6 +1,6 @@
-"""`--plant`: with nobody there, with devices there and no leave to write, and with leave. And ports that are taken.
+"""`--plant`: without devices, with devices and without permission to write, and with permission; also ports in use.
 
-The plant's devices are a field side that was started on its own; the run knows nothing of it but the URLs in its system file.
+The plant's devices are a separately started field simulator; the run knows only the URLs in its system file.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def test_with_nobody_there_it_says_so_retries_and_keeps_scanning(tmp_path: Path)
     assert ended.process.returncode == 1, ended.err
     for bus, endpoint in (("line1", "ttyNONE"), ("can0", "nocan0"), ("lan", "tcp://127.0.0.1:")):
         told = [line for line in ended.err.splitlines() if line.startswith(f"! {bus}: ")]
-        assert len(told) == 1, ended.err  # once, and not with every try
+        assert len(told) == 1, ended.err  # once, and not with every attempt
         assert endpoint in told[0]
         assert endpoint in ended.out
     as_json = run_to_end(tmp_path, "run", path, "--plant", "--for", "3s", "--instance", "n", "--json", name="json")
@@ -62,7 +62,7 @@ def test_with_nobody_there_it_says_so_retries_and_keeps_scanning(tmp_path: Path)
 
 
 class Plant:
-    """A field side on fixed endpoints, and the system file that has them as its plant."""
+    """A field simulator on fixed endpoints, and the system file that has them as its plant."""
 
     def __init__(self, folder: Path, field: Asking, system: Path, line: Path) -> None:
         self.folder, self.field, self.system, self.line = folder, field, system, line
@@ -116,15 +116,15 @@ def test_a_plant_is_only_read_until_it_may_be_written(plant: Plant) -> None:
         run.signal(signal.SIGINT)
         assert run.wait(4) == 0, run.err
     assert "read-only" in run.err
-    assert plant.held() == ["0000"]  # as it left the factory
+    assert plant.held() == ["0000"]  # its factory setting
     node = plant.counters("inclinometer")
     assert node["requests"] > before["inclinometer"]["requests"]
     assert node["nmt_commands"] == before["inclinometer"]["nmt_commands"] == 0
-    assert node["tpdos"] == 0  # nobody started it
-    assert node["frames_in"] == node["requests"]  # its serial and its mapping were asked for, and nothing else was sent
+    assert node["tpdos"] == 0  # no program started it
+    assert node["frames_in"] == node["requests"]  # only its serial number and its mapping were requested
     entries = [json.loads(line) for line in (plant.folder / "ro" / "audit.jsonl").read_text().splitlines()]
     assert {e["action"] for e in entries} == {"refuse"}
-    # the 0 of the first scan is refused too, unless the device was met after the command had come
+    # the 0 of the first scan is refused too, unless the device was connected after the command had arrived
     assert [e["new"] for e in entries if e["by"] == "plc"] in ([1], [0, 1])
     assert "read-only" in entries[0]["result"]
 
@@ -142,7 +142,7 @@ def test_a_plant_is_only_read_until_it_may_be_written(plant: Plant) -> None:
 
 @pytest.mark.long
 def test_a_plant_obeys_its_twin_while_its_switch_says_remote_and_both_know_the_same_in_the_end(plant: Plant) -> None:
-    """No emulated connection anywhere: the plant's own file on both sides, the switch thrown while the plant runs."""
+    """No emulated connection anywhere: the plant's own file on both sides, the switch changed while the plant runs."""
     place = f"tcp://127.0.0.1:{free_port()}"
     with plant.system.open("a", encoding="utf-8") as file:
         file.write("commands: {period_s: [0, 60], per_minute: 60}\n")

@@ -16,7 +16,7 @@ from fieldtwin.gateway.core.files.yaml_file import parse
 
 
 def plc(*args: str) -> str:
-    """What a command prints on stdout. Its errors are raised."""
+    """Return the output of a command on stdout. Its errors are raised."""
     done = CliRunner().invoke(cli, ["plc", *args], catch_exceptions=True, standalone_mode=False)
     if isinstance(done.exception, FieldtwinError):
         raise done.exception
@@ -97,7 +97,7 @@ def test_a_counterexample_is_a_scenario(tmp_path: Path) -> None:
     out = tmp_path / "found.scenario.yaml"
     shown = plc("prove", str(tmp_path / "site.yaml"), "-o", str(out))
     assert "relay: broken after 2 scans: the state follows from the sign of the period" in shown
-    assert shown.endswith(out.read_text())  # not wrapped at a terminal's width: it can be piped into a file
+    assert shown.endswith(out.read_text())  # not wrapped at a terminal's width, because it may be piped into a file
     scenario = parse(out.read_text(), str(out)).data
     assert (scenario["system"], scenario["needs"]) == ("site.yaml", ["send_command"])
     assert [s for s in scenario["steps"] if "send" in s] == [{"send": {"from": "shore", "period_s": -32768}}] * 2

@@ -1,7 +1,7 @@
-"""What people do to a PLC of two tasks with `fieldtwin`: negative values, steps, a stop, and a program's file that was edited.
+"""Operator actions on a PLC of two tasks with `fieldtwin`: negative values, steps, a stop, and an edited program file.
 
-Observed before: `plc force TAG -1` failed as an unknown option, `plc step 20` ran the slow task 12 to 20 times, `reload` said
-that nothing had changed after the .st file was edited, and the inputs of a stopped PLC were still shown as good.
+Defects: `plc force TAG -1` failed as an unknown option, `plc step 20` ran the slow task 12 to 20 times, `reload` reported no
+change after the .st file was edited, and the inputs of a stopped PLC were still shown as good.
 """
 
 from __future__ import annotations

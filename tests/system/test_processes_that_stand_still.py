@@ -1,4 +1,4 @@
-"""SIGSTOP of each process for 10 s: nothing stale is published as good, the run reports it, and all is well after SIGCONT."""
+"""SIGSTOP of each process for 10 s: nothing stale is published as good, the run reports it, and it recovers after SIGCONT."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ STOPPED_S = 10
 PROCESSES = ("field", "gateway", "plc", "thread", "twin", "run")
 WATCHED = ("ctd.pressure", "inclinometer.slope_long", "modem.link_state")
 LATEST_S = 6.0
-"""No value is good that is older: the slowest poll of the system, and what a device may miss."""
+"""Maximum age of a good value: the slowest poll of the system, and the misses that a device may have."""
 
 
 def good(status: dict[str, Any]) -> list[str]:
@@ -81,7 +81,7 @@ def well(ask: dict[str, Asking]) -> bool:
 
 
 def stood_still(name: str, ask: dict[str, Asking]) -> None:
-    """Ten seconds with that process stopped: look all the time at what the others publish."""
+    """For ten seconds with that process stopped, check continuously the values published by the others."""
     began = time.monotonic()
     expected: dict[str, Callable[[], None]] = {
         "field": lambda: nothing_is_good(ask["gateway"], "tags"),
@@ -95,7 +95,7 @@ def stood_still(name: str, ask: dict[str, Asking]) -> None:
             status = ask["gateway"]("get")
             assert good(status["tags"]) == list(WATCHED), "what only watches holds nothing up"
             assert status["plc"]["alive"]
-        time.sleep(0.1)  # looked at ten times a second
+        time.sleep(0.1)  # checked ten times a second
 
 
 def nothing_is_good(asking: Asking, where: str) -> None:

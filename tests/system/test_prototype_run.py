@@ -1,4 +1,4 @@
-"""A whole run of the observatory's prototype, looked at from outside: files, streams, exit code, counters."""
+"""A whole run of the observatory's prototype, observed from outside: files, streams, exit code, counters."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from procs import Fieldtwin, no_tracebacks, run_to_end
 
 @pytest.fixture(scope="module")
 def ended(tmp_path_factory: pytest.TempPathFactory) -> Fieldtwin:
-    """One run of 8 s with its script of commands; every test here looks at what it left."""
+    """One run of 8 s with its script of commands; every test here checks its results."""
     root = tmp_path_factory.mktemp("run")
     return run_to_end(root, "run", "observatory", "--prototype", "--for", "8s", "--instance", "a", "--json")
 
@@ -69,7 +69,7 @@ def test_the_exchanges_of_active_times_are_stored(ended: Fieldtwin) -> None:
     entries = [json.loads(payload) for _, _, payload in rows]
     assert [e["t_ns"] for e in entries] == sorted(e["t_ns"] for e in entries)
     commands = [e["data"] for e in entries if e["kind"] == "command"]
-    assert commands == ["0001", "0002"]  # and neither 0 nor -1: nothing is logged in STANDBY and OFF
+    assert commands == ["0001", "0002"]  # without 0 and -1: nothing is logged in STANDBY and OFF
     samples = [e["data"] for e in entries if e["kind"] == "response"]
     assert samples
     assert {len(bytes.fromhex(s)) for s in samples} == {20}  # ten registers, unaltered
@@ -81,7 +81,7 @@ def test_every_write_is_on_record(ended: Fieldtwin) -> None:
     assert all(e["utc_ns"] > 10**18 and e["by"] and e["result"] for e in entries)
     writes = [e for e in entries if e["action"] == "write" and e["device"] == "ctd"]
     asked = [(e["by"], e["old"], e["new"]) for e in writes if e["result"] == "asked"]
-    # The period 0 of the start is not among them: the sensor holds it already.
+    # The period 0 of the start is not among them, because the sensor already has it.
     assert [(by, new) for by, _, new in asked[:4]] == [("plc", 1), ("plc", 2), ("plc", 0), ("plc", -1)]
     assert [old for _, old, _ in asked[:4]] == [0, 1, 2, 0]
     assert asked[-1][2] == 0
@@ -116,6 +116,6 @@ def test_files_are_the_owners_only(ended: Fieldtwin) -> None:
 
 def test_the_plc_kept_its_cycle(ended: Fieldtwin) -> None:
     plc: dict[str, Any] = ended.summary["plc"]
-    assert plc["state"] == "running"  # when last asked, before the end
+    assert plc["state"] == "running"  # when last requested, before the end
     assert plc["scans"] > 500
     assert plc["error"] == ""

@@ -1,5 +1,5 @@
-"""Every shipped Modbus profile of a real device in one system: its prototype plays the recordings of exchanges, and every value
-that the gateway publishes is one that the device held."""
+"""Every shipped Modbus profile of a real device in one system: its prototype replays the recordings of exchanges, and every
+value that the gateway publishes is one that the device held."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_a_prototype_of_real_devices(tmp_path: Path) -> None:
         wait_for(lambda: gateway("get")["tags"]["probe.conductivity"]["quality"] == "good", 10)
         tags = gateway("get")["tags"]
         assert tags["rover.model"]["value"] == "ROVER-20A"
-        assert tags["inverter.current_l3"]["quality"] == "bad"  # not implemented there, and says so
+        assert tags["inverter.current_l3"]["quality"] == "bad"  # not implemented there, as its value indicates
         assert 220 < tags["meter.voltage_l1"]["value"] < 240
         assert gateway("get")["published"] > 50
         wait_for(lambda: gateway("get")["published"] > 200, 10)

@@ -1,7 +1,7 @@
-"""An output that does not reach its device is an event with tag, value, limit and program line, wherever a run is looked at.
+"""An output that does not reach its device is an event with tag, value, limit and program line, in every view of a run.
 
-Observed before: a program asked for `speed := 60.0` where the range is 0 to 50; `run` ended ok, `trace --problems` was empty, no
-scenario failed, and the drive was started with its old setpoint.
+Defect: a program requested `speed := 60.0` with the range 0 to 50; `run` ended ok, `trace --problems` was empty, no scenario
+failed, and the drive was started with its old setpoint.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def test_a_value_that_is_not_a_number_is_a_refused_output(tmp_path: Path) -> Non
 
 
 def test_a_value_that_is_wanted_for_one_scan_only_is_refused_visibly(tmp_path: Path) -> None:
-    """The gateway writes a tag at most ten times a second; a value that is replaced before its turn was never looked at."""
+    """The gateway writes a tag at most ten times a second; a value that is replaced before its turn is never checked."""
     pulse = TOO_FAST.replace("VAR_OUTPUT", "VAR n : INT; END_VAR\nVAR_OUTPUT").replace(
         "  speed := 60.0;\n",
         "  n := n + 1;\n  speed := 10.0 + INT_TO_REAL(n MOD 5);\n  IF n = 20 THEN speed := 60.0; END_IF;\n",
@@ -119,7 +119,7 @@ def test_a_run_in_processes_reports_the_line_and_its_capture_has_the_refusal(tmp
 
 def test_a_scenario_in_processes_fails_on_a_refused_output(tmp_path: Path) -> None:
     written(tmp_path)
-    # The refusal ends the scenario, also when it came before the judge looked for the first time. The pause is only the limit.
+    # The refusal ends the scenario, even if it came before the scenario's first observation. The pause is only the limit.
     ended = run_to_end(tmp_path, "test", str(scenario(tmp_path, "  - pause: 30s\n")), "--target", "local")
     assert ended.process.returncode == 1, ended.err
     assert "drive.speed = 60 did not reach the device" in ended.out

@@ -1,4 +1,4 @@
-"""One scenario on other targets: processes on this host, a plant. What they cannot do, or must not, is skipped: not passed."""
+"""One scenario on other targets: processes on this host, a plant. Impossible or forbidden scenarios are skipped, not passed."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """A scenario and the user's own control program in one command, and `with` and `test --target compose` that find each other.
 
-Observed: to judge a controller that is not fieldtwin's, a user had to start the simulated field by hand, copy its port into the
-controller's settings and into the scenario, and end everything by hand; `test --target compose` inside of `fieldtwin with` looked
-for a host named `field`.
+Defect: to test a controller other than fieldtwin's, a user had to start the simulated devices by hand, copy their port into
+the controller's settings and into the scenario, and end everything by hand; `test --target compose` inside `fieldtwin with`
+looked for a host named `field`.
 """
 
 from __future__ import annotations
@@ -139,7 +139,7 @@ def test_what_does_not_fit_is_a_usage_error(site: Path, words: list[str], told: 
 
 
 def test_inside_of_with_the_judge_finds_the_field_side(site: Path) -> None:
-    """The shell starts a controller and then judges it: FIELDTWIN_CONTROL says where the simulated devices are."""
+    """The shell starts a controller and then tests it: FIELDTWIN_CONTROL gives the address of the simulated devices."""
     fieldtwin_test = f"{sys.executable} -m fieldtwin test {site / 'as_is.scenario.yaml'} --target compose --json"
     script = f"{' '.join(controller(site))} >&2 & {fieldtwin_test}; status=$?; kill $!; exit $status"
     ended = run_to_end(site, "with", str(site / "shed.yaml"), "--", "sh", "-c", script, within_s=200)

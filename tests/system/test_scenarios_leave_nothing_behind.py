@@ -1,7 +1,7 @@
-"""Scenarios on a system that runs already put in faults and values, and leave none of them behind.
+"""Scenarios on a running system inject faults and values, and leave none of them.
 
-Observed: after `--target compose`, the faults and set values of a scenario that failed, or whose judge was killed, stayed in the
-simulated devices. Later scenarios were judged on a sabotaged system, and the second run ended with "the fault is in already".
+Defect: after `--target compose`, the faults and set values of a scenario that failed or was killed stayed in the simulated
+devices. Later scenarios ran on a manipulated system, and the second run ended with "the fault is in already".
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ GUARD = """PROGRAM guard
 END_PROGRAM
 """
 WITHIN = "within: 60s"
-"""Ample: what is judged is the outcome, and the host may be busy."""
+"""Generous, because the test is about the result, and the host may be busy."""
 SCENARIOS = {
     "calm": f"""
 start: fresh
@@ -118,7 +118,8 @@ def site(tmp_path: Path) -> Path:
 
 
 class Running:
-    """A field side and a controller that run, as in two containers, and how `fieldtwin test` is told of them."""
+    """A field simulator and a controller that run, as in two containers, and the options that tell `fieldtwin test` their
+    addresses."""
 
     def __init__(self, site: Path, field: Fieldtwin, run: Fieldtwin, port: int) -> None:
         self.site = site
@@ -135,7 +136,7 @@ class Running:
         return results
 
     def put_in(self) -> tuple[list[str], dict[str, float]]:
-        """What is in the devices now: the ids of faults, and set values."""
+        """Return the ids of faults and the set values that are now in the devices."""
         status = self.field("get")
         return [fault["id"] for fault in status["faults"]], status["set"]
 
@@ -187,7 +188,7 @@ def test_a_killed_judge_s_faults_and_values_expire(running: Running) -> None:
         wait_for(lambda: running.put_in() == (["dead"], {"tank.level": 120}), 30, judge.err)
         judge.signal(signal.SIGKILL)
         judge.wait()
-    results = running.test("calm", "silent")  # at once: this judge waits for the lease of the one that was killed
+    results = running.test("calm", "silent")  # at once: this scenario waits for the lease of the killed one
     assert verdicts(results) == {"calm": "passed", "silent": "passed"}, results
     assert running.put_in() == ([], {})
     assert running.field("get")["lease"]["expired"] == 1
@@ -238,7 +239,7 @@ steps:
 
 
 def test_a_line_a_can_bus_and_a_modem_are_made_anew(tmp_path: Path) -> None:
-    """A serial line, CANopen nodes and a transmitter whose mailboxes were used: the second run begins like the first."""
+    """A serial line, CANopen nodes and a transmitter whose mailboxes were used: the second run starts like the first."""
     port = free_port()
     scenario = tmp_path / "scenarios" / "a.scenario.yaml"
     scenario.parent.mkdir()

@@ -1,4 +1,4 @@
-"""Scenarios on a CAN interface that is said: `fieldtwin test --target local --can`."""
+"""Scenarios on a given CAN interface: `fieldtwin test --target local --can`."""
 
 from __future__ import annotations
 

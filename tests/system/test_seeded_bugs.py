@@ -1,7 +1,7 @@
 """Five bugs, planted one at a time in a copy of the program: `run --virtual` with faults must end as not ok for each of them.
 
 Without its bug the same copy, with the same faults and seed, must end as ok. Two of the five were not caught before the oracle
-looked at values that stay good (`AgeOracle.still_good`) and at repeated commands (`MessageOracle`).
+checked values that stay good (`AgeOracle.still_good`) and repeated commands (`MessageOracle`).
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ LATE = FAULTS + "  - {name: late-reply, device: ctd, function: 4, by_ms: 550, fr
 
 
 def add(path: Path, text: str, before: str, target: Path) -> None:
-    """Write the file at `path` to `target`, with `text` in front of the line that is `before`."""
+    """Write the file at `path` to `target`, with `text` inserted before the line `before`."""
     found = path.read_text()
     assert found.count(before) == 1
     target.write_text(found.replace(before, text + before))
@@ -62,14 +62,14 @@ def files(tmp_path: Path) -> Path:
     prototype = tmp_path / "observatory.prototype.yaml"
     add(shipped / prototype.name, played, "  inclinometer: {recording", prototype)
     faster = prototype.read_text().replace("speed: 1, at_end: hold", "speed: 20, at_end: loop")
-    prototype.write_text(faster)  # so that the value of a late reply is a different one
+    prototype.write_text(faster)  # so that a late reply has a different value
     (tmp_path / "faults.yaml").write_text(FAULTS)
     (tmp_path / "late.yaml").write_text(LATE)
     return tmp_path
 
 
 def run(program: Path, files: Path, faults: str = "faults.yaml") -> tuple[int, dict[str, Any]]:
-    """Exit code and summary of the run, with the program in the folder `program`."""
+    """Return exit code and summary of the run, with the program in the folder `program`."""
     words = ["--prototype", "--virtual", "--for", "20s", "--seed", "3", "--commands", "1,2,0,-1", "--json"]
     ended = subprocess.run(
         [sys.executable, "-m", "fieldtwin", "run", "observatory.yaml", "--faults", faults, *words],

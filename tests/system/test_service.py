@@ -1,4 +1,4 @@
-"""`fieldtwin run` as systemd sees it: READY, the watchdog only while the gateway answers, STOPPING; events and metrics."""
+"""`fieldtwin run` under systemd: READY, the watchdog only while the gateway answers, STOPPING; events and metrics."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from procs import CHECKOUT, Asking, wait_for
 from prometheus_client.parser import text_string_to_metric_families
 
 VALUES = "010400000"  # unit 1, function 04 from the first input register on
-"""How a read of the sensor's values begins, in hex."""
+"""The first bytes of a read of the sensor's values, in hex."""
 
 
 def ctd_polls(capture: Path) -> list[float]:
-    """When the gateway asked for the sensor's values, in seconds, by its own clock."""
+    """Return when the gateway polled the sensor's values, in seconds, by its own clock."""
     lines = [json.loads(line) for line in capture.read_text(encoding="ascii").splitlines() if line.endswith("}")]
     return [x["t_ns"] / 1e9 for x in lines if x.get("direction") == "sent" and x["hex"].startswith(VALUES)]
 
@@ -43,7 +43,7 @@ def test_a_run_under_systemd(tmp_path: Path) -> None:
         told: list[str] = []
 
         def hear(start: str) -> str:
-            """The next message that begins so."""
+            """Return the next message that begins with this text."""
             while not (text := systemd.recv(4096).decode()).startswith(start):
                 told.append(text)
             return text
@@ -71,7 +71,7 @@ def test_a_run_under_systemd(tmp_path: Path) -> None:
                 samples = [s for f in text_string_to_metric_families(answer.read().decode()) for s in f.samples]
             assert {s.labels["process"] for s in samples if s.name == "fieldtwin_up"} == {"gateway", "plc", "field"}
 
-            # Three seconds of polls on either side of a reload, as the wire had them.
+            # Three seconds of polls before and after a reload, from the capture.
             gateway_socket = Asking(str(run_dir / "observatory" / "gateway.sock"))
             wait_for(lambda: len(ctd_polls(capture)) > 3)
             edit(system, "values: {every_ms: 500}", "values: {every_ms: 1000}")
@@ -102,7 +102,7 @@ def test_a_run_under_systemd(tmp_path: Path) -> None:
             gateway = gateway_socket("ready")["pid"]
             os.kill(gateway, signal.SIGSTOP)
             try:
-                hear("STATUS=")  # a line of status that feeds no watchdog
+                hear("STATUS=")  # a status line that does not feed the watchdog
             finally:
                 os.kill(gateway, signal.SIGCONT)
             assert hear("WATCHDOG=1")  # and it is fed again

@@ -1,4 +1,4 @@
-"""`fieldtwin run --thread` and `fieldtwin shadow`: two processes that only have a thread between them."""
+"""`fieldtwin run --thread` and `fieldtwin shadow`: two processes connected only by a thread."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""A PLC that stopped by itself during a run makes the run not ok, also when it runs again at the end.
+"""A PLC that stopped by itself during a run makes the run not ok, even if it runs again at the end.
 
-Observed: three stops by the watchdog, each with "PLC LOST" in the live view, and then `ok` with exit code 0.
+Defect: three stops by the watchdog, each with "PLC LOST" in the live view, and then `ok` with exit code 0.
 """
 
 from __future__ import annotations

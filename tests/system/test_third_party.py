@@ -1,7 +1,7 @@
-"""A third party that reads the emulators of a prototype run does not make the run "not ok": its traffic is counted apart.
+"""A third party that reads the emulators of a prototype run does not make the run "not ok": its traffic is counted separately.
 
-"gateway counted 48 requests, the emulators 46", exit code 1, was what a run said after another program had read one register, and
-likewise after an SDO of another client.
+Defect: after a different program had read one register, a run ended with "gateway counted 48 requests, the emulators 46" and
+exit code 1, and likewise after an SDO request of a different client.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""A digital twin opposite a prototype, all of it as processes, over each carrier: 20 % of the frames lost, others repeated and
-turned round by a link of ours, either side killed at random instants. The two logs are equal in the end, row by row.
+"""A digital twin and a prototype as processes, over each carrier: a link loses 20 % of the frames, and repeats and reorders
+others; either side is killed at random instants. At the end the two logs are equal, row by row.
 
-The same in virtual time, with many seeds and in milliseconds, is in tests/unit/test_thread_core.py and test_thread_carriers.py.
+tests/unit/test_thread_core.py and test_thread_carriers.py test the same in virtual time, with many seeds and in milliseconds.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ FAULTS = """faults:
 
 
 class Chaos:
-    """A plant and its twin, started and killed as often as the seed says; their stores stay."""
+    """A plant and its twin, started and killed as often as the seed determines; their stores remain."""
 
     def __init__(self, folder: Path, seed: int, plant: tuple[str, ...], twin_at: str) -> None:
         self.root = folder / "r"
@@ -49,7 +49,7 @@ class Chaos:
         )
         self.commanded: list[int] = []
         self.wanted = 0
-        """How much the plant knew when nobody was killed any more."""
+        """Number of the plant's events when the kills ended."""
 
     @contextmanager
     def plant(self) -> Iterator[Fieldtwin]:
@@ -63,19 +63,19 @@ class Chaos:
             yield run
 
     def field_is_gone(self) -> bool:
-        """Its ports are free again, which a prototype file may name."""
+        """The ports are free again; a prototype file may name them."""
         with closing(socket.socket(socket.AF_UNIX)) as probe:
             return probe.connect_ex(str(self.root / "observatory" / "field.sock")) != 0
 
     def counts(self) -> tuple[int, int]:
-        """Events of the plant's log, and how many of them its twin has without a gap."""
+        """Return the number of events in the plant's log, and how many of them its twin has without a gap."""
         origin = own(self.stores[0], "plant")
         arrived = log_of(self.stores[1], origin)
         whole = next((n for n, row in enumerate(arrived) if row[0] != n + 1), len(arrived))
         return len(log_of(self.stores[0], origin)), whole
 
     def run(self) -> None:
-        """Both sides die at some instant while knowledge is on its way, the twin twice, and the last ones stay to the end."""
+        """Both sides die at some instant while events are in transit, the twin twice, and the last ones run to the end."""
         with ExitStack() as stack:
             plant = stack.enter_context(self.plant())
             for which in ("twin", "plant", "twin"):
@@ -98,7 +98,8 @@ class Chaos:
             plant.wait(20)
 
     def until_more(self, count: int, twin: Fieldtwin) -> None:
-        """So many events more have arrived, and the twin has its command on record: who dies before never gave it."""
+        """Wait until so many more events have arrived, and the twin has recorded its command; a twin that dies before never
+        gave it."""
         began = self.counts()[1]
 
         def arrived() -> bool:
@@ -111,7 +112,7 @@ class Chaos:
         )
 
     def until_equal(self, plant: Fieldtwin) -> None:
-        """Everything that there is now is on both sides."""
+        """Wait until both sides have all events."""
         thread = plant.control("observatory", "thread")
         wait_for(lambda: own(self.stores[1], "twin") and self._all_commands_there(), 60, f"commands: {thread('get')}")
         self.wanted = self.counts()[0]
@@ -141,7 +142,7 @@ class Chaos:
 
 @contextmanager
 def shaken(folder: Path, framing: str, target: int) -> Iterator[int]:
-    """The port of a link to `target` that loses, repeats and turns round."""
+    """The port of a link to `target` that loses, repeats and reorders."""
     (folder / "faults.yaml").write_text(FAULTS)
     port = free_port()
     ends = f"tcp://127.0.0.1:{port}?listen=1", f"tcp://127.0.0.1:{target}"
@@ -170,7 +171,7 @@ def test_over_mqtt(tmp_path: Path) -> None:
 
 
 def test_over_the_modems(tmp_path: Path) -> None:
-    """The reference system's own, 64 bytes a message. They do not send again what is lost, and die with the plant."""
+    """The modems of the reference system, 64 bytes per message. They do not repeat lost messages, and die with the plant."""
     port = free_port()
     chaos = Chaos(tmp_path, 3, ("--thread", "modem:"), f"modem:tcp://127.0.0.1:{port}")
     prototype = tmp_path / "profiles" / "systems" / "observatory.prototype.yaml"

@@ -1,4 +1,4 @@
-"""`fieldtwin twin` opposite a prototype: commands that reach the control logic, once, and only while the plant allows it."""
+"""`fieldtwin twin` with a prototype: commands reach the control logic, once, and only while the plant allows it."""
 
 from __future__ import annotations
 

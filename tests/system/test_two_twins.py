@@ -11,7 +11,7 @@ from procs import Fieldtwin, fieldtwin, no_tracebacks, run_to_end, wait_for
 
 
 def what_if(root: Path, system: str, instance: str) -> tuple[int, str, int]:
-    """Exit code, state and period of a fork of an instance that runs, a few seconds ahead; or what is wrong."""
+    """Return exit code, state and period of a fork of a running instance, a few seconds ahead; or the error."""
     ended = run_to_end(
         root, "what-if", system, "--from", f"instance:{instance}", "--horizon", "5s", "--json", name=f"if-{instance}"
     )
@@ -40,7 +40,7 @@ def test_two_twins_of_one_system_run_side_by_side_and_each_has_its_own_plant(tmp
             start("twin", "observatory", "--from", place, "--json", "--command", str(period), name=f"{name}-twin")
             for place, period, name in zip(places, (3, 7), names, strict=True)
         ]
-        twins[0].control("one-twin", "twin")("get")  # it is there: the name is taken
+        twins[0].control("one-twin", "twin")("get")  # it exists, so the name is in use
         again = run_to_end(root, "twin", "observatory", "--from", places[0], "--instance", "one-twin", name="again")
         assert again.process.returncode == 4
         assert "is running already" in again.err

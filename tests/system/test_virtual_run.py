@@ -1,4 +1,4 @@
-"""A whole prototype in virtual time, by the command line: the same seed gives the same events, byte for byte."""
+"""A whole prototype in virtual time, from the command line: the same seed gives the same events, byte for byte."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_many_seeds() -> None:
     told = json.loads(ended.stdout)
     assert [r["seed"] for r in told["results"]] == [1, 2, 3]
     assert told["failed"] == []
-    assert len({r["sha256"] for r in told["results"]}) > 1  # the modems' link loses other packets
+    assert len({r["sha256"] for r in told["results"]}) > 1  # the modems' link loses different packets
 
 
 @pytest.mark.parametrize(
@@ -79,7 +79,7 @@ def test_what_makes_no_sense_is_refused(words: list[str], told: str) -> None:
 
 
 def test_a_command_that_is_due_between_two_instants_is_sent() -> None:
-    """0.1 x 3 s is a little more than 0.3 s: less than a nanosecond was waited for without end."""
+    """Defect: 0.1 x 3 s is a little more than 0.3 s; the run waited for less than a nanosecond without end."""
     made = VirtualRun(VirtualOptions("observatory", 3.0, commands=(1, 2, 0, -1)))
     made.run()
     assert made.errors == []

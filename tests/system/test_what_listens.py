@@ -1,6 +1,6 @@
-"""What listens where: each mode is started, and the listening sockets of its processes are read from /proc.
+"""Listening sockets of each mode: each is started, and the sockets of its processes are read from /proc.
 
-SECURITY.md states the same as a table. Nothing may listen beyond loopback unless it was asked for, and then only with a token.
+SECURITY.md has the same facts as a table. No process may listen beyond loopback without a request, and then only with a token.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ LOOPBACK = "127.0.0.1"
 
 
 def tree(pid: int) -> set[int]:
-    """The process and its descendants."""
+    """Return the process and its descendants."""
     found = {pid}
     for task in Path(f"/proc/{pid}/task").glob("*/children"):
         for child in task.read_text().split():
@@ -48,7 +48,7 @@ def inodes(pids: set[int]) -> set[str]:
 
 
 def listening(pid: int) -> set[tuple[str, int]]:
-    """Address and port of each TCP socket on which the process or a descendant listens; of UDP, each bound one."""
+    """Return address and port of each TCP socket on which the process or a descendant listens; of UDP, each bound one."""
     ours, found = inodes(tree(pid)), set()
     for table, states in (("tcp", {LISTENING}), ("tcp6", {LISTENING}), ("udp", {"07"}), ("udp6", {"07"})):
         for line in Path(f"/proc/{pid}/net/{table}").read_text().splitlines()[1:]:
@@ -62,7 +62,7 @@ def listening(pid: int) -> set[tuple[str, int]]:
 
 
 def only_loopback(pid: int) -> set[int]:
-    """The ports; fails if one of them is anywhere else than on 127.0.0.1."""
+    """Return the ports; fail if one of them is not on 127.0.0.1."""
     found = listening(pid)
     assert {host for host, _ in found} <= {LOOPBACK}, found
     return {port for _, port in found}
@@ -81,7 +81,7 @@ def test_a_prototype_listens_on_loopback_and_its_channels_are_the_owners(tmp_pat
         run.control("observatory", "plc")
         wait_for(lambda: all(d["online"] for d in gateway("get")["devices"].values()), 40, "every device online")
         wait_for(lambda: {metrics, thread} <= only_loopback(run.process.pid), 20, "metrics and thread")
-        # The CAN bus, the modem, its far end and what the system file serves, beside metrics and thread.
+        # The CAN bus, the modem, its remote end and the serve section of the system file, in addition to metrics and thread.
         assert len(only_loopback(run.process.pid)) == 6
         folder = tmp_path / "observatory"
         assert stat.S_IMODE(folder.stat().st_mode) == 0o700
@@ -134,11 +134,11 @@ def test_a_digital_thread_without_certificates_is_refused_off_loopback(tmp_path:
     assert "loopback" in refused.err
 
 
-# -- a plant: what it serves, with and without TLS ----------------------------------------------------------------------
+# -- a plant: served ports, with and without TLS ------------------------------------------------------------------------
 
 
 def a_plant(folder: Path, serve: str, bridge: str = "") -> Path:
-    """A system file whose devices are not there, and which serves and bridges at these URLs."""
+    """A system file with missing devices that serves and bridges at these URLs."""
     text = (CHECKOUT / "profiles" / "systems" / "observatory.yaml").read_text(encoding="utf-8")
     for old, new in (
         ("/dev/ttyS0", str(folder / "ttyNONE")),
@@ -172,7 +172,7 @@ def test_a_plant_listens_where_serve_and_bridge_say_and_nowhere_else(tmp_path: P
 
 @pytest.mark.long
 def test_a_plant_listens_off_loopback_only_where_its_file_says_so(tmp_path: Path) -> None:
-    """With `serve` and with a thread, both on TLS: what no certificate of the authority opens."""
+    """With `serve` and with a thread, both on TLS: connections without a certificate of the authority are refused."""
     pki = make_pki(tmp_path)
     keys = f"ca={pki.ca}&cert={pki.cert('server')}&key={pki.key('server')}"
     serve, thread = free_port(), free_port()
@@ -185,7 +185,7 @@ def test_a_plant_listens_off_loopback_only_where_its_file_says_so(tmp_path: Path
         assert listening(run.process.pid) == {("0.0.0.0", serve), ("0.0.0.0", thread)}
         for port in (serve, thread):
             with socket.create_connection((LOOPBACK, port), timeout=5) as stranger:
-                stranger.sendall(bytes.fromhex("0001 0000 0006 01 04 0000 0002"))  # Modbus TCP in the clear
+                stranger.sendall(bytes.fromhex("0001 0000 0006 01 04 0000 0002"))  # Modbus TCP without TLS
                 stranger.settimeout(15)
                 with_what = b""
                 try:

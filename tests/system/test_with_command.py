@@ -1,4 +1,4 @@
-"""Somebody else's program against the emulated field: it finds the ports, its status is ours, and nothing stays."""
+"""A third-party program with the simulated field devices: it gets the ports, its exit status is ours, and no process remains."""
 
 from __future__ import annotations
 

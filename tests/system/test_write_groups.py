@@ -1,6 +1,6 @@
-"""Outputs of a device that are a write group are written whole or not at all: on a serial line, on TCP and on a CAN bus.
+"""Outputs of a device that are a write group are written completely or not at all: on a serial line, on TCP and on a CAN bus.
 
-Observed before: in one scan a program asked for 60 Hz, which is out of range, and started the drive: it was started at 20 Hz.
+Defect: in one scan a program requested 60 Hz, which is out of range, and started the drive: it was started at 20 Hz.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ GROUPED = SYSTEM.replace("    safe: {run: 0}\n", "    write_groups: {drive: [spe
 LINE = GROUPED.replace("tcp://drive:502", "rtu:/dev/ttyS0?baudrate=115200")
 ON_PTY = PROTOTYPE.replace("tcp://127.0.0.1:0", "pty:lan")
 HALF_AN_HOUR_LATER = TOO_FAST.replace("speed := 60.0", "speed := SEL(pressure > 3.0, 60.0, 40.0)")
-"""Asks for 60 Hz until the pressure is above 3 bar."""
+"""Request 60 Hz until the pressure is above 3 bar."""
 
 
 @pytest.mark.long

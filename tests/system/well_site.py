@@ -54,7 +54,7 @@ steps:
 
 
 def write_site(folder: Path, name: str, url: str) -> None:
-    """Write all files but the program. The system is called `name`, and its sensor is at `url`."""
+    """Write all files except the program. The system is called `name`, and its sensor is at `url`."""
     (folder / "well.yaml").write_text(_PROFILE)
     (folder / f"{name}.yaml").write_text(_SYSTEM.replace("NAME", name).replace("URL", url))
     (folder / f"{name}.prototype.yaml").write_text(_PROTOTYPE.replace("NAME", name))
@@ -62,5 +62,5 @@ def write_site(folder: Path, name: str, url: str) -> None:
 
 
 def write_program(folder: Path, limit: str) -> None:
-    """Write the program, which says that it runs while the level is above `limit`."""
+    """Write the program, which reports that it runs while the level is above `limit`."""
     (folder / "well.st").write_text(_PROGRAM.replace("LIMIT", limit))

@@ -1,4 +1,5 @@
-"""A digital twin that asks a prototype before it commands: what it begins with, what it says, and that no answer is a no."""
+"""A digital twin that queries a prototype before it commands: its initial state, its answer, and that a missing answer counts
+as no."""
 
 from __future__ import annotations
 
@@ -72,7 +73,7 @@ def test_a_state_that_does_not_follow_from_its_period_is_taken_as_it_was_told() 
 
 
 def test_a_twin_asks_in_a_process_beside_it_and_what_gets_no_answer_is_refused() -> None:
-    """Real processes: a command that is forbidden, one that is allowed, one that nobody answers in time."""
+    """Real processes: a forbidden command, an allowed one, and one without an answer in time."""
 
     async def main() -> tuple[list[str], list[bytes], list[int]]:
         told: list[int] = []
@@ -107,7 +108,7 @@ def test_a_twin_asks_in_a_process_beside_it_and_what_gets_no_answer_is_refused()
 
 def test_nothing_is_forked_from_nothing() -> None:
     class Late:
-        """A clock that is always later than the one before."""
+        """A clock that advances with every reading."""
 
         now_ns = 0
 
@@ -177,7 +178,7 @@ def test_what_is_wrong_with_a_question_is_said_with_its_line(tmp_path: Path, tex
 
 
 def test_what_control_logic_prints_is_no_answer_and_what_it_dies_of_is_told(tmp_path: Path) -> None:
-    """A system of one's own, whose program prints when it is imported, or ends the process."""
+    """A custom system, whose program prints when it is imported, or ends the process."""
     (tmp_path / "loud.py").write_text(
         "import os, sys\nfrom fieldtwin.plc.program import Program\n\nprint('loud' * 100_000)\n"
         "if os.path.exists(os.path.dirname(__file__) + '/dies'):\n    print('no more', file=sys.stderr); os._exit(9)\n\n"

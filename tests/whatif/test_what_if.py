@@ -1,4 +1,4 @@
-"""Forks: they begin with what is known, do what a plan says, and tell what came of it."""
+"""Forks: they start from the known state, execute a plan, and report the effects."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ DEEP = KnownState({"ctd.pressure": 250.0, "ctd.temperature": 8.0}, {"relay": of_
 
 
 def test_a_fork_goes_on_from_what_is_known() -> None:
-    """The relay is ACTIVE with the period of before, and the sensor is where it was in the cast."""
+    """The relay is ACTIVE with its earlier period, and the sensor continues at its position in the cast."""
     outcome = answer(Fork("observatory", DEEP, 6.0, settle_s=3.0), Plan("go on", require=("relay.state == 'ACTIVE'",)))
     assert outcome.error == ""
     assert outcome.met
@@ -49,7 +49,7 @@ def test_a_fork_goes_on_from_what_is_known() -> None:
 
 
 def test_a_mean_is_one_over_time_however_often_somebody_looked() -> None:
-    """10 for ten seconds and each second told, 20 for thirty and told once, then bad for a minute, then 40 for ten."""
+    """10 for ten seconds, reported each second; 20 for thirty, reported once; then bad for a minute; then 40 for ten."""
     seen = VariableOutcome()
     for second in range(10):
         seen.saw(10, True, second * NS_PER_S)
@@ -69,7 +69,7 @@ def test_a_mean_is_one_over_time_however_often_somebody_looked() -> None:
 
 
 def test_a_program_that_keeps_its_period_to_itself_is_commanded_what_is_known() -> None:
-    """Of `adapt.st` a store knows state and period; the period that it was ordered stands in none of these."""
+    """For `adapt.st`, a store knows state and period, but not the period that it was ordered."""
     known = KnownState({}, {"adapt": of_period(10)})
     outcome = answer(Fork("ocean_west", known, 30.0), Plan("go on", require=("adapt.state == 'ACTIVE'",)))
     assert (outcome.error, outcome.met, outcome.not_taken) == ("", True, [])
@@ -82,7 +82,7 @@ def test_a_state_that_a_fork_could_not_begin_with_is_named_unless_a_command_came
 ) -> None:
     known = KnownState(
         {}, {program: {**of_period(10), "state": 2}}
-    )  # OFF with a period of 10 s: the state follows from it
+    )  # OFF with a period of 10 s: the state follows from the period
     told = [answer(Fork(system, known, 3.0), plan).not_taken for plan in (Plan("go on"), Plan("", (Scripted(0, 5),)))]
     assert told == [[program], []]
 
@@ -114,7 +114,7 @@ def test_commands_and_faults_of_a_plan_and_the_same_again() -> None:
 
 
 def test_somebody_listens_at_the_far_end() -> None:
-    """Modems whose messages nobody takes would be full in the end, and the fork would foresee losses that there are not."""
+    """Modems whose messages are not taken would become full, and the fork would predict losses that do not occur."""
     outcome = answer(Fork("observatory", DEEP, 40.0), Plan("go on", finally_=("relay.waiting < 3",)))
     assert outcome.met, outcome.described()
     assert outcome.variables["modem.link_sent"].last > 30
@@ -189,7 +189,7 @@ def test_the_last_that_a_store_knows(tmp_path: Path) -> None:
         return await known_state(str(tmp_path / "k.db"), OBSERVATORY)
 
     known = run(main())
-    assert dict(known.values) == {"ctd.pressure": 101.5}  # what turned bad is not known
+    assert dict(known.values) == {"ctd.pressure": 101.5}  # a value that turned bad is unknown
     assert known.programs == {"relay": {"period": 2, "period_s": 2, "state": 1}}
     assert known.utc_ms == 3000
 
@@ -225,7 +225,7 @@ def test_several_plans_by_command(tmp_path: Path) -> None:
     assert said.exception is None
     found = json.loads(said.stdout)
     assert [(o["plan"], o["met"]) for o in found["outcomes"]] == [("keep", True), ("stop", False)]
-    assert said.return_value == 0  # one of them will do
+    assert said.return_value == 0  # one of them is sufficient
     assert found["outcomes"][1]["requirements"][1]["seen"] == "relay.state: 'STANDBY'"
     shown = CliRunner().invoke(command, words, standalone_mode=False).stdout
     assert "keep: met" in shown

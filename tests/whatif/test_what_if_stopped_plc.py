@@ -1,4 +1,4 @@
-"""What-if with a PLC that stops, and requirements about what is unknown: neither may be met."""
+"""What-if with a PLC that stops, and requirements on unknown values: neither may be met."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def plan(name: str, *require: str) -> Plan:
 
 
 def test_a_plan_in_which_the_plc_stops_or_nothing_is_known_is_not_met(tmp_path: Path) -> None:
-    """Observed before: ``not pump.fault`` was met by a PLC that divided by zero in its first scan."""
+    """Defect: ``not pump.fault`` was met by a PLC that divided by zero in its first scan."""
     (tmp_path / "pump.st").write_text(DIVIDES_BY_ZERO)
     write_plant(tmp_path)
     fork = Fork(str(tmp_path / "plant.yaml"), KnownState(), 10.0)

@@ -1,7 +1,7 @@
-"""libmodbus's server as a program of its own: ``modbus_libmodbus_server.py tcp`` or ``... rtu DEVICE``.
+"""libmodbus's server in a separate program: ``modbus_libmodbus_server.py tcp`` or ``... rtu DEVICE``.
 
-Unit 1: 200 coils, discrete inputs (every third set), holding registers (0), input registers (257 x address). Prints the
-TCP port, or ``ready``, and serves one master after the other until it is terminated.
+Unit 1: 200 coils, discrete inputs (every third set), holding registers (0), input registers (257 x address). It prints the TCP
+port, or ``ready``, and serves one client after the other until it is terminated.
 """
 
 from __future__ import annotations

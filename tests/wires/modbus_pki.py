@@ -1,4 +1,4 @@
-"""A certification authority for one test run: made by openssl when needed, thrown away with the directory."""
+"""A certification authority for one test run: created by openssl on demand, removed with the directory."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ ROLE = "1.3.6.1.4.1.50316.802.1"
 
 @dataclass(frozen=True)
 class Pki:
-    """Files of one authority and what it signed; each name gives NAME.pem (certificate) and NAME.key."""
+    """Files of one authority and the certificates it signed; each name gives NAME.pem (certificate) and NAME.key."""
 
     directory: Path
 
@@ -29,7 +29,7 @@ class Pki:
         return self.path(f"{name}.key")
 
     def issue(self, name: str, alternative_name: str = "", role: str = "") -> None:
-        """A certificate for NAME, signed by the authority, with a role where one is given."""
+        """Create a certificate for NAME, signed by the authority, with a role if one is given."""
         extensions = [f"subjectAltName={alternative_name or 'DNS:' + name}"]
         if role:
             extensions.append(f"{ROLE}=ASN1:UTF8String:{role}")
@@ -45,7 +45,7 @@ class Pki:
 
 
 def make_pki(directory: Path) -> Pki:
-    """An authority in `directory` that has signed a server (127.0.0.1) and a client with role Operator."""
+    """Create an authority in `directory` that has signed a server (127.0.0.1) and a client with role Operator."""
     pki = Pki(directory)
     _openssl(
         *("req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes", "-days", "2"),

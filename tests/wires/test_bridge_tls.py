@@ -1,4 +1,4 @@
-"""TLS in front of the gateway's servers: real certificates, who gets in, and what a role may do (MODBUS/TCP Security)."""
+"""TLS for the gateway's servers: real certificates, accepted clients, and the permissions of a role (MODBUS/TCP Security)."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def listening(pki: Pki, **others: str) -> Endpoint:
 
 @asynccontextmanager
 async def client(pki: Pki, name: str, port: int, issued_by: Pki | None = None) -> AsyncIterator[ModbusClient]:
-    """A master that trusts the server's authority and shows NAME's certificate; no certificate without a name."""
+    """A client that trusts the server's authority and presents NAME's certificate; without a name, no certificate."""
     own = issued_by or pki
     files = f"ca={pki.ca}" + (f"&cert={own.cert(name)}&key={own.key(name)}" if name else "")
     connection = await TlsConnection.open(Endpoint.parse(f"tls://127.0.0.1:{port}?{files}"))
@@ -71,7 +71,7 @@ async def client(pki: Pki, name: str, port: int, issued_by: Pki | None = None) -
 
 @asynccontextmanager
 async def bridge(pki: Pki, folder: Path, rules: tuple[AllowRule, ...]) -> AsyncIterator[tuple[Bridge, MapBank]]:
-    """A bridge behind TLS that leads to a unit on TCP."""
+    """A bridge with TLS that leads to a unit on TCP."""
     bank = MapBank([Span("holding", 0, 16)])
     bank.poke("holding", 0, 7)
     device = await SocketListener.open(
@@ -134,7 +134,7 @@ def test_who_has_no_certificate_of_ours_does_not_get_in(pki: Pki, tmp_path: Path
             port = b.front.bound.port
             for name in ("", "client"):
                 with pytest.raises((ConnectionLost, Unreachable)):
-                    # In TLS 1.3 the client has shaken hands before the server has seen its certificate.
+                    # In TLS 1.3 the client completes the handshake before the server has seen its certificate.
                     async with client(pki, name, port, foreign) as shut_out:
                         await shut_out.read_registers(1, "holding", 0, 1)
             reader, writer = await asyncio.open_connection("127.0.0.1", port)
@@ -244,7 +244,7 @@ def test_the_silent_are_closed_after_a_while() -> None:
             assert asyncio.get_running_loop().time() < began + 5
         assert await asyncio.wait_for(reader.read(1), 5) == b""
         assert len(listener.clients) == 1
-        assert await asyncio.wait_for(other.read(1), 5) == b""  # it stops talking too
+        assert await asyncio.wait_for(other.read(1), 5) == b""  # it stops sending too
         assert listener.retired == 2
         writer.close()
         talking.close()

@@ -1,4 +1,4 @@
-"""Two CAN buses joined: the software bus with another one, and with a kernel's vcan0 where there is one."""
+"""Two joined CAN buses: the software bus with a second one, and with the kernel's vcan0 if it exists."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ async def two_buses(**options: bool) -> AsyncIterator[tuple[SoftBusServer, SoftB
 
 
 async def cross(sender: CanConnection, receiver: CanConnection, count: int, ahead: int = 100) -> None:
-    """Frames in order from one to the other, at most `ahead` of them under way: vcan itself holds nobody back."""
+    """Send frames in order from one to the other, at most `ahead` of them in transit, because vcan does not throttle a sender."""
     got: list[int] = []
     room = asyncio.Semaphore(ahead)
 
@@ -93,7 +93,7 @@ def test_both_ways_at_once_whole_and_in_order() -> None:
         async with two_buses(paced=False) as (one, other, bridge):
             ends = [one.attach("a"), one.attach("b"), other.attach("c"), other.attach("d")]
             a, b, c, d = ends
-            # b and c hear their neighbours too, and take only what came across.
+            # b and c receive their neighbours' frames too, and count only those that crossed the bridge.
             b.accept = lambda frame: frame.can_id >= 0x700
             c.accept = lambda frame: frame.can_id < 0x700
             crossing = asyncio.create_task(cross(a, c, 3000))
@@ -114,7 +114,7 @@ def test_errors_stay_on_their_side() -> None:
         async with two_buses() as (one, other, bridge):
             here, there = one.attach("here"), other.attach("there")
             one.disturb(spoil(Disturbance(at_bit=3), times=32))
-            await there.send(CanFrame(0x123))  # the bridge's own node is in bus-off before it gets it through
+            await there.send(CanFrame(0x123))  # the bridge's own node is bus-off before it can send it
             assert str(await here.recv()) == "123#"
             await here.send(CanFrame(0x124))
             assert str(await there.recv()) == "124#"
@@ -141,7 +141,7 @@ def test_a_bus_that_vanishes_ends_the_bridge_and_says_so() -> None:
 
 @contextlib.asynccontextmanager
 async def command(*options: str) -> AsyncIterator[tuple[asyncio.subprocess.Process, dict[str, str]]]:
-    """`fieldtwin can-bus` and the addresses that it tells."""
+    """Start `fieldtwin can-bus` and return the addresses that it prints."""
     process = await asyncio.create_subprocess_exec(
         *(sys.executable, "-m", "fieldtwin", "can-bus", "--listen", "127.0.0.1:0", *options),
         stderr=asyncio.subprocess.PIPE,
@@ -264,7 +264,7 @@ class TestVcan:
                 dump = await asyncio.create_subprocess_exec(
                     *("candump", "-L", "-n", "200", "vcan0"), stdout=asyncio.subprocess.PIPE
                 )
-                await asyncio.sleep(1)  # candump tells nothing when it is ready
+                await asyncio.sleep(1)  # candump does not indicate when it is ready
                 for i in range(200):
                     await soft.send(CanFrame(0x181, i.to_bytes(2)))
                 out, _ = await asyncio.wait_for(dump.communicate(), 60)

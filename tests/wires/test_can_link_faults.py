@@ -1,4 +1,4 @@
-"""Faults between two CAN buses of strangers: `fieldtwin link --faults FILE can:NEAR can:FAR`."""
+"""Faults between two third-party CAN buses: `fieldtwin link --faults FILE can:NEAR can:FAR`."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ BEAT, OTHER = CanFrame(0x705, b"\x7f"), CanFrame(0x706, b"\x05")
 
 @contextlib.asynccontextmanager
 async def strangers(*said: dict[str, Any]) -> AsyncIterator[tuple[CanConnection, CanConnection, CanLink]]:
-    """A master's end, a node's end, and the link between their buses."""
+    """A client's end, a node's end, and the link between their buses."""
     near, far = [await SoftBusServer.open(ANY_PORT, 1_000_000, paced=False) for _ in range(2)]
     now_ns = round(asyncio.get_running_loop().time() * NS_PER_S)
     link = CanLink(near.attach("link"), far.attach("link"), wire_faults(said, Framing.RAW, 1, now_ns, check_can_link))
@@ -44,7 +44,7 @@ async def strangers(*said: dict[str, Any]) -> AsyncIterator[tuple[CanConnection,
 
 
 async def heard(at: CanConnection, count: int) -> list[CanFrame]:
-    """So many frames, without the time at which they came."""
+    """Read so many frames, without their times."""
     async with asyncio.timeout(5):
         return [CanFrame(frame.can_id, frame.data) for frame in [await at.recv() for _ in range(count)]]
 

@@ -1,4 +1,4 @@
-"""canbusload of can-utils counts the bits of the same frames as the modelled bus does, stuff bits included."""
+"""canbusload of can-utils counts the bits of the same frames as the modelled bus, stuff bits included."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def frames() -> list[CanFrame]:
         extended, remote = chance.random() < 0.3, chance.random() < 0.1
         can_id = chance.getrandbits(29 if extended else 11)
         data = bytes(chance.choice((0x00, 0xFF, 0x0F, chance.getrandbits(8))) for _ in range(chance.randrange(9)))
-        if remote:  # without a length: tools differ in whether a remote frame's length code has data behind it
+        if remote:  # without a length: tools differ in whether a remote frame's length code implies data
             made.append(CanFrame(can_id, extended=extended, remote=True, dlc=0))
         else:
             made.append(CanFrame(can_id, data, extended=extended))

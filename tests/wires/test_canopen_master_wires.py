@@ -1,7 +1,7 @@
-"""The rows of the CANopen master once more, in real time on real wires: the kernel's vcan, and the software bus over TCP.
+"""The rows of the CANopen master repeated in real time on real wires: the kernel's vcan, and the software bus over TCP.
 
-The order of the frames counts here, and what comes of them; times are stretched and only lower bounds. Left out are rows
-that need a time to the millisecond, or a bus that can be filled or cut.
+The order of the frames and their effects count here; times are stretched and only lower bounds. Rows are omitted if they need
+millisecond times, or a bus that can be filled or cut.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ from fieldtwin.gateway.wallclock import WallClock
 ROWS = tomllib.loads((Path(__file__).parents[1] / "vectors" / "canopen_master.toml").read_text())["row"]
 BITRATE = 125_000
 SCALE = 5
-"""By how much times are stretched: a shared machine is late now and then."""
+"""Factor by which times are stretched, because a shared machine is late at times."""
 TO_THE_MILLISECOND = ("CO-018", "CO-024")
 CALLS = ("upload", "download", "nmt", "lss-any", "lss-fastscan", "lss-node-id", "lss-store", "lss-assign")
 
 
 def playable(row: dict[str, Any]) -> bool:
-    """Whether a row needs nothing but a wire."""
+    """Return whether a row needs nothing but a wire."""
     late = max([float(line.split()[0]) for line in row.get("bus", [])] + [row.get("until_ms", 0)], default=0)
     calls = all(call[1] in CALLS for call in row.get("do", []))
     plain = not row.get("driver") and not row.get("patience")
@@ -55,7 +55,7 @@ def parse(text: str) -> CanFrame:
 
 
 class WirePlay:
-    """A master on one end of the wire; the row on the other."""
+    """Connect the client to one end of the wire; the row drives the other end."""
 
     def __init__(self, row: dict[str, Any]) -> None:
         self.row = row

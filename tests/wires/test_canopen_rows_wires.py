@@ -67,7 +67,7 @@ async def says(heard: list[str], wanted: list[str], row: Row) -> None:
 
 
 async def poke(node: CanopenNode, what: str, pokes: asyncio.Queue[Poke]) -> None:
-    """Let it happen in the device, and wait until it did."""
+    """Trigger an event in the device, and wait until it has happened."""
     done = asyncio.Event()
 
     def happened(now_ns: int) -> list[CanFrame]:
@@ -95,7 +95,7 @@ def test_over_tcp() -> None:
     async def main() -> None:
         server = await SoftBusServer.open(Endpoint.parse("can:fieldtwin/127.0.0.1:0"), 1_000_000)
         try:
-            for row in ROWS[::4]:  # all of them are played on the bus in virtual time
+            for row in ROWS[::4]:  # all of them run on the bus in virtual time
                 await play_on(row, server.bound)
         finally:
             await server.aclose()

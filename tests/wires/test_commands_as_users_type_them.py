@@ -1,4 +1,4 @@
-"""Commands at a device that failed, or did something else, when a user typed them as the help suggests."""
+"""Device commands that failed, or had a wrong effect, when a user typed them as the help suggests."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ async def _with_node(work: Callable[[str], Awaitable[None]]) -> None:
 
 
 def test_record_with_an_eds_reads_the_objects_of_the_eds(tmp_path: Path) -> None:
-    """With --eds and without --profile, `record` on CAN polled nothing, without a word."""
+    """With --eds and without --profile, `record` on CAN polled nothing, without a message."""
     (tmp_path / "x.eds").write_text(SHEET)
     log = tmp_path / "node.log"
 
@@ -137,7 +137,7 @@ def test_a_link_opens_a_pseudo_terminal_with_parity_as_often_as_it_likes() -> No
 
 
 def test_a_bridge_reads_through_an_adapter_that_echoes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """`bridge` had no --echo, so that a two-wire adapter which returns what is sent answered nothing."""
+    """`bridge` had no --echo, so a two-wire adapter that returns its own transmissions gave no answer."""
     monkeypatch.setenv("FIELDTWIN_RUN", str(tmp_path / "r"))
 
     async def main() -> None:

@@ -1,4 +1,4 @@
-"""A live wire for the commissioning verbs: opened by its URL, logged beside, closed on leaving."""
+"""A live wire for the commissioning commands: opened by its URL, logged, closed on exit."""
 
 from __future__ import annotations
 

@@ -95,7 +95,7 @@ def test_a_unit_is_dumped_read_written_and_put_back(opened: Opened, tmp_path: Pa
     async def main() -> None:
         async with opened(tmp_path) as url:
             target = Target(url, 1, timeout_s=2.0)
-            # libmodbus sleeps half a second before it refuses, and its RTU server ends at a function that it does not know.
+            # libmodbus sleeps half a second before it refuses, and its RTU server ends at an unknown function.
             polite = opened in (libmodbus_tcp, libmodbus_pty)
             spans = register_spans(
                 [f"input:0..{COUNT - 1 if polite else COUNT + 9}", "holding:0..59", "discrete:0..63"]
@@ -149,7 +149,7 @@ def test_a_node_on_the_software_bus(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_a_dump_that_was_killed_goes_on(tmp_path: Path) -> None:
-    """kill -9 in the middle of a dump by the command line; the last line at most is lost, and nothing is asked twice."""
+    """kill -9 in the middle of a dump from the command line; at most the last line is lost, and no request is repeated."""
     out = tmp_path / "d.jsonl"
 
     async def main() -> None:

@@ -1,4 +1,4 @@
-"""The emulated drive with a stranger's master: the `canopen` package's own CiA 402 state machine, over the software bus."""
+"""The emulated drive with a third-party client: the `canopen` package's CiA 402 state machine, over the software bus."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ NODE, EVENT_MS = 7, 20
 
 
 def drive_it(host: str, port: int) -> list[str]:
-    """What a user's script does; the states that it saw. Blocking."""
+    """Run a user's script; return the states that it saw. Blocking."""
     network = canopen.Network(SoftBus(f"{host}:{port}"))
     network.connect()
     try:
         node = BaseNode402(NODE, str(PROFILE.eds_path))
         network.add_node(node)
-        for pdo in range(4):  # this client wants TPDOs that come by themselves
+        for pdo in range(4):  # this client needs TPDOs without a request
             node.sdo[0x1800 + pdo][5].raw = EVENT_MS
         node.nmt.state = "PRE-OPERATIONAL"
         node.setup_402_state_machine()

@@ -30,7 +30,7 @@ DRIVE = Path("profiles/devices/drive-cia402.eds")
 
 
 async def fieldtwin(*words: str) -> tuple[int, dict[str, Any], str]:
-    """Exit code, JSON on stdout, talk on stderr."""
+    """Return exit code, JSON on stdout, diagnostics on stderr."""
     program = await asyncio.create_subprocess_exec(
         sys.executable, "-m", "fieldtwin", *words, "--json", stdout=subprocess.PIPE, stderr=subprocess.PIPE
     )
@@ -44,7 +44,7 @@ def slave() -> RtuSlave:
 
 
 async def answer_at(end: PtyEnd, speed: int) -> None:
-    """A device whose UART runs at `speed`: what is sent at another is noise to it."""
+    """A device whose UART runs at `speed`; data sent at a different speed is noise to it."""
     device, port = slave(), os.open(end.device, os.O_RDWR | os.O_NOCTTY)
     try:
         while True:

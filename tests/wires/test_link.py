@@ -1,4 +1,4 @@
-"""The emulated connection: bytes unchanged, in order, exactly once; carriers that come and go; bounds."""
+"""The emulated connection: bytes unchanged, in order, exactly once; carriers that are lost and restored; bounds."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ QUICK = LinkOptions(backoff_s=0.01, backoff_max_s=0.05, half_close_s=0.2, stall_
 
 
 class Driver:
-    """Whoever opens the virtual serial port: a bare descriptor."""
+    """A program that opens the virtual serial port: a bare descriptor."""
 
     def __init__(self, path: Path) -> None:
         self.fd = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
@@ -61,7 +61,7 @@ class Driver:
 
 
 class Far:
-    """The field side: a listening socket and the one client that it took in."""
+    """The emulator's side: a listening socket and its one client."""
 
     def __init__(self) -> None:
         self.listener = socket.create_server(("127.0.0.1", 0))
@@ -321,7 +321,7 @@ def test_two_links_are_a_serial_line_across_tcp(tmp_path: Path) -> None:
 
 
 def test_a_serial_device_as_the_near_side_unplugged_and_back(tmp_path: Path) -> None:
-    """A pty stands in for the device; its replacement comes under the same name."""
+    """A pty replaces the device; its replacement gets the same name."""
 
     async def main() -> None:
         device = tmp_path / "ttyUSB0"

@@ -1,4 +1,4 @@
-"""The emulated connection against socat, on either side, with the gateway's own serial port on the virtual ones."""
+"""The emulated connection against socat, on either side, with the gateway's serial port on the virtual ports."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ async def linked(near: Endpoint, far: Endpoint) -> AsyncIterator[tuple[Endpoint,
 
 
 async def talk(one: Path, other: Path) -> None:
-    """Bytes of every value, both ways at once, between two virtual serial ports that the gateway's end opens."""
+    """Send bytes of every value, in both directions at once, between two virtual serial ports opened by the gateway's end."""
     await eventually(lambda: os.path.lexists(one) and os.path.lexists(other))
     a = await SerialConnection.open(Endpoint.parse(f"rtu:{one}?frame=8N1"))
     b = await SerialConnection.open(Endpoint.parse(f"rtu:{other}?frame=8N1"))
@@ -64,7 +64,7 @@ async def talk(one: Path, other: Path) -> None:
 
 
 async def _until_through(a: SerialConnection, b: SerialConnection) -> None:
-    """The carrier may still be coming up; until then a line loses what is said on it. Then wait until it is quiet."""
+    """The carrier may still be starting; until then a line loses its data. Afterwards wait until it is quiet."""
 
     async def heard() -> bool:
         await a.write(b"?")

@@ -1,4 +1,4 @@
-"""Every function of the master over every transport, against an emulated unit on real ptys and sockets."""
+"""Every function of the client over every transport, against an emulated unit on real ptys and sockets."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ async def ask_everything(client: ModbusClient, unit: ModbusUnit, bank: MapBank, 
     await client.write_coil(7, 11, True)  # 05h
     assert (await client.read_bits(7, "coil", 9, 5)).bits == (False, True, True, True, False)  # 01h
     assert (await client.read_bits(7, "discrete", 0, 9)).bits == (False,) * 3 + (True,) + (False,) * 5  # 02h
-    await client.write_registers(7, 0, list(range(123)))  # 10h, as many as there can be
+    await client.write_registers(7, 0, list(range(123)))  # 10h, the maximum number
     await client.write_register(7, 1, 0xABCD)  # 06h
     assert (await client.read_registers(7, "holding", 0, 3)).registers == (0, 0xABCD, 2)  # 03h
     assert len((await client.read_registers(7, "holding", 0, 125)).registers) == 125
@@ -126,7 +126,7 @@ async def ask_everything(client: ModbusClient, unit: ModbusUnit, bank: MapBank, 
     assert [tuple(r) for r in spans.records] == [(2, 3), (0,)]
     fifos.push(0x04DE, 440, 4740)
     assert (await client.execute(7, ReadFifoQueue(0x04DE))).registers == (440, 4740)  # 18h
-    assert await client.read_identification(7, 3) == NAMES  # 2Bh/0Eh, in several answers
+    assert await client.read_identification(7, 3) == NAMES  # 2Bh/0Eh, in several replies
     echoed = await client.execute(7, UserFunction(0x41, b"\x01\x02\x03", CountedShape()))
     assert echoed.raw == b"\x03\x03\x02\x01"
     with pytest.raises(ModbusExceptionReply) as refused:

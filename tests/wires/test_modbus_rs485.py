@@ -1,4 +1,4 @@
-"""RS485 by the kernel: what is asked of the driver, and ports that have no such mode (a pty is one)."""
+"""RS485 by the kernel: the requests to the driver, and ports without such a mode (a pty is one)."""
 
 from __future__ import annotations
 

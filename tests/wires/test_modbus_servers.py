@@ -1,7 +1,7 @@
-"""The Modbus client against servers that share nothing with it: pymodbus, libmodbus (C) and pyModbusTCP.
+"""The Modbus client against servers that share no code with it: pymodbus, libmodbus (C) and pyModbusTCP.
 
-Over every wire that they speak: RTU inside TCP, ASCII, UDP and TLS with certificates (pymodbus), TCP and RTU (libmodbus),
-TCP (pyModbusTCP). pymodbus over TCP and RTU stands in test_modbus_interop.
+It covers every wire that they support: RTU over TCP, ASCII, UDP and TLS with certificates (pymodbus), TCP and RTU (libmodbus),
+TCP (pyModbusTCP). test_modbus_interop covers pymodbus over TCP and RTU.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ async def client_at(url: str) -> AsyncIterator[ModbusClient]:
 
 @contextmanager
 def null_modem() -> Iterator[tuple[str, str]]:
-    """Two ptys joined byte for byte; their slave ends stay open, so that nobody sees a hang-up."""
+    """Two ptys joined byte for byte; their slave ends remain open, so that neither program sees a hang-up."""
     pairs = [os.openpty(), os.openpty()]
     loop = asyncio.get_running_loop()
     for _, slave in pairs:
@@ -108,7 +108,7 @@ async def pymodbus_tls(directory: Path) -> AsyncIterator[ModbusClient]:
     context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH, cafile=pki.ca)
     context.load_cert_chain(pki.cert("server"), pki.key("server"))
     context.verify_mode = ssl.CERT_REQUIRED
-    # Its own TLS framer leaves out the MBAP header, against the specification: so the one of TCP.
+    # Its TLS framer omits the MBAP header, contrary to the specification, so the TCP framer is used.
     server = ModbusTlsServer(sim_device(), address=("127.0.0.1", 0), framer=FramerType.SOCKET, sslctx=context)
     await server.serve_forever(background=True)
     port = server.transport.sockets[0].getsockname()[1]  # type: ignore[attr-defined]
@@ -130,7 +130,7 @@ async def pymodbus_ascii(_: Path) -> AsyncIterator[ModbusClient]:
 
 @asynccontextmanager
 async def libmodbus(*arguments: str) -> AsyncIterator[str]:
-    """The program, running; gives its first line."""
+    """Run the program; return its first line."""
     if find_library("modbus") is None:
         pytest.skip("libmodbus is not installed")
     process = await asyncio.create_subprocess_exec(

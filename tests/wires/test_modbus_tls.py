@@ -1,4 +1,4 @@
-"""`TlsConnection` against a real TLS server: who is verified, what is said when it fails, roles, loss."""
+"""`TlsConnection` against a real TLS server: verification, error messages, roles, loss."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def pki(tmp_path_factory: pytest.TempPathFactory) -> Pki:
 
 
 def role_of(certificate: bytes | None) -> str:
-    """The role as the server's side reads it: behind its object identifier, by the tags of DER."""
+    """Return the role as the server's side reads it: after its object identifier, by the tags of DER."""
     _, _, rest = (certificate or b"").partition(b"\x06\x0b" + ROLE_OID)
     return rest[4 : 4 + rest[3]].decode() if rest else ""
 
@@ -44,7 +44,7 @@ def role_of(certificate: bytes | None) -> str:
 async def server(
     pki: Pki, name: str = "server", *, version: ssl.TLSVersion = ssl.TLSVersion.TLSv1_3, mutual: bool = True
 ) -> AsyncIterator[tuple[Endpoint, list[str]]]:
-    """A device behind TLS: unit 1, register 0 is 42; with no role in the client's certificate it refuses writes."""
+    """A device with TLS: unit 1, register 0 is 42; without a role in the client's certificate it refuses writes."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.load_cert_chain(pki.cert(name), pki.key(name))
     context.maximum_version = version
@@ -72,7 +72,7 @@ async def server(
     finally:
         listening.close()
         await listening.wait_closed()
-        await asyncio.sleep(0.02)  # the server's streams say goodbye
+        await asyncio.sleep(0.02)  # the server closes its streams in order
 
 
 def with_files(endpoint: Endpoint, **files: str) -> Endpoint:

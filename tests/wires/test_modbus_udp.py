@@ -1,4 +1,4 @@
-"""`UdpConnection` and the client on it, against real sockets: borders, loss, order, strangers, floods."""
+"""`UdpConnection` and the client on it, against real sockets: datagram boundaries, loss, order, foreign datagrams, floods."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ READ = bytes.fromhex("0000 0006 01 03 0000 0001")
 
 @contextlib.asynccontextmanager
 async def device() -> AsyncIterator[tuple[UdpConnection, socket.socket]]:
-    """A connection, and the bare socket that it talks to."""
+    """A connection, and the bare socket of its peer."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
         peer.bind(("127.0.0.1", 0))
         peer.setblocking(False)
@@ -88,7 +88,7 @@ def test_datagrams_that_wait_together_are_not_joined() -> None:
             client = ModbusClient.at(connection.endpoint, connection, WallClock())
             asking = asyncio.create_task(client.read_registers(1, "holding", 0, 1))
             data, sender = await request(peer)
-            peer.sendto(bytes.fromhex("0099 0000 000b 01 03 02"), sender)  # cut off: the rest is in no other datagram
+            peer.sendto(bytes.fromhex("0099 0000 000b 01 03 02"), sender)  # truncated: the rest is in no other datagram
             peer.sendto(adu(data[:2], 7), sender)
             assert (await asking).registers == (7,)
 

@@ -1,4 +1,4 @@
-"""The plant's Connector and the taps on it, on a real pty and a real socket."""
+"""The plant's Connector and its taps, on a real pty and a real socket."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def test_a_software_can_bus_is_joined_and_tapped() -> None:
 
 
 class Echo:
-    """A TCP server that sends back what it gets, first greeting."""
+    """A TCP server that first sends a greeting and then echoes."""
 
     async def __aenter__(self) -> Endpoint:
         self._ended = asyncio.Event()
@@ -119,7 +119,7 @@ class Echo:
 
 
 class Mapped(Connector):
-    """Opens another endpoint than the one it was asked for, as a prototype does."""
+    """Open an endpoint that differs from the requested one, as a prototype does."""
 
     def __init__(self, target: Endpoint) -> None:
         self.target = target
@@ -258,7 +258,7 @@ def test_a_capture_is_bounded_and_counts_what_it_dropped(tmp_path: Path) -> None
         file.on_bytes(PLANT, Direction.SENT, n, bytes([n]))
     assert capture.stream(PLANT, Direction.SENT) == b"\2\3\4"
     assert capture.dropped == 2
-    written = (tmp_path / "capture.jsonl").read_text()  # before it is closed: a crash would leave as much
+    written = (tmp_path / "capture.jsonl").read_text()  # before it is closed: a crash would leave the same
     assert len(written) <= 200
     assert file.dropped == 5 - len(written.splitlines()) > 0
     file.close()

@@ -1,4 +1,5 @@
-"""Functions that no standard knows: declared in a profile, answered by `fieldtwin emulate`, asked by our master and another."""
+"""Device-specific functions: declared in a profile, answered by `fieldtwin emulate`, requested by our client and a third-party
+one."""
 
 from __future__ import annotations
 
@@ -35,7 +36,7 @@ with serial.Serial(sys.argv[1], 9600, timeout=3, exclusive=True) as port:
         port.write(bytes.fromhex(frame))
         print(port.read(8).hex())
 """
-"""Nothing but the frames as they are published, check sums included."""
+"""Use only the published frames, with their checksums."""
 RESET, CLEAR = "0178000000016000", "0179000000015dc0"
 
 
@@ -102,7 +103,7 @@ def test_what_is_registered_goes_before_what_was_recorded_and_is_counted() -> No
 @pytest.mark.parametrize("piece", [1, 3, 8])
 @pytest.mark.parametrize("noise", ["", "00", "FF 00", "01 03"])
 def test_a_frame_of_its_own_that_looks_like_a_shorter_one_with_a_zero_behind_it(noise: str, piece: int) -> None:
-    factory_reset = bytes.fromhex("01 78 00 00 00 01 60 00")  # 01 78 00 00 00 with the check sum 01 60, and a 00
+    factory_reset = bytes.fromhex("01 78 00 00 00 01 60 00")  # 01 78 00 00 00 with the checksum 01 60, and a 00
     line = RtuSlave({1: a_rover()})
     heard = bytes.fromhex(noise) + factory_reset + bytes.fromhex("01 03 01 00 00 01 85 F6")
     replies = [r for i in range(0, len(heard), piece) for r in line.feed(heard[i : i + piece], 0)]
@@ -113,7 +114,7 @@ def test_a_recording_tells_how_long_functions_of_its_own_are() -> None:
     lengths = (("78 00 00 00 01", 5), ("78 01", 2), ("41 07", 2))
     made = [Exchange(i / 10, 1, bytes.fromhex(pdu), bytes.fromhex(pdu), 0.01) for i, (pdu, _) in enumerate(lengths)]
     unit = ReplayUnit(ExchangeReplay(made), 1)
-    assert unit.request_lengths == {0x41: 2}  # 78h came in two lengths
+    assert unit.request_lengths == {0x41: 2}  # 78h has two lengths
 
 
 def test_a_recorded_unit_can_be_busy() -> None:

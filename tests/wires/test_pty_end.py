@@ -1,4 +1,4 @@
-"""A virtual serial port as its other side sees it: through the operating system, opened by path."""
+"""A virtual serial port from its other side: through the operating system, opened by path."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LINE = Endpoint.parse("pty:line1")
 
 
 def open_port(path: Path) -> int:
-    """Open the port as a program does that trusts it to be raw already."""
+    """Open the port like a program that expects it to be raw already."""
     return os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
 
 
@@ -117,7 +117,7 @@ def test_it_can_be_opened_with_parity_again_and_again(tmp_path: Path) -> None:
                 return False
             return True
 
-        for _ in range(2):  # programs that open it and never say a word
+        for _ in range(2):  # programs that open it and send nothing
             await eventually(opens, within_s=2)
         await end.aclose()
 
@@ -127,7 +127,7 @@ def test_it_can_be_opened_with_parity_again_and_again(tmp_path: Path) -> None:
 def test_the_link_is_replaced_and_removed_only_by_its_owner(tmp_path: Path) -> None:
     async def main() -> None:
         link = tmp_path / "line1"
-        link.symlink_to("/dev/pts/none")  # left behind by a process that was killed
+        link.symlink_to("/dev/pts/none")  # left by a killed process
         first = await PtyEnd.open(link, LINE)
         assert os.readlink(link) == first.device
         second = await PtyEnd.open(link, LINE)
@@ -158,7 +158,7 @@ def test_closing_wakes_who_waits(tmp_path: Path) -> None:
     async def main() -> None:
         end = await PtyEnd.open(tmp_path / "line1", LINE)
         reading = asyncio.create_task(end.read())
-        writing = asyncio.create_task(end.write(bytes(1_000_000)))  # nobody reads: this waits
+        writing = asyncio.create_task(end.write(bytes(1_000_000)))  # no program reads: this waits
         await eventually(lambda: end._room is not None)
         await end.aclose()
         for task in (reading, writing):
@@ -195,7 +195,7 @@ def test_a_flood_is_held_back_and_nothing_is_lost(tmp_path: Path) -> None:
 
 
 def test_writing_goes_on_after_the_other_side_flushed(tmp_path: Path) -> None:
-    """A master that opens the port throws away what is in it; whoever waited for room must notice."""
+    """A client that opens the port discards its content; a writer that waits for room must notice."""
 
     async def main() -> None:
         end = await PtyEnd.open(tmp_path / "line1", LINE)
@@ -237,7 +237,7 @@ def test_a_paced_reply_takes_the_time_of_the_line(tmp_path: Path, settings: Seri
 
 
 def test_what_is_read_is_there_when_the_line_has_carried_it(tmp_path: Path) -> None:
-    """A device begins to think when it has heard the last character, and hears one request after the other."""
+    """A device starts to process a request after its last character, and receives one request after the other."""
 
     async def main() -> None:
         loop = asyncio.get_running_loop()
@@ -266,7 +266,7 @@ def test_what_is_read_is_there_when_the_line_has_carried_it(tmp_path: Path) -> N
 def test_an_answer_begins_so_long_after_the_last_character(
     tmp_path: Path, settings: SerialSettings | None, after_s: float
 ) -> None:
-    """A device's own time counts from the request's end on the line, and is never less than the silence of 3.5 characters."""
+    """The device's response time counts from the request's end on the line, and is at least the silence of 3.5 characters."""
 
     async def main() -> None:
         loop = asyncio.get_running_loop()
@@ -304,7 +304,7 @@ def test_a_port_that_closes_while_something_is_on_its_way_forgets_it(tmp_path: P
 
 
 def test_a_paced_reply_comes_in_pieces_as_it_is_sent(tmp_path: Path) -> None:
-    """A master that waits for the first byte must not wait for the last one."""
+    """A client that waits for the first byte must not have to wait for the last one."""
 
     async def main() -> None:
         end = await PtyEnd.open(tmp_path / "line1", LINE, SerialSettings(1200, "8N1"))

@@ -1,4 +1,4 @@
-"""RTU units on a virtual serial port and the TCP server, asked by strangers: mbpoll (libmodbus) and pymodbus."""
+"""RTU units on a virtual serial port and the TCP server, queried by third-party clients: mbpoll (libmodbus) and pymodbus."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def test_a_master_that_comes_and_goes(tmp_path: Path) -> None:
                 port = os.open(tmp_path / "line1", os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
                 os.write(port, READ)
                 assert await take(port, len(READ_REPLY)) == READ_REPLY
-                os.write(port, READ[:5])  # leaves in the middle of a request: MB-004
+                os.write(port, READ[:5])  # disconnects in the middle of a request: MB-004
                 os.close(port)
                 await eventually(
                     lambda turn=turn: slave.counters.noise_bytes == 5 * turn, what="half a request is given up"

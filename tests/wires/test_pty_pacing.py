@@ -29,7 +29,7 @@ def test_times_of_a_line(baudrate: int, frame: str, char_us: float, t3_5_us: flo
 
 
 def test_characters_queue_behind_each_other() -> None:
-    line = SerialPacer(SerialSettings(10_000, "8N1"))  # 1 ms a character
+    line = SerialPacer(SerialSettings(10_000, "8N1"))  # 1 ms per character
     assert line.earliest_end(5_000_000, 3) == 8_000_000
     assert line.earliest_end(5_000_000, 3) == 8_000_000, "asking takes no time on the line"
     assert line.send(5_000_000, 3) == 8_000_000

@@ -1,4 +1,4 @@
-"""A real pty stands in for a serial port: what it cannot show (parity on the wire, DTR) is not tested here."""
+"""A real pty replaces a serial port; its limits (no parity on the wire, no DTR) are not tested here."""
 
 from __future__ import annotations
 
@@ -65,7 +65,9 @@ async def collect(connection: SerialConnection, size: int) -> bytes:
 
 
 def test_every_byte_value_passes_both_ways_unchanged(line: Line) -> None:
-    every = bytes(range(256)) * 3  # XON, XOFF, ^C, CR, NL and 0xFF are what a badly set up line eats
+    every = (
+        bytes(range(256)) * 3
+    )  # XON, XOFF, ^C, CR, NL and 0xFF are the characters that a badly configured line removes
 
     async def main() -> None:
         connection = await SerialConnection.open(line.endpoint)
@@ -165,7 +167,7 @@ def test_permission_denied_names_the_group(tmp_path: Path) -> None:
 
 
 def _some_group() -> int:
-    """A group that this process may give a file to, preferably not root's."""
+    """Return a group to which this process may assign a file, preferably not root's."""
     return 20 if os.getuid() == 0 else os.getgid()
 
 
@@ -192,7 +194,7 @@ def test_unplugged_gives_what_arrived_and_then_the_loss(line: Line) -> None:  # 
             await connection.read()
         with pytest.raises(ConnectionLost):
             await connection.write(b"x")
-        with pytest.raises(OSError):  # closed at once: a lingering descriptor would cost the port its name
+        with pytest.raises(OSError):  # closed at once: an open descriptor would keep the port's name in use
             os.fstat(connection._fd)
         await connection.aclose()
 

@@ -1,4 +1,4 @@
-"""COM ports, as far as they can be tried here: the same port with threads instead of descriptors, and verbs without POSIX."""
+"""COM ports, as far as they can be tested here: the same port with threads instead of descriptors, and commands without POSIX."""
 
 from __future__ import annotations
 

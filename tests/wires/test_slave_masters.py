@@ -1,8 +1,8 @@
-"""Masters of other makes on the emulator's wires: pymodbus over ASCII and UDP, with the rarer functions.
+"""Third-party clients on the emulator's wires: pymodbus over ASCII and UDP, with the rarer functions.
 
-Not over TLS: it leaves out the MBAP header there, which MODBUS/TCP Security has.
+TLS is omitted, because pymodbus leaves out the MBAP header there, which MODBUS/TCP Security requires.
 
-And `fieldtwin emulate` as a user starts it, with one device on every kind of wire, read by our own driver's client.
+Also `fieldtwin emulate` as a user starts it, with one device on every kind of wire, read by our own driver's client.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ def make_unit() -> ModbusUnit:
 
 @contextlib.asynccontextmanager
 async def served(kind: str, unit: ModbusUnit, directory: Path) -> AsyncIterator[str]:
-    """The unit on a wire; gives what a master has to be told to find it."""
+    """Serve the unit on a wire; yields the endpoint for a client."""
     clock, units = WallClock(), {1: unit}
     end: PtyEnd | UdpEnd
     if kind == "ascii":

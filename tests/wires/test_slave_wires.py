@@ -94,7 +94,7 @@ async def ask_pty(path: Path, request: bytes, length: int) -> bytes:
 
 
 class UdpClient:
-    """A socket of the operating system: what the emulator's end must suit."""
+    """A socket of the operating system, which the emulator's end must work with."""
 
     def __init__(self) -> None:
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -167,7 +167,7 @@ def test_udp_each_datagram_for_itself() -> None:
     async def main() -> None:
         unit = make_unit()
         async with udp_server(unit) as (end, slave, client):
-            # cut off, length FFFFh, not Modbus, empty: none of them spoils the next one, or is joined to it
+            # truncated, length FFFFh, not Modbus, empty: none of them damages the next one, or is joined to it
             answer = await client.ask(
                 end.bound, READ[:5], READ[:4] + b"\xff\xff" + READ[6:], b"GET / HTTP/1.1", b"", READ
             )

@@ -1,4 +1,4 @@
-"""The slcan port over real TCP: python-can's own `slcan` interface, and a client that knows nothing but the bytes."""
+"""The slcan port over real TCP: python-can's own `slcan` interface, and a client that knows only the bytes."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_python_cans_slcan_both_ways() -> None:
     ]
 
     def program(channel: str) -> list[str]:
-        # python-can waits two seconds for an Arduino to boot unless told not to
+        # by default, python-can waits two seconds for an Arduino to boot
         with can.Bus(
             interface="slcan", channel=channel, bitrate=125_000, sleep_after_open=0, ignore_config=True, timeout=1
         ) as bus:

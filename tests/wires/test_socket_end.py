@@ -279,7 +279,7 @@ def test_a_client_that_does_not_read_its_answers_is_not_read_from_and_gets_all_o
         listener = await SocketListener.open(ANY_PORT, serve)
         reader, writer = await connect(listener)
         asked = 0
-        for _ in range(200):  # far more than the kernel's buffers hold: at some point nothing more is taken
+        for _ in range(200):  # far more than the kernel's buffers hold, so at some point no more is accepted
             writer.write(long_read * 500)
             asked += 500
             if writer.transport.get_write_buffer_size() > 1_000_000:

@@ -1,6 +1,6 @@
 """Kernel CAN: the plant's end and the emulators' end on vcan0, and on an slcan interface made of a pty.
 
-The slcan interface is what a virtual one cannot be: it has a bit rate, and a transmit queue that fills up.
+The slcan interface has two properties that a virtual one lacks: a bit rate, and a transmit queue that fills up.
 """
 
 from __future__ import annotations
@@ -139,7 +139,7 @@ class TestVcan:
             dump = await asyncio.create_subprocess_exec("candump", "-L", "-n", "1", "vcan0,605:7FF", stdout=-1)
             assert dump.stdout is not None
             line = asyncio.create_task(dump.stdout.readline())
-            while not line.done():  # it listens at some time after it was started
+            while not line.done():  # it listens at some time after its start
                 await ours.send(CanFrame(0x605, b"\x40\x00\x10\x00\0\0\0\0"))
                 await asyncio.wait([line], timeout=0.2)
             assert line.result().split()[-1] == b"605#4000100000000000"
@@ -188,7 +188,7 @@ class TestVcan:
 
 @contextmanager
 def slcan(bitrate: int) -> Iterator[tuple[str, int]]:
-    """An slcan interface on a pty: its name, and the pty's master, where the adapter would be."""
+    """An slcan interface on a pty: its name, and the pty's master side, which represents the adapter."""
     master, slave = pty.openpty()
     try:
         tty.setraw(slave)
@@ -198,7 +198,7 @@ def slcan(bitrate: int) -> Iterator[tuple[str, int]]:
         ip("link", "set", name, "type", "can", "bitrate", str(bitrate))
         ip("link", "set", name, "txqueuelen", "10")
         os.set_blocking(master, False)
-        # The driver tells the adapter the bit rate and waits until that is read: the pty wakes a writer only then.
+        # The driver sends the adapter the bit rate and waits until that is read: the pty wakes a writer only then.
         with subprocess.Popen(["ip", "link", "set", name, "up"]) as bringing_up:
             while bringing_up.poll() is None:
                 if select.select([master], [], [], 0.05)[0]:
@@ -240,7 +240,7 @@ class TestSlcan:
 
                 sending = asyncio.create_task(send_all())
                 stuck_at = -1
-                while stuck_at != sent or sent == 0:  # nobody reads the adapter's side: it must come to a halt
+                while stuck_at != sent or sent == 0:  # the adapter's side is not read, so it must block
                     stuck_at = sent
                     await asyncio.sleep(0.3)
                 assert 0 < sent < count

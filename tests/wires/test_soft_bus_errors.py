@@ -1,4 +1,4 @@
-"""What nodes on the software CAN bus are told of their controllers, at each kind of end."""
+"""Error frames for nodes on the software CAN bus about their controllers, at each kind of end."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ def test_alone_on_a_bus_that_nobody_watches() -> None:
             assert [told_state(await alone.recv()) for _ in range(2)] == [WARNING, PASSIVE]
             await eventually(lambda: server.bus_stats()["nodes"][0]["state"] == "error-passive")
             late = await open_can_end(server.bound, 0)
-            assert str(await late.recv()) == "705#00"  # sent until somebody took it
+            assert str(await late.recv()) == "705#00"  # sent until a node acknowledged it
             assert told_state(await alone.recv()) is WARNING  # 127
             for end in (late, alone):
                 await end.aclose()

@@ -1,4 +1,4 @@
-"""The software bus as an interface of python-can: programs that know nothing of fieldtwin join it."""
+"""The software bus as an interface of python-can: programs without knowledge of fieldtwin join it."""
 
 from __future__ import annotations
 
@@ -136,7 +136,9 @@ def test_periodic_sending_until_it_is_stopped() -> None:
             times = [(await other.recv()).t_ns for _ in range(20)]
             task.stop()
             assert times == sorted(times)
-            assert (times[-1] - times[0]) / 1e9 > 0.1  # 19 periods; a loaded computer stretches them, and never hurries
+            assert (
+                times[-1] - times[0]
+            ) / 1e9 > 0.1  # 19 periods; a loaded computer stretches them, but never shortens them
             await leave(a)
             await other.aclose()
 
@@ -176,7 +178,7 @@ def test_what_is_sent_last_is_not_lost_by_leaving() -> None:
         async with bus(50_000) as server:
             watch, a = server.attach(), await join(server)
             for _ in range(5):
-                await watch.send(CanFrame(0x1))  # unread by a
+                await watch.send(CanFrame(0x1))  # not read by a
             for i in range(200):
                 await asyncio.to_thread(a.send, can.Message(arbitration_id=0x100 + i, is_extended_id=False))
             await leave(a)
@@ -187,7 +189,7 @@ def test_what_is_sent_last_is_not_lost_by_leaving() -> None:
 
 def test_a_send_that_the_bus_does_not_take_times_out_and_is_not_sent() -> None:
     async def main() -> None:
-        async with bus(100, queue_frames=1) as server:  # 1 s a frame: nothing is taken for a while
+        async with bus(100, queue_frames=1) as server:  # 1 s per frame: no frame is accepted for a while
             a = await join(server)
 
             def flood() -> int:
@@ -198,7 +200,7 @@ def test_a_send_that_the_bus_does_not_take_times_out_and_is_not_sent() -> None:
                         return i
                 raise AssertionError("the bus took a million frames")
 
-            # What the sockets hold is all that can be under way: some hundred frames, not minutes of them.
+            # At most the content of the sockets can be in transit: some hundred frames, not minutes of them.
             assert 1 < await asyncio.to_thread(flood) < 500
             assert server.bus_stats()["nodes"][0]["queued"] == 1
             await leave(a)

@@ -217,7 +217,7 @@ def test_a_slow_receiver_overruns_alone_and_stalls_nobody() -> None:
             slow_node, a_node, b_node = server.bus_stats()["nodes"]
             assert (a_node["sent"], b_node["received"], b_node["overruns"]) == (sent, sent, 0)
             assert server.bus_stats()["overruns"] == slow_node["overruns"] >= 100
-            # What it did get is whole and in order, with a gap where it overran.
+            # The received frames are complete and in order, with a gap where it overran.
             slow.settimeout(5)
             received = slow.recv(RECORD_SIZE, socket.MSG_WAITALL)
             assert unpack_hello(received) is not None

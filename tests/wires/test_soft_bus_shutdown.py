@@ -1,6 +1,6 @@
 """`shutdown()` of the python-can interface while another thread is in `recv`.
 
-Observed: if a program shut the bus down before it stopped its Notifier, the Notifier's thread raised a CanOperationError.
+Defect: if a program shut the bus down before it stopped its Notifier, the Notifier's thread raised a CanOperationError.
 """
 
 from __future__ import annotations

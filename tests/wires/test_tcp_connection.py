@@ -1,4 +1,4 @@
-"""`TcpConnection` against real sockets that behave and misbehave."""
+"""`TcpConnection` against real sockets that behave correctly or incorrectly."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_bytes_pass_both_ways_and_the_socket_is_tuned() -> None:
 def test_refused_says_that_nobody_listens() -> None:
     async def main() -> None:
         with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))  # bound and not listening: nobody else can take the port meanwhile
+            free.bind(("127.0.0.1", 0))  # bound and not listening: no other program can take the port meanwhile
             endpoint = Endpoint("tcp", host="127.0.0.1", port=free.getsockname()[1])
             with pytest.raises(Unreachable, match="refused"):
                 await TcpConnection.open(endpoint)

@@ -1,4 +1,4 @@
-"""Digital threads over a broker with TLS: whom it lets in, whom we trust, what a user may do there; against a real mosquitto."""
+"""Digital threads over a broker with TLS: accepted clients, verified brokers, permissions of a user; against a real mosquitto."""
 
 from __future__ import annotations
 
@@ -47,9 +47,9 @@ def pki(tmp_path_factory: pytest.TempPathFactory) -> Pki:
 
 
 def strict(folder: Path, pki: Pki, *more: str) -> tuple[str, ...]:
-    """Settings of a broker that asks for a certificate, a user and a password, and lets each do what is his."""
+    """Settings of a broker that requires a certificate, a user and a password, and restricts each user to its own topics."""
     passwords = folder / "passwords"
-    program()  # skips where there is none
+    program()  # skips if it is missing
     tool = shutil.which("mosquitto_passwd") or "mosquitto_passwd"
     for first, user in enumerate(("plant", "shore")):
         subprocess.run(
@@ -114,7 +114,8 @@ def test_whom_the_broker_does_not_want_hears_why(tmp_path: Path, pki: Pki, monke
             assert "the broker refuses: Not authorized" in await refused(url(here, pki, "plant"), "wrong-word")
             trusting_others = url(here, pki, "plant").replace(pki.ca, stranger.ca)
             assert "the broker's certificate is refused: " in await refused(trusting_others, "plant-word")
-            monkeypatch.setattr(thread_mqtt, "TIMEOUT_S", 0.5)  # TLS 1.3: we may say CONNECT before it refuses
+            # TLS 1.3: the client may send CONNECT before the broker refuses
+            monkeypatch.setattr(thread_mqtt, "TIMEOUT_S", 0.5)
             with pytest.raises(Unreachable, match="the broker ends the connection: tlsv13 alert certificate required"):
                 await (await plant(url(here, pki, "plant", certificate=False))).open()
             with pytest.raises(Unreachable, match="does it want mqtts://"):
@@ -126,7 +127,7 @@ def test_whom_the_broker_does_not_want_hears_why(tmp_path: Path, pki: Pki, monke
 def test_a_twin_that_is_refused_ends_and_a_plant_that_is_refused_waits(
     tmp_path: Path, pki: Pki, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A plant's thread keeps its log meanwhile: somebody may put the password right at the broker."""
+    """A plant's thread keeps its log meanwhile, because the password may be corrected at the broker."""
 
     async def main() -> None:
         with broker(tmp_path, *strict(tmp_path, pki)) as here:
@@ -153,7 +154,7 @@ def test_a_broker_without_tls_is_asked_about(tmp_path: Path, pki: Pki) -> None:
 
 
 def test_a_topic_that_we_may_not_hear_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    """mosquitto grants every subscription and keeps back what comes; other brokers answer SUBACK with 0x80 (MQTT 3.9.3)."""
+    """mosquitto grants every subscription and withholds messages; other brokers answer SUBACK with 0x80 (MQTT 3.9.3)."""
 
     gone = asyncio.Event()
 

@@ -1,4 +1,5 @@
-"""A digital thread between two computers: over TLS, where both sides show a certificate; plain TCP stays on one."""
+"""A digital thread between two computers: over TLS, where both sides present a certificate; plain TCP is limited to one
+computer."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Captures as pcap files: what a tap wrote comes back, and what is made up around it is well made."""
+"""Captures as pcap files: the content of a tap is complete, and the generated headers around it are valid."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def test_a_capture_that_is_not_there_is_refused(tmp_path: Path) -> None:
 
 
 def read_pcap(path: Path) -> tuple[int, list[tuple[int, bytes]]]:
-    """Link type, and times in ns with packets, read by the format's own description."""
+    """Return link type, and times in ns with packets, read by the format's own description."""
     data = path.read_bytes()
     magic, major, minor, _, _, _, link = struct.unpack_from(">IHHiIII", data)
     assert (magic, major, minor) == (0xA1B23C4D, 2, 4)
@@ -131,7 +131,7 @@ chunks = st.lists(st.tuples(st.sampled_from([S, R]), st.binary(min_size=1, max_s
 
 @given(chunks)
 def test_a_tcp_stream_survives_its_segments(said: list[tuple[Direction, bytes]]) -> None:
-    """Put together by sequence numbers, every byte is there, in order, under good check sums."""
+    """Reassembled by sequence numbers, every byte is present, in order, with correct checksums."""
     captured = [Captured(1000 * i + 10, TCP, d, data) for i, (d, data) in enumerate(said)]
     streams: dict[bytes, bytes] = {}
     next_sequence: dict[bytes, int] = {}

@@ -1,7 +1,8 @@
-"""An independent ctd: libmodbus as the RTU server, a register map kept by hand, samples out of a table.
+"""An independent ctd: libmodbus as the RTU server, a handwritten register map, samples from a table.
 
-Run as ``python ctd_libmodbus.py PORT TABLE [--plant ...]``. TABLE is JSON: a list of [milliseconds, pressure, temperature,
-conductivity], one row a sample. Written from the reference profile's text; shares nothing with this project.
+Run as ``python ctd_libmodbus.py PORT TABLE [--plant ...]``. TABLE is JSON: a list of [milliseconds, pressure,
+temperature, conductivity], one row per sample. It was written from the text of the reference profile and shares no code
+with this project.
 """
 
 import argparse
@@ -51,7 +52,8 @@ def library():
 
 
 class Ctd:
-    """The instrument: takes a row of its table every `period` seconds while that is positive, the first at once."""
+    """The instrument: takes a row of its table every `period` seconds while the period is positive, the first one at
+    once."""
 
     def __init__(self, mapping, rows, swapped):
         self.inputs, self.holding = mapping.contents.tab_input_registers, mapping.contents.tab_registers
@@ -78,7 +80,7 @@ class Ctd:
             self.next += self.period
 
     def written(self, now):
-        """The period may have been written: a new one starts at once."""
+        """If the period was written, a new one starts at once."""
         self.period = struct.unpack(">h", struct.pack(">H", self.holding[1]))[0]
         self.holding[0] = SAMPLING if self.period > 0 else STANDBY if self.period == 0 else OFF
         self.next = now
@@ -86,7 +88,7 @@ class Ctd:
 
 
 def refusal(pdu):
-    """The exception code that the instrument's manual asks for, 0 for none."""
+    """Return the exception code that the instrument's manual requires, or 0."""
     function, address, count = struct.unpack(">BHH", pdu[:5])
     if function not in FUNCTIONS:
         return ILLEGAL_FUNCTION

@@ -1,8 +1,9 @@
-"""An independent inclinometer: a bare python-can program that answers SDO requests out of a table, beats and sends TPDO1.
+"""An independent inclinometer: a bare python-can program that answers SDO requests from a table and sends heartbeats
+and TPDO1.
 
-Run as ``python inclinometer_can.py INTERFACE CHANNEL TABLE ROWS [--plant abort]``. TABLE is YAML (inclinometer.yaml
-beside this), ROWS is JSON: a list of [slope long, slope lateral] in hundredths of a degree, one row a TPDO. Any interface that
-python-can knows will do.
+Run as ``python inclinometer_can.py INTERFACE CHANNEL TABLE ROWS [--plant abort]``. TABLE is YAML (inclinometer.yaml in
+this folder), ROWS is JSON: a list of [slope long, slope lateral] in hundredths of a degree, one row per TPDO. It works
+with any interface that python-can knows.
 """
 
 import argparse

@@ -1,10 +1,10 @@
-"""An independent modem: a socket that answers bytes with bytes out of a table. It knows no Modbus beyond the MBAP header.
+"""An independent modem: a socket that answers bytes with bytes from a table. It knows no Modbus beyond the MBAP header.
 
 Run as ``python modem_bytes.py TABLE [--plant byte]``. TABLE is YAML:
 
-replies   request PDU -> reply PDU, in hex
-once      used up, in order: when a request PDU begins with `request`, answer `reply`, and `then` changes replies
-events    by name: what changes when that name comes in as a line on stdin
+  replies   request PDU -> reply PDU, in hex
+  once      used in order and then removed: if a request PDU begins with `request`, answer `reply`, and `then` changes replies
+  events    by name: the changes to make when that name arrives as a line on stdin
 """
 
 import argparse

@@ -9,6 +9,7 @@ from fieldtwin.gateway.core.clock import NS_PER_MS
 from fieldtwin.gateway.protocols.canopen.boot import Configuration, ExpectedIdentity
 from fieldtwin.gateway.protocols.canopen.configure import PdoConfig
 from fieldtwin.gateway.protocols.canopen.lss import LssAddress
+from fieldtwin.gateway.protocols.canopen.sdo import WHOLE_S
 
 
 @dataclass(frozen=True)
@@ -16,13 +17,15 @@ class CanopenBusConfig:
     """The master of a bus: SYNC every `sync_ms` with a counter up to `sync_counter` (0: no counter), TIME every
     `time_ms`; 0: never.
 
-    `short_sdo`: accept replies of fewer than 8 bytes, as old controllers send them.
+    `short_sdo`: accept replies of fewer than 8 bytes, as old controllers send them. `sdo_transfer_s`: the longest time
+    for a whole SDO transfer, in seconds.
     """
 
     sync_ms: int = 0
     sync_counter: int = 0
     time_ms: int = 0
     short_sdo: bool = False
+    sdo_transfer_s: float = WHOLE_S
 
 
 @dataclass(frozen=True)
@@ -43,7 +46,7 @@ class CanopenNodeConfig:
     `lss`: the LSS address by which the node gets its node ID if no node has that ID. `tpdos`: the process data that the
     node sends, from its DCF; None if `adopt_tpdos` asks to read them from the node, or if nothing is configured.
     `rpdos` and `adopt_rpdos`: the same for the process data that the node receives; `rpdo1`: how its RPDO1 is to be
-    configured.
+    configured. `sdo_transfer_s`: as of the bus, for this node; None: the bus's.
     """
 
     identity: ExpectedIdentity = field(default_factory=ExpectedIdentity)
@@ -55,6 +58,7 @@ class CanopenNodeConfig:
     rpdo1: RpdoConfig | None = None
     rpdos: tuple[PdoConfig, ...] | None = None
     adopt_rpdos: bool = False
+    sdo_transfer_s: float | None = None
 
 
 def cycle_period_ns(bus: CanopenBusConfig, nodes: Iterable[CanopenNodeConfig]) -> int:

@@ -160,6 +160,7 @@ class CanopenDriver(DeviceDriver):
             heartbeat_consumer_ms=consumer_ms,
             sdo_timeout_s=self.config.timeout_s,
             sdo_retries=self.config.retries,
+            sdo_transfer_s=self.config.canopen.sdo_transfer_s,
         )
 
     # -- bringing the node up (CiA 302-2, boot slave) ---------------------------------------------------------------

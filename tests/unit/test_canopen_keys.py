@@ -43,14 +43,15 @@ def test_what_the_keys_become(tmp_path: Path) -> None:
     system = load_system(
         write(
             tmp_path,
-            BUS="sync: {period_ms: 100, counter: 240}, time_ms: 60000, short_sdo: true",
-            NODE=f"{who}, lss: true, dcf: node5.dcf, store: true, tpdos: dcf",
+            BUS="sync: {period_ms: 100, counter: 240}, time_ms: 60000, short_sdo: true, sdo_transfer_ms: 30000",
+            NODE=f"{who}, sdo_transfer_ms: 2500, lss: true, dcf: node5.dcf, store: true, tpdos: dcf",
         )
     )
-    assert system.buses["can0"].canopen == CanopenBusConfig(100, 240, 60_000, True)
+    assert system.buses["can0"].canopen == CanopenBusConfig(100, 240, 60_000, True, 30.0)
     boot = system.devices["incl"].canopen
     assert boot.identity == ExpectedIdentity(None, 1, 16, 3, 4)
     assert boot.lss == LssAddress(1, 16, 3, 4)
+    assert boot.sdo_transfer_s == 2.5
     assert boot.dcf == "node5.dcf"
     assert boot.configuration is not None
     assert (len(boot.configuration.settings), boot.configuration.store, boot.configuration.date) == (9, True, None)
@@ -60,6 +61,7 @@ def test_what_the_keys_become(tmp_path: Path) -> None:
     plain = load_system(write(tmp_path, NODE="tpdos: node"))
     assert plain.devices["incl"].canopen.adopt_tpdos
     assert plain.buses["can0"].canopen == CanopenBusConfig()
+    assert plain.devices["incl"].canopen.sdo_transfer_s is None
 
 
 RPDO1 = "writable: [controlword, target_velocity, mode], rpdo1: "
@@ -111,6 +113,9 @@ def test_what_is_wrong_with_outputs_is_said_with_its_line(tmp_path: Path, node: 
     [
         ({"BUS": "sync: {period_ms: 10, counter: 1}"}, "2 to 240"),
         ({"LAN": "sync: {period_ms: 10}"}, "a CAN bus"),
+        ({"LAN": "sdo_transfer_ms: 100"}, "a CAN bus"),
+        ({"CTD": "sdo_transfer_ms: 100"}, "a CANopen node"),
+        ({"NODE": "sdo_transfer_ms: 0"}, "at least 1"),
         ({"CTD": "dcf: node5.dcf"}, "a CANopen node"),
         ({"CTD": "rpdos: node"}, "a CANopen node"),
         ({"CTD": "rpdo1: {map: [sample_period_s]}"}, "a CANopen node"),

@@ -22,8 +22,8 @@ from fieldtwin.gateway.protocols.canopen.pdo import PDO_BITS
 from fieldtwin.twin.site.data_files import find
 from fieldtwin.twin.site.schema import BusForm, DeviceForm, IdentityForm
 
-CANOPEN_BUS_KEYS = ("sync", "time_ms", "short_sdo")
-CANOPEN_KEYS = ("identity", "dcf", "store", "lss", "tpdos", "rpdo1", "rpdos")
+CANOPEN_BUS_KEYS = ("sync", "time_ms", "short_sdo", "sdo_transfer_ms")
+CANOPEN_KEYS = ("sdo_transfer_ms", "identity", "dcf", "store", "lss", "tpdos", "rpdo1", "rpdos")
 
 
 def canopen_bus(file: YamlFile, name: str, form: BusForm, *, is_can: bool) -> CanopenBusConfig:
@@ -38,6 +38,7 @@ def canopen_bus(file: YamlFile, name: str, form: BusForm, *, is_can: bool) -> Ca
         sync_counter=counter,
         time_ms=form.time_ms or 0,
         short_sdo=form.short_sdo,
+        sdo_transfer_s=form.sdo_transfer_ms / 1000,
     )
 
 
@@ -60,6 +61,7 @@ def canopen_node(
         rpdo1=_rpdo1(form),
         rpdos=rpdos_of(dictionary) if dictionary is not None and form.rpdos == "dcf" else None,
         adopt_rpdos=form.rpdos == "node",
+        sdo_transfer_s=form.sdo_transfer_ms / 1000 if form.sdo_transfer_ms else None,
     )
 
 

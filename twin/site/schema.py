@@ -50,6 +50,7 @@ class BusForm(Strict):
     sync: SyncForm | None = None
     time_ms: Milliseconds | None = Field(default=None, description="CANopen: how often TIME is sent")
     short_sdo: bool = Field(default=False, description="CANopen: take SDO replies of fewer than 8 bytes")
+    sdo_transfer_ms: Milliseconds = Field(default=600_000, description="CANopen: limit of a whole SDO transfer")
 
 
 class PollForm(Strict):
@@ -123,6 +124,7 @@ class DeviceForm(Strict):
     )
     heartbeat: HeartbeatForm | None = None
     tpdo1: TpdoForm | None = None
+    sdo_transfer_ms: Milliseconds | None = Field(default=None, description="CANopen: default: the bus's")
     identity: IdentityForm | None = None
     dcf: str | None = Field(default=None, description="CANopen: what the node shall hold, written unless it does")
     store: bool = Field(default=False, description="CANopen: let the node keep its DCF over a restart")

@@ -25,7 +25,7 @@ from fieldtwin.gateway.core.latency import Latencies
 from fieldtwin.gateway.protocols.canopen import abort_codes, cob_id, nmt
 from fieldtwin.gateway.protocols.canopen.heartbeat import HeartbeatConsumer
 from fieldtwin.gateway.protocols.canopen.nmt import NmtCommand, NmtState, NodeEvent, conflict_text
-from fieldtwin.gateway.protocols.canopen.sdo import SdoDownload, SdoTransfer, SdoUpload
+from fieldtwin.gateway.protocols.canopen.sdo import WHOLE_S, SdoDownload, SdoTransfer, SdoUpload, TransferTooLong
 from fieldtwin.gateway.protocols.canopen.sdo_block import SdoBlockDownload, SdoBlockUpload
 from fieldtwin.gateway.protocols.canopen.sdo_channel import Counters, SdoChannel
 
@@ -51,7 +51,9 @@ class CanopenMaster:
     not hidden.
 
     `sdo_timeout_s` is the timeout for each SDO reply of a node without its own setting. `sdo_retries` is how often an
-    upload without a valid reply is repeated. `short_sdo` also accepts SDO replies of fewer than 8 bytes (CO-026).
+    upload without a valid reply is repeated. `sdo_transfer_s` is the longest time for a whole SDO transfer, in seconds;
+    a transfer that reaches it ends with `ReplyTimeout` and is not repeated. `short_sdo` also accepts SDO replies of
+    fewer than 8 bytes (CO-026).
     """
 
     def __init__(
@@ -61,6 +63,7 @@ class CanopenMaster:
         *,
         sdo_timeout_s: float = 0.5,
         sdo_retries: int = 0,
+        sdo_transfer_s: float = WHOLE_S,
         short_sdo: bool = False,
         on_event: EventCallback | None = None,
     ) -> None:
@@ -75,9 +78,11 @@ class CanopenMaster:
         self._clock = clock
         self._sdo_timeout_s = sdo_timeout_s
         self._sdo_retries = sdo_retries
+        self._sdo_transfer_s = sdo_transfer_s
         self._short_sdo = short_sdo
         self._timeouts_s: dict[int, float] = {}
         self._retries: dict[int, int] = {}
+        self._transfers_s: dict[int, float] = {}
         self._heartbeat = HeartbeatConsumer()
         self._channels: dict[int, SdoChannel] = {}
         self._pdos: dict[int, list[PdoCallback]] = {}
@@ -96,16 +101,19 @@ class CanopenMaster:
         heartbeat_consumer_ms: int = 0,
         sdo_timeout_s: float | None = None,
         sdo_retries: int | None = None,
+        sdo_transfer_s: float | None = None,
     ) -> None:
         """Register `node`; with a consumer time its heartbeat is monitored from the first one on.
 
-        If `sdo_timeout_s` and `sdo_retries` are None, the settings of the master apply.
+        If `sdo_timeout_s`, `sdo_retries` or `sdo_transfer_s` is None, the setting of the master applies.
         """
         self._channel(cob_id.check_node(node))
         if sdo_timeout_s is not None:
             self._timeouts_s[node] = sdo_timeout_s
         if sdo_retries is not None:
             self._retries[node] = sdo_retries
+        if sdo_transfer_s is not None:
+            self._transfers_s[node] = sdo_transfer_s
         self._heartbeat.monitor(node, heartbeat_consumer_ms)
         self._arm()
 
@@ -330,12 +338,13 @@ class CanopenMaster:
         for left in range(retries, -1, -1):
             transfer = make()
             transfer.tolerate_short = self._short_sdo
+            transfer.whole_ns = int(self._transfers_s.get(transfer.node, self._sdo_transfer_s) * NS_PER_S)
             try:
                 return await self._channel(transfer.node).run(transfer)
             except ConnectionLost:
                 raise
             except FieldtwinError as e:
-                if not (left and isinstance(e, ReplyTimeout | Desync)):
+                if not left or isinstance(e, TransferTooLong) or not isinstance(e, ReplyTimeout | Desync):
                     raise e.at(f"{self._where()} node {transfer.node}") from e.__cause__
                 self.counters.sdo_retries += 1
         raise Bug("retries without end", got=str(retries))

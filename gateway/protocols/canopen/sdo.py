@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.errors import Bug, Desync, FieldtwinError, ReplyTimeout, SdoAborted, UsageError
 from fieldtwin.gateway.protocols.canopen import abort_codes, cob_id
 
@@ -28,6 +29,11 @@ WHOLE_NS_PER_BYTE = 50_000_000
 """Limit of a whole transfer: this many of its timeouts, and this many nanoseconds for each transferred byte. Without
 this limit a node that sends one byte just before each timeout would occupy the client for days. A segment of 7 bytes
 takes 26 ms at 10 kbit/s.
+"""
+
+WHOLE_S = 600.0
+"""The longest whole transfer in seconds, if no other limit is stated. `MAX_BYTES` at the slowest rate above would take
+14.5 hours.
 """
 
 KNOWN_MAX_BYTES = 64
@@ -82,13 +88,20 @@ class Stray:
 Step = Send | Wait | Done | Failed | Stray
 
 
+class TransferTooLong(ReplyTimeout):
+    """The whole transfer reached its limit. The node answers, so a repetition would take as long again."""
+
+
 class SdoTransfer(ABC):
     """One transfer of one object with one node. After its end, every frame is a stray.
 
     `timeout_ns` is for each reply and starts again with every reply that advances the transfer (CO-022). The whole
-    transfer is limited by `WHOLE_TIMEOUTS` and `WHOLE_NS_PER_BYTE`. `answered` says whether the node has replied to the
-    initiate request (or aborted).
+    transfer is limited by `whole_ns`, and by `WHOLE_TIMEOUTS` and `WHOLE_NS_PER_BYTE`, whichever ends first. `answered`
+    says whether the node has replied to the initiate request (or aborted).
     """
+
+    whole_ns = int(WHOLE_S * NS_PER_S)
+    """The longest time for the whole transfer, in nanoseconds; if it is less than one timeout, one timeout."""
 
     tolerate_short = False
     """Whether a reply of fewer than 8 bytes is accepted and padded with zeros, because old PLCs omit them (CO-026)."""
@@ -173,13 +186,17 @@ class SdoTransfer(ABC):
 
     def _timed_out(self) -> Failed:
         self.over = True
-        if self.deadline_ns >= self._limit_ns:
+        return Failed(self._why_timed_out(), self.abort_frame(abort_codes.TIMED_OUT))
+
+    def _why_timed_out(self) -> ReplyTimeout:
+        if self.answered and self.deadline_ns >= self._limit_ns:
             took = f"{(self.deadline_ns - self._started_ns) / 1e9:g} s and {self._moved} bytes"
-            error = ReplyTimeout(f"{self.name}: not complete after {took}", hint="the node sends too little at a time")
-            return Failed(error, self.abort_frame(abort_codes.TIMED_OUT))
+            return TransferTooLong(
+                f"{self.name}: not complete after {took}",
+                hint="the node is too slow; `sdo_transfer_ms` in the system file limits a whole transfer",
+            )
         what = "between segments" if self.answered else "to the request"
-        error = ReplyTimeout(f"{self.name}: no reply {what} within {self.timeout_ns / 1e9:g} s")
-        return Failed(error, self.abort_frame(abort_codes.TIMED_OUT))
+        return ReplyTimeout(f"{self.name}: no reply {what} within {self.timeout_ns / 1e9:g} s")
 
     def abort_frame(self, code: int) -> CanFrame:
         """Return the frame by which this client aborts the transfer."""
@@ -218,7 +235,8 @@ class SdoTransfer(ABC):
     @property
     def _limit_ns(self) -> int:
         """Return when the whole transfer is given up."""
-        return self._started_ns + WHOLE_TIMEOUTS * self.timeout_ns + self._moved * WHOLE_NS_PER_BYTE
+        slowest_ns = WHOLE_TIMEOUTS * self.timeout_ns + self._moved * WHOLE_NS_PER_BYTE
+        return self._started_ns + min(max(self.whole_ns, self.timeout_ns), slowest_ns)
 
     @property
     @abstractmethod

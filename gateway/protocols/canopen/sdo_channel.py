@@ -164,8 +164,10 @@ class SdoChannel:
             return
         self._counters.sdo_probes += 1
         index, subindex = self._late.probe()
+        probe = SdoUpload(self._node, index, subindex, transfer.timeout_ns)
+        probe.whole_ns = transfer.whole_ns
         try:
-            await self._run(SdoUpload(self._node, index, subindex, transfer.timeout_ns))
+            await self._run(probe)
         except (SdoAborted, NodeRestarted):
             pass  # an answer, which is all that is needed, or no reply can arrive any more
         except ReplyTimeout as e:

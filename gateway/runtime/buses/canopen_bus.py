@@ -235,6 +235,7 @@ class CanopenBus:
                 self._clock,
                 sdo_timeout_s=self.config.timeout_s,
                 sdo_retries=self.config.retries,
+                sdo_transfer_s=self.config.canopen.sdo_transfer_s,
                 short_sdo=self.config.canopen.short_sdo,
                 on_event=self._on_event,
             )

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from fieldtwin.gateway.core.files.profile import load_profile as load_profile
     from fieldtwin.run.live.options import RunOptions as RunOptions
     from fieldtwin.run.live.session import RunSession as RunSession
-    from fieldtwin.run.live.summary import summarise as summarise
     from fieldtwin.twin.prototype.file import load_prototype as load_prototype
     from fieldtwin.twin.site.system import load_system as load_system
 
@@ -28,7 +27,6 @@ _PUBLIC = {
     "load_prototype": "fieldtwin.twin.prototype.file",
     "load_system": "fieldtwin.twin.site.system",
     "scan_can_bus": "fieldtwin.commissioning.scan.node_scan",
-    "summarise": "fieldtwin.run.live.summary",
 }
 
 __all__ = [
@@ -40,7 +38,6 @@ __all__ = [
     "load_prototype",
     "load_system",
     "scan_can_bus",
-    "summarise",
 ]
 
 

@@ -26,7 +26,6 @@ from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.run.live.network_session import NetworkOptions, NetworkSession
 from fieldtwin.run.live.network_summary import summarise_network
 from fieldtwin.run.live.session import RunSession
-from fieldtwin.run.live.summary import summarise
 from fieldtwin.run.processes.topside import Scripted, script
 from fieldtwin.run.template import agree
 from fieldtwin.run.virtual.network_run import VirtualNetworkOptions
@@ -174,7 +173,7 @@ async def _on_this_host(request: NetworkRequest, network: Network) -> int:
         elapsed_s = session.elapsed_s
     if not showing.cancelled() and (failed := showing.exception()) is not None:
         raise failed
-    systems = {name: summarise(one) for name, one in session.sessions.items()}
+    systems = {name: one.summary() for name, one in session.sessions.items()}
     ship = session.shore.describe() if session.shore is not None else None
     summary = summarise_network(network, systems, session.counters(), ship, [], session.faults.history.describe())
     summary["duration_s"] = round(elapsed_s, 3)

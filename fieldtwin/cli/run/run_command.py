@@ -21,7 +21,6 @@ from fieldtwin.cli.template_question import consent, trust_option
 from fieldtwin.gateway.core.errors import FieldtwinError, UsageError
 from fieldtwin.run.live.options import RunOptions
 from fieldtwin.run.live.session import RunSession
-from fieldtwin.run.live.summary import summarise
 from fieldtwin.run.processes.topside import DEFAULT_SCRIPT, parse_periods
 from fieldtwin.run.template import system_file
 from fieldtwin.service.attached import Service, ServiceOptions, check
@@ -408,7 +407,7 @@ async def _run(options: RunOptions, service_options: ServiceOptions, as_json: bo
             return 130
         raise
     notifier.close()
-    summary = summarise(session)
+    summary = session.summary()
     if as_json:
         json.dump(summary, sys.stdout, indent=2)
         sys.stdout.write("\n")

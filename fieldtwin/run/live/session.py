@@ -26,6 +26,7 @@ from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.results.trace import Trace
 from fieldtwin.run.live.options import RunOptions
 from fieldtwin.run.live.oracle import Oracle
+from fieldtwin.run.live.summary import RunFacts, summarise
 from fieldtwin.run.processes.children import Child
 from fieldtwin.run.processes.field_contact import FieldContact, contact_elsewhere, contact_here
 from fieldtwin.run.processes.field_return import FieldReturn, is_loss
@@ -147,6 +148,37 @@ class RunSession(Started):
     def calm(self) -> bool:
         """Return whether the run had no faults. How long recovery takes is for a scenario to check."""
         return not self.options.faults and not self.made_anew
+
+    def summary(self) -> dict[str, Any]:
+        """Return the verdict on the run, for `--json` and for printing. Call it after the run."""
+        invariants, shore = self.invariants, self.shore
+        return summarise(
+            RunFacts(
+                prototype=self.options.prototype,
+                system=self.system,
+                instance=self.instance.name,
+                elapsed_s=self.elapsed_s,
+                disturbed=self.disturbed,
+                calm=self.calm,
+                errors=tuple(self.errors),
+                gateway=self.gateway_status,
+                plc=self.plc_status,
+                field=self.field_status,
+                counted_before=self.counted_before,
+                clients_before=self.clients_before,
+                mapping=self.mapping,
+                published=self.oracle.describe(),
+                invariants=invariants.results() if invariants is not None else (),
+                invariant_errors=invariants.errors() if invariants is not None else (),
+                states=self.states.seen(),
+                topside=shore.describe() if shore is not None else None,
+                commands_sent=tuple(shore.commands_sent) if shore is not None else (),
+                outputs_confirmed_safe=self.outputs_confirmed_safe,
+                field_contact=self.field_return.describe() if self.field_return is not None else None,
+                thread=self.thread_status,
+                delegated=self.lent,
+            )
+        )
 
     # -- starting -------------------------------------------------------------------------------------------------------
 

@@ -2,111 +2,66 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
-from typing import Any, Protocol
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 from fieldtwin.__about__ import __version__
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.plc.task import StopReason
 from fieldtwin.results.trace import refusal_text
-from fieldtwin.run.processes.states import StateWatch, expected_states
-from fieldtwin.run.processes.topside import Shore
+from fieldtwin.run.processes.states import SeenStates, expected_states
 from fieldtwin.twin.site.system import System
 
 MOST_REFUSED = 10
 """Refused outputs that a summary names one by one."""
 
 
-class Options(Protocol):
-    @property
-    def prototype(self) -> bool: ...
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunFacts:
+    """The facts of a run that is over, of processes on this host or in virtual time."""
 
-
-class Named(Protocol):
-    @property
-    def name(self) -> str: ...
-
-
-class Oracle(Protocol):
-    """The comparison of published with held values."""
-
-    checked: int
-    wrong_count: int
-    wrong: list[str]
-
-    def describe(self) -> dict[str, Any]: ...
-
-
-class Invariants(Protocol):
-    """The check of the system file's invariants."""
-
-    def results(self) -> list[dict[str, Any]]: ...
-
-    def errors(self) -> list[str]: ...
-
-
-class Run(Protocol):
-    """A run that is over: of processes on this host, or in virtual time."""
-
-    @property
-    def invariants(self) -> Invariants | None:
-        """The check of the system file's invariants; None if the run had none."""
-        ...
-
-    @property
-    def options(self) -> Options: ...
-
-    @property
-    def system(self) -> System: ...
-
-    @property
-    def instance(self) -> Named: ...
-
-    @property
-    def errors(self) -> Iterable[str]: ...
-
-    @property
-    def oracle(self) -> Oracle: ...
-
-    @property
-    def states(self) -> StateWatch: ...
-
-    @property
-    def shore(self) -> Shore | None: ...
-
-    @property
-    def mapping(self) -> dict[Endpoint, Endpoint]: ...
-
-    @property
-    def gateway_status(self) -> dict[str, Any] | None: ...
-
-    @property
-    def plc_status(self) -> dict[str, Any] | None: ...
-
-    @property
-    def field_status(self) -> dict[str, Any] | None: ...
-
-    @property
-    def counted_before(self) -> dict[str, dict[str, int]]: ...
-
-    @property
-    def clients_before(self) -> dict[str, dict[str, dict[str, int]]]: ...
-
-    @property
-    def outputs_confirmed_safe(self) -> bool | None: ...
-
-    @property
-    def elapsed_s(self) -> float: ...
-
-    @property
-    def disturbed(self) -> bool:
-        """Return whether faults were injected: then the counts of both sides may differ."""
-        ...
-
-    @property
-    def calm(self) -> bool:
-        """Return whether the last fault has been over for long enough that the system must have recovered."""
-        ...
+    prototype: bool
+    system: System
+    instance: str
+    elapsed_s: float
+    disturbed: bool
+    """Faults were injected, or the simulated field devices were away or made anew: the counts of both sides may differ."""
+    calm: bool
+    """There were no faults, or the last one has been over for long enough that the system must have recovered."""
+    errors: Sequence[str]
+    """The errors that the run noted while it ran."""
+    gateway: Mapping[str, Any] | None
+    """The last status of the gateway; None if it did not answer at the end. `plc` and `field` likewise."""
+    plc: Mapping[str, Any] | None
+    field: Mapping[str, Any] | None
+    counted_before: Mapping[str, Mapping[str, int]]
+    """Per device, the requests and replies that its emulator had counted before the run; `clients_before` per bus and client."""
+    clients_before: Mapping[str, Mapping[str, Mapping[str, int]]]
+    mapping: Mapping[Endpoint, Endpoint]
+    """Where the endpoints of the plant lead in the prototype."""
+    published: Mapping[str, Any]
+    """How many published values were checked against those that the devices held, and the first wrong ones."""
+    wrong_messages: Sequence[str] = ()
+    """Commands that reached the gateway through a mailbox and should not have. A run of processes cannot see them."""
+    invariants: Sequence[Mapping[str, Any]] = ()
+    """The results of the system file's invariants, and the errors that follow from them."""
+    invariant_errors: Sequence[str] = ()
+    states: SeenStates
+    topside: Mapping[str, Any] | None = None
+    """The status of the topside controller; None if the run had none."""
+    commands_sent: Sequence[int] = ()
+    """The periods that the topside controller commanded, in order."""
+    outputs_confirmed_safe: bool | None
+    """None if there were no outputs to make safe."""
+    field_contact: Mapping[str, Any] | None = None
+    """The losses of a remote field simulator; None if it runs on this host."""
+    thread: Mapping[str, Any] | None = None
+    """The last status of the digital thread."""
+    delegated: str = ""
+    """The transmitter whose mailboxes the digital thread uses."""
+    may_refuse: Collection[str] = ()
+    """Tags of which a scenario expects that their outputs are refused."""
 
 
 GATEWAY_GONE = "the gateway did not answer at the end: what it published and what its outputs hold is not known"
@@ -114,48 +69,45 @@ NOT_CALM = "whether devices and outputs were good at the end, because faults wer
 """The message of a run that had faults until its end, or until shortly before."""
 
 
-def summarise(run: Run) -> dict[str, Any]:
+def summarise(run: RunFacts) -> dict[str, Any]:
     """Return plain data for `--json` and for printing. `ok` is False when any check failed; `errors` lists the reasons."""
-    gateway = run.gateway_status or {}
-    plc = run.plc_status or {}
+    gateway, plc, field = run.gateway or {}, run.plc or {}, run.field or {}
     exchanges = _exchanges(run)
     checks = [*_plc_checks(plc), *_loss_checks(gateway)]
-    if run.gateway_status is None:
+    if run.gateway is None:
         checks.append(GATEWAY_GONE)
+    disturbed = run.prototype and run.disturbed
     if run.calm:
-        checks = [*_device_checks(gateway, run.options.prototype and run.disturbed), *_output_checks(gateway), *checks]
-    if run.options.prototype:
-        checks += _oracle_checks(run) + ([] if run.disturbed else exchange_checks(exchanges) + _state_checks(run))
+        checks = [*_device_checks(gateway, disturbed), *_output_checks(gateway), *checks]
+    if run.prototype:
+        checks += _published_checks(run) + ([] if run.disturbed else exchange_checks(exchanges) + _state_checks(run))
     refusals = gateway.get("refusals", {})
-    checks += _refusal_checks(
-        refusals, getattr(run, "may_refuse", ()), disturbed=run.options.prototype and run.disturbed
-    )
-    invariants = run.invariants
-    errors = [*run.errors, *(invariants.errors() if invariants is not None else ()), *checks]
+    checks += _refusal_checks(refusals, run.may_refuse, disturbed=disturbed)
+    errors = [*run.errors, *run.invariant_errors, *checks]
     return {
         "fieldtwin": __version__,
         "system": run.system.name,
         "system_hash": run.system.hash,
-        "prototype": run.options.prototype,
-        "instance": run.instance.name,
+        "prototype": run.prototype,
+        "instance": run.instance,
         "duration_s": round(run.elapsed_s, 3),
         "warnings": list(run.system.warnings),
         "mapping": {str(plant): str(target) for plant, target in run.mapping.items()},
-        "devices": _devices(gateway, run.field_status or {}),
-        "states": {program: run.states.sequence(program) for program in run.states.programs},
+        "devices": _devices(gateway, field),
+        "states": {program: list(seen) for program, seen in run.states.sequences.items()},
         "transitions": {p: [[round(t, 3), s] for t, s in seen] for p, seen in run.states.transitions.items()},
         "exchanges": exchanges,
-        "faults": (run.field_status or {}).get("struck", []),
-        "published": {"values": gateway.get("published"), **run.oracle.describe()},
+        "faults": field.get("struck", []),
+        "published": {"values": gateway.get("published"), **run.published},
         "mailboxes": gateway.get("mailboxes", {}),
-        "far_end": run.shore.describe() if run.shore else None,
-        "field": back.describe() if (back := getattr(run, "field_return", None)) else None,
-        "thread": getattr(run, "thread_status", None),
+        "far_end": run.topside,
+        "field": run.field_contact,
+        "thread": run.thread,
         "learnt": gateway.get("learnt", {}),
         "logged": gateway.get("logged", 0),
         "writes": gateway.get("writes", {}),
         "refused": refusals.get("entries", []),
-        "invariants": invariants.results() if invariants is not None else [],
+        "invariants": list(run.invariants),
         "outputs_safe": run.outputs_confirmed_safe,
         "plc": {
             k: plc[k]
@@ -183,7 +135,7 @@ def summarise(run: Run) -> dict[str, Any]:
     }
 
 
-def _devices(gateway: dict[str, Any], field: dict[str, Any]) -> dict[str, Any]:
+def _devices(gateway: Mapping[str, Any], field: Mapping[str, Any]) -> dict[str, Any]:
     """Return the state of each device, and the model or recording that replaced it, if any."""
     emulated = field.get("devices", {})
     return {
@@ -193,9 +145,9 @@ def _devices(gateway: dict[str, Any], field: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _exchanges(run: Run) -> dict[str, Any]:
+def _exchanges(run: RunFacts) -> dict[str, Any]:
     """Return the requests and replies per bus, as counted by the gateway and by its emulators."""
-    gateway, field = run.gateway_status or {}, run.field_status or {}
+    gateway, field = run.gateway or {}, run.field or {}
     out: dict[str, Any] = {}
     for name, bus in gateway.get("buses", {}).items():
         counters = bus["counters"]
@@ -230,7 +182,7 @@ def _exchanges(run: Run) -> dict[str, Any]:
                 # before the counts are read, so it may have one request in progress at each node.
                 row["under_way"] = len(devices) if can else 0
                 row["emulators"] = {what: number - others[what] for what, number in row["emulators"].items()}
-        if any(d.name == getattr(run, "lent", "") for d in devices):
+        if any(d.name == run.delegated for d in devices):
             row["shared"] = "the digital thread"
         out[name] = row
     return out
@@ -246,7 +198,7 @@ def unanswered_at_stop(row: dict[str, Any], devices: int) -> int:
 
 
 def _others(
-    bus: dict[str, Any], clients: dict[str, dict[str, int]], before: dict[str, dict[str, int]]
+    bus: Mapping[str, Any], clients: Mapping[str, Mapping[str, int]], before: Mapping[str, Mapping[str, int]]
 ) -> dict[str, int]:
     """Return the traffic of third parties with the emulators of a bus: that of clients whose address is not the gateway's.
 
@@ -291,7 +243,7 @@ def exchange_checks(exchanges: dict[str, Any]) -> list[str]:
     return failed
 
 
-def _device_checks(gateway: dict[str, Any], disturbed: bool) -> list[str]:
+def _device_checks(gateway: Mapping[str, Any], disturbed: bool) -> list[str]:
     """Return the errors of devices.
 
     A fault that doubles frames looks like two nodes with one ID, so this is not an error when the run is `disturbed`.
@@ -303,7 +255,7 @@ def _device_checks(gateway: dict[str, Any], disturbed: bool) -> list[str]:
     ]
 
 
-def _output_checks(gateway: dict[str, Any]) -> list[str]:
+def _output_checks(gateway: Mapping[str, Any]) -> list[str]:
     """Return the outputs that an online device does not hold at the end, although they may be written."""
     devices = gateway.get("devices", {})
     return [
@@ -316,7 +268,7 @@ def _output_checks(gateway: dict[str, Any]) -> list[str]:
     ]
 
 
-def _refusal_checks(refusals: dict[str, Any], expected: Collection[str], *, disturbed: bool) -> list[str]:
+def _refusal_checks(refusals: Mapping[str, Any], expected: Collection[str], *, disturbed: bool) -> list[str]:
     """Return the errors of refused outputs of programs.
 
     A refusal counts if the program or the configuration is wrong, and, in a run without faults, if the device refused.
@@ -335,7 +287,7 @@ def _refusal_checks(refusals: dict[str, Any], expected: Collection[str], *, dist
     return told
 
 
-def _plc_checks(plc: dict[str, Any]) -> list[str]:
+def _plc_checks(plc: Mapping[str, Any]) -> list[str]:
     if not plc:
         return []  # its death is in the run's errors already
     # A stopped PLC still lists the programs that never ran.
@@ -352,7 +304,7 @@ def _plc_checks(plc: dict[str, Any]) -> list[str]:
     return [f"PLC: {error}", *failed] if error and not told else failed
 
 
-def _loss_checks(gateway: dict[str, Any]) -> list[str]:
+def _loss_checks(gateway: Mapping[str, Any]) -> list[str]:
     failed = [
         f"{n}: {m['dropped']} messages were dropped" for n, m in gateway.get("mailboxes", {}).items() if m["dropped"]
     ]
@@ -364,23 +316,23 @@ def _loss_checks(gateway: dict[str, Any]) -> list[str]:
     return failed + [f"{name}: {bus['sync_producers']}" for name, bus in buses if bus.get("sync_producers")]
 
 
-def _oracle_checks(run: Run) -> list[str]:
-    oracle = run.oracle
-    judged = getattr(run, "messages", None)  # a run of processes cannot see each message
-    messages: list[str] = judged.wrong if judged is not None else []
-    if oracle.wrong_count:
-        return [f"{oracle.wrong_count} published values were never held by their device", *oracle.wrong, *messages]
-    return messages if oracle.checked else ["no value was published as good", *messages]
+def _published_checks(run: RunFacts) -> list[str]:
+    """Check that the devices held the published values, and that the gateway took no message that was not sent."""
+    published, messages = run.published, list(run.wrong_messages)
+    if published["wrong"]:
+        told = f"{published['wrong']} published values were never held by their device"
+        return [told, *published["examples"], *messages]
+    return messages if published["checked"] else ["no value was published as good", *messages]
 
 
-def _state_checks(run: Run) -> list[str]:
+def _state_checks(run: RunFacts) -> list[str]:
     """Check that the states are those that the topside controller's commands require, in order, beginning with STANDBY."""
-    if run.shore is None:
+    if run.topside is None:
         return []
-    expected = expected_states(run.shore.commands_sent)
+    expected = expected_states(run.commands_sent)
     failed = []
     for program in run.states.relays:
-        seen = run.states.sequence(program)
+        seen = list(run.states.sequences.get(program, ()))
         if seen and seen != expected:
             failed.append(f"{program}: the commands ask for {' '.join(expected)}, seen were {' '.join(seen)}")
     return failed

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 from fieldtwin.gateway.core.image.image import OUTPUTS, ImageLayout, RegionReader
@@ -16,7 +17,7 @@ NAMES = list(STATES)
 MAX_TRANSITIONS = 10_000
 
 
-def expected_states(periods_s: list[int]) -> list[str]:
+def expected_states(periods_s: Iterable[int]) -> list[str]:
     """Return the states that a digital model passes through at these commands, from STANDBY; repeated states count once."""
     model = DigitalModel()
     expected = [model.state.name]
@@ -31,6 +32,17 @@ def state_words(layout: ImageLayout, programs: Iterable[str]) -> dict[str, dict[
     """Return, for each program with a `state` that has names, the name of each code."""
     tags = {tag.name: tag for region in layout.regions for tag in region.tags}
     return {p: dict(tags[f"{p}.state"].words) for p in programs if f"{p}.state" in tags and tags[f"{p}.state"].words}
+
+
+@dataclass(frozen=True, slots=True)
+class SeenStates:
+    """The states that the programs of a run passed through."""
+
+    sequences: Mapping[str, Sequence[str]]
+    """Per program with named states, its states in order; `transitions` with the time in s since the first check."""
+    transitions: Mapping[str, Sequence[tuple[float, str]]]
+    relays: Collection[str]
+    """The programs that follow the topside controller's commands."""
 
 
 class StateWatch:
@@ -97,3 +109,7 @@ class StateWatch:
     def sequence(self, program: str) -> list[str]:
         """Return the states of a program in the order in which it was in them."""
         return [state for _, state in self.transitions.get(program, [])]
+
+    def seen(self) -> SeenStates:
+        """Return the states until now."""
+        return SeenStates({p: self.sequence(p) for p in self.programs}, dict(self.transitions), tuple(self.relays))

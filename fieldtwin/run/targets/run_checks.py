@@ -26,8 +26,6 @@ TITLE = "what a run in virtual time is judged by"
 class _Judged(VirtualRun):
     disturbed = True
     """The scenario decides what a program should do."""
-    may_refuse: tuple[str, ...] = ()
-    """The outputs whose refusal the scenario expects."""
 
 
 class RunJudge:

@@ -25,7 +25,7 @@ from fieldtwin.gateway.runtime.status import describe
 from fieldtwin.results.trace import Event, Kind
 from fieldtwin.run.benches.invariant_watch import InvariantWatch
 from fieldtwin.run.benches.virtual_bench import VirtualBench
-from fieldtwin.run.live.summary import summarise
+from fieldtwin.run.live.summary import RunFacts, summarise
 from fieldtwin.run.processes.states import StateWatch, expected_states
 from fieldtwin.run.processes.topside import Shore, script
 from fieldtwin.run.virtual.age_oracle import AgeOracle
@@ -65,16 +65,9 @@ class VirtualOptions:
     """The random faults that the seed chooses, in addition to `faults`."""
     trace: Path | None = None
 
-    prototype: bool = True
-    field_host: str = ""
-
     def make(self) -> VirtualRun:
         """Return the run of these options."""
         return VirtualRun(self)
-
-
-class _Instance:
-    name = "virtual"
 
 
 class VirtualRun(DrivenRun):
@@ -100,7 +93,6 @@ class VirtualRun(DrivenRun):
         if options.random_faults is not None:
             options.random_faults.check(self.system)
             self.faults += random_schedule(self.system, self.seed, options.duration_s, options.random_faults)
-        self.instance = _Instance()
         self.states = StateWatch(self.system)
         self.oracle = AgeOracle()
         self.messages = MessageOracle()
@@ -111,8 +103,8 @@ class VirtualRun(DrivenRun):
         self.gateway_status: dict[str, Any] | None = None
         self.plc_status: dict[str, Any] | None = None
         self.field_status: dict[str, Any] | None = None
-        self.counted_before: dict[str, dict[str, int]] = {}
-        self.clients_before: dict[str, dict[str, dict[str, int]]] = {}
+        self.may_refuse: tuple[str, ...] = ()
+        """Tags of which a scenario expects that their outputs are refused."""
         self.outputs_confirmed_safe: bool | None = None
         self.mapping: dict[Endpoint, Endpoint] = {}
         self.far: dict[str, Endpoint] = {}
@@ -306,9 +298,36 @@ class VirtualRun(DrivenRun):
     def summary(self) -> dict[str, Any]:
         """Return the summary of a run on this computer, with seed and trace; it does not depend on the speed of the run."""
         return {
-            **summarise(self),
+            **summarise(self._facts()),
             "virtual": True,
             "seed": self.seed,
             "trace": {"events": self.trace.count, "sha256": self.trace.hexdigest()},
             "virtual_s": round(self.elapsed_s, 3),
         }
+
+    def _facts(self) -> RunFacts:
+        invariants, shore = self.invariants, self.shore
+        return RunFacts(
+            prototype=True,
+            system=self.system,
+            instance="virtual",
+            elapsed_s=self.elapsed_s,
+            disturbed=self.disturbed,
+            calm=self.calm,
+            errors=tuple(self.errors),
+            gateway=self.gateway_status,
+            plc=self.plc_status,
+            field=self.field_status,
+            counted_before={},
+            clients_before={},
+            mapping=self.mapping,
+            published=self.oracle.describe(),
+            wrong_messages=tuple(self.messages.wrong),
+            invariants=invariants.results() if invariants is not None else (),
+            invariant_errors=invariants.errors() if invariants is not None else (),
+            states=self.states.seen(),
+            topside=shore.describe() if shore is not None else None,
+            commands_sent=tuple(shore.commands_sent) if shore is not None else (),
+            outputs_confirmed_safe=self.outputs_confirmed_safe,
+            may_refuse=self.may_refuse,
+        )

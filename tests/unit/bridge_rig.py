@@ -1,4 +1,4 @@
-"""A bridge with clients on real sockets in front, and emulated units on a line in memory behind it."""
+"""A bridge with clients on real sockets, and emulated units on a line in memory."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def a_unit(first: int) -> ModbusUnit:
 
 
 class Rig:
-    """A bridge, its line, and what went over that line."""
+    """A bridge, its line, and the recorded traffic of the line."""
 
     def __init__(self, bridge: Bridge, bus: ModbusBus, units: dict[int, ModbusUnit], audit: Path) -> None:
         self.bridge, self.bus, self.units = bridge, bus, units
@@ -89,7 +89,7 @@ async def rig(
     timeout_s: float = 0.15,
     blocked: Callable[[str, int], str] = lambda bus, unit: "",
 ) -> AsyncIterator[Rig]:
-    """Units 1 and 2 on a line, behind a bridge that leads every unit there unless `config` says otherwise."""
+    """Units 1 and 2 on a line, and a bridge that routes every unit there unless `config` says otherwise."""
     units = {1: a_unit(100), 2: a_unit(200)}
     plant = LINE.with_path(str(tmp_path / "line"))
     end = await PtyEnd.open(tmp_path / "line", plant, None)

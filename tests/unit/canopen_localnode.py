@@ -1,6 +1,6 @@
-"""The `canopen` package's own slave, LocalNode, in the place of ours: rows of canopen_slave.toml played on it without threads.
+"""Run rows of canopen_slave.toml without threads on LocalNode, the node of the `canopen` package, in place of ours.
 
-It has no timers to speak of (a heartbeat is a thread of python-can's), so that only the order of frames is asked of it.
+It has hardly any timers (its heartbeat is a thread of python-can), so only the order of frames is checked.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from fieldtwin.gateway.core.connection import CanConnection
 FILE = Path(__file__).parents[1] / "vectors" / "canopen_localnode.toml"
 DUMMIES = "".join(f"Dummy{n:04}={n // 5 % 2}\n" for n in range(1, 8))
 EVENTS = ("error", "clear", "set")
-"""Events of a device that LocalNode has a call for."""
+"""Device events for which LocalNode has a function."""
 
 
 class _Periodic:
-    """What python-can would run in a thread; here it never sends."""
+    """A replacement for python-can's cyclic sending in a thread; here it never sends."""
 
     def stop(self) -> None: ...
 
@@ -36,7 +36,7 @@ class _Periodic:
 
 
 class SilentBus:
-    """Keeps what is sent."""
+    """Record sent frames."""
 
     def __init__(self) -> None:
         self.sent: list[str] = []
@@ -52,19 +52,19 @@ class SilentBus:
 
 
 def load_known() -> tuple[str, dict[str, str]]:
-    """The version that was looked at, and what it does otherwise, by the rows' ids."""
+    """The examined version and its deviations, by row id."""
     file = tomllib.loads(FILE.read_text())
     return file["version"], {entry["id"]: entry["instead"] for entry in file["known"]}
 
 
 def can_be_asked(row: Row) -> bool:
-    """Whether the row needs nothing but frames and what LocalNode can be told."""
+    """Return whether the row needs only frames and events that LocalNode supports."""
     events = [what[1:].split()[0] for _, what in row.hear if what.startswith("!")]
     return row.node_id == NODE and not row.options and all(event in EVENTS for event in events)
 
 
 def make_localnode(text: str = RICH) -> tuple[canopen.Network, canopen.LocalNode, SilentBus]:
-    """LocalNode with the rig's data sheet, on a bus of its own, PRE-OPERATIONAL."""
+    """LocalNode with the rig's data sheet, on a separate bus, PRE-OPERATIONAL."""
     sheet = io.StringIO(text.replace("VendorNumber=\n", "VendorNumber=0\n").replace("Dummy0005=1\n", DUMMIES))
     sheet.name = "rig.eds"
     network, bus = canopen.Network(), SilentBus()
@@ -77,7 +77,7 @@ def make_localnode(text: str = RICH) -> tuple[canopen.Network, canopen.LocalNode
 
 
 class LocalNodeOnBus:
-    """LocalNode behind a connection of ours. What it raises is what a thread of python-can would swallow: silence."""
+    """LocalNode behind our connection. Its exceptions count as silence, because a thread of python-can would swallow them."""
 
     def __init__(self, connection: CanConnection, text: str = RICH) -> None:
         self._connection = connection
@@ -85,14 +85,14 @@ class LocalNodeOnBus:
         self.raised: list[str] = []
 
     async def serve(self) -> None:
-        """Until cancelled or lost."""
+        """Run until cancelled or lost."""
         try:
             while True:
                 frame = await self._connection.recv()
                 if not frame.remote and not frame.extended:
                     try:
                         self._network.notify(frame.can_id, bytearray(frame.data), 0.0)
-                    except Exception as e:  # a stranger's fault is what is looked for
+                    except Exception as e:  # errors of the third-party package are what the test examines
                         self.raised.append(type(e).__qualname__)
                 for text in self._bus.sent:
                     await self._connection.send(parse_frame(text))
@@ -102,12 +102,12 @@ class LocalNodeOnBus:
 
 
 def play_localnode(row: Row) -> str:
-    """What LocalNode does otherwise than the row says, '' when nothing."""
+    """Return the deviation of LocalNode from the row, '' if there is none."""
     network, node, bus = make_localnode()
     try:
         for _, what in row.hear:
             step(network, node, what)
-    except Exception as e:  # a stranger's fault is what is looked for
+    except Exception as e:  # errors of the third-party package are what the test examines
         return f"raises {type(e).__module__}.{type(e).__qualname__}"
     finally:
         network.bus = None
@@ -117,7 +117,7 @@ def play_localnode(row: Row) -> str:
 def step(network: canopen.Network, node: canopen.LocalNode, what: str) -> None:
     if not what.startswith("!"):
         frame = parse_frame(what)
-        if not frame.remote and not frame.extended:  # its Network never hands out a remote frame
+        if not frame.remote and not frame.extended:  # its Network never passes on a remote frame
             network.notify(frame.can_id, bytearray(frame.data), 0.0)
         return
     name, *words = what[1:].split()

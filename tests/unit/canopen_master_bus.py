@@ -1,4 +1,4 @@
-"""What the tests of the CANopen master share: a bus in memory, time that jumps, and frames written as on paper."""
+"""Helpers for the tests of the CANopen master: a bus in memory, jumping time, and frames in candump's notation."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
 
 
 class LoopClock:
-    """The clock of the loop that runs."""
+    """The clock of the running loop."""
 
     def monotonic_ns(self) -> int:
         return round(asyncio.get_running_loop().time() * 1e9)
@@ -45,7 +45,7 @@ class LoopClock:
 
 
 def run_virtual(coro: Coroutine[Any, Any, T]) -> T:
-    """Run on a `VirtualLoop`, which must be left without tasks."""
+    """Run on a `VirtualLoop`, which must end without tasks."""
     loop = VirtualLoop()
     try:
         result = loop.run_until_complete(coro)
@@ -56,7 +56,7 @@ def run_virtual(coro: Coroutine[Any, Any, T]) -> T:
 
 
 class MemoryEnd(CanConnection):
-    """One end of a bus of two; what is sent is stamped and fed to the other at once."""
+    """One end of a bus of two; a sent frame gets a time stamp and reaches the other end at once."""
 
     def __init__(self) -> None:
         super().__init__(CANConnection(), Endpoint.parse("can:memory/test"))
@@ -82,14 +82,14 @@ def bus() -> tuple[MemoryEnd, MemoryEnd]:
 
 
 def frame(text: str) -> CanFrame:
-    """A frame as candump writes it; spaces in the data are for the reader."""
+    """A frame in candump's notation; spaces in the data are ignored."""
     can_id, _, data = text.partition("#")
     return CanFrame(int(can_id, 16), bytes.fromhex(data))
 
 
 @asynccontextmanager
 async def running(master: CanopenMaster) -> AsyncIterator[asyncio.Task[None]]:
-    """`master.run()` for as long as the block lasts."""
+    """Run `master.run()` for the duration of the block."""
     task = asyncio.ensure_future(master.run())
     try:
         yield task

@@ -1,6 +1,6 @@
-"""A CANopen node for tests of the gateway: objects of 1 to 4 bytes over SDO, NMT, a heartbeat, and what was written to it.
+"""A CANopen node for tests of the gateway: objects of 1 to 4 bytes over SDO, NMT, a heartbeat, and the recorded writes.
 
-Small and careless on purpose: it checks nothing. `stored` is what survives a power cycle. On a bus in memory, in virtual time.
+It is small and checks nothing on purpose. `stored` survives a power cycle. On a bus in memory, in virtual time.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Objects = dict[tuple[int, int], bytes]
 
 
 class PeerNode:
-    """Call `power_on` once it is on a bus; `power_off` takes it away."""
+    """Call `power_on` once it is on a bus; `power_off` removes it."""
 
     def __init__(self, node: int, objects: Objects, *, heartbeat_s: float = 0.0) -> None:
         self.node, self.factory, self.heartbeat_s = node, objects, heartbeat_s
@@ -91,7 +91,7 @@ class PeerNode:
 
 
 class PeerBus:
-    """A `Connector` whose one bus has these nodes on it. `sent` is what the gateway sent. `gone`: it cannot be opened."""
+    """A `Connector` whose only bus has these nodes. `sent` has the gateway's frames. `gone`: the bus cannot be opened."""
 
     def __init__(self, nodes: Iterable[PeerNode] = (), *, others: Iterable[object] = ()) -> None:
         self.nodes = list(nodes)
@@ -123,7 +123,7 @@ class PeerBus:
                 listener(theirs, frame)  # type: ignore[operator]
 
     def writes(self) -> list[CanFrame]:
-        """What the gateway sent that is more than looking: NMT, SYNC, TIME, LSS, downloads."""
+        """Return the gateway's frames that may change a node: NMT, SYNC, TIME, LSS, downloads."""
         return [f for f in self.sent if not (f.can_id & 0x780 == 0x600 and f.data[0] in (0x40, 0x60, 0x70, 0x80))]
 
     async def aclose(self) -> None:

@@ -1,4 +1,4 @@
-"""The rows of tests/vectors/canopen_slave.toml, for whatever plays them: what goes in when, and what comes out."""
+"""The rows of tests/vectors/canopen_slave.toml: inputs with their times, and expected outputs."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ FILE = Path(__file__).parents[1] / "vectors" / "canopen_slave.toml"
 
 @dataclass(frozen=True)
 class Row:
-    """One row. Times in ms since the boot-up; `hear` are frames and, after a ``!``, events of the device itself."""
+    """One row. Times in ms since the boot-up; `hear` contains frames and, after a ``!``, events of the device itself."""
 
     id: str
     hear: list[tuple[float, str]]
@@ -35,15 +35,15 @@ class Row:
     values: dict[str, str] = field(default_factory=dict)
     counters: dict[str, int] = field(default_factory=dict)
     timed: bool = False
-    """Silence in it depends on how much time passes."""
+    """A silence in it depends on the elapsed time."""
 
     @property
     def answers_only(self) -> bool:
-        """Whether all that the node says is at once, so that the row can be played without a clock."""
+        """Return whether all replies are immediate, so that the row needs no clock."""
         return not self.timed and {at for at, _ in self.say} <= {at for at, _ in self.hear}
 
     def make(self) -> CanopenNode:
-        """The node of the row, without power yet."""
+        """Return the node of the row, without power."""
         options = dict(self.options)
         if "lss_store" in options:
             options["lss_store"] = LssStore[options["lss_store"]]
@@ -52,7 +52,7 @@ class Row:
         return CanopenNode(parse_eds(RICH), self.node_id, NodeContext(**options))
 
     def check_end(self, node: CanopenNode) -> None:
-        """The state that the row leaves."""
+        """Return the state after the row."""
         assert node.state.name.replace("_", "-") == self.state
         assert {key: node.data.get(*key_of(key)).hex() for key in self.values} == self.values
         counted = node.counters.as_dict()
@@ -60,7 +60,7 @@ class Row:
 
 
 def load() -> list[Row]:
-    """All rows, in the file's order."""
+    """Return all rows, in the file's order."""
     rows = []
     for entry in tomllib.loads(FILE.read_text())["row"]:
         hear = [(float(at), what) for at, what in entry.pop("hear")]
@@ -71,13 +71,13 @@ def load() -> list[Row]:
 
 
 def key_of(text: str) -> tuple[int, int]:
-    """``2006:00`` as index and subindex."""
+    """Parse ``2006:00`` as index and subindex."""
     index, _, subindex = text.partition(":")
     return int(index, 16), int(subindex, 16)
 
 
 def parse_frame(text: str) -> CanFrame:
-    """A frame as candump writes it; blanks between bytes are allowed. Eight digits of identifier make it an extended one."""
+    """Parse a frame in candump's notation; blanks between bytes are allowed. Eight digits of identifier make it extended."""
     identifier, _, body = text.partition("#")
     extended = len(identifier) > 3
     if body.startswith("R"):
@@ -86,7 +86,7 @@ def parse_frame(text: str) -> CanFrame:
 
 
 def happen(node: CanopenNode, event: str, now_ns: int) -> list[CanFrame]:
-    """An event of the device: ``!bus-off``, ``!error 5000``, ``!set 2002:00 3412``..."""
+    """Apply an event of the device: ``!bus-off``, ``!error 5000``, ``!set 2002:00 3412``..."""
     name, *words = event.removeprefix("!").split()
     if name in (state.value for state in CanErrorState):
         return node.bus_state(CanErrorState(name), now_ns)
@@ -106,7 +106,7 @@ def happen(node: CanopenNode, event: str, now_ns: int) -> list[CanFrame]:
 
 
 def play(row: Row, node: CanopenNode) -> list[tuple[float, str]]:
-    """The row on the pure node: what it says, and when."""
+    """Run the row on the pure node; return its frames with their times."""
     now_ns = start_ns = 1_000_000_000
     said: list[tuple[float, str]] = []
 

@@ -1,4 +1,4 @@
-"""What the tests of the emulated CANopen node share: a data sheet with every kind of object, and a hand on the node."""
+"""Helpers for the tests of the emulated CANopen node: a data sheet with every kind of object, and control of the node."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ RICH = "".join(
 
 
 class Rig:
-    """One node and a clock that the test turns. Frames are strings as candump writes them."""
+    """One node and a manual clock. Frames are strings in candump's notation."""
 
     def __init__(self, text: str = RICH, context: NodeContext | None = None, node_id: int = NODE) -> None:
         self.node = CanopenNode(parse_eds(text), node_id, context)
@@ -115,7 +115,7 @@ class Rig:
         return [str(frame) for frame in frames]
 
     def send(self, can_id: int, data: str = "", *, remote: bool = False, extended: bool = False) -> list[str]:
-        """Put a frame on the bus, hex data; returns what the node sends for it."""
+        """Put a frame with hex data on the bus; return the node's frames in reply."""
         frame = CanFrame(can_id, b"" if remote else bytes.fromhex(data), remote=remote, extended=extended)
         return self.texts(self.node.feed(frame, self.now_ns))
 
@@ -123,7 +123,7 @@ class Rig:
         return self.send(0, bytes([command, self.node_id if node_id is None else node_id]).hex())
 
     def sdo(self, data: str) -> str:
-        """One SDO request, padded with zeros; the one reply's data, or '' for silence."""
+        """Send one SDO request, padded with zeros; return the data of its only reply, or '' for silence."""
         return self.sdo_and_more(data)[0]
 
     def sdo_and_more(self, data: str) -> tuple[str, list[str]]:
@@ -134,12 +134,12 @@ class Rig:
         return (replies[0] if replies else ""), [f for f in frames if not f.startswith(head)]
 
     def write(self, index: int, sub: int, value: int, size: int) -> str:
-        """Expedited download; '' when taken, else the abort code in hex."""
+        """Make an expedited download; return '' on success, else the abort code in hex."""
         data = bytes([0x23 | (4 - size) << 2]) + mux(index, sub) + value.to_bytes(size, "little", signed=value < 0)
         return code(self.sdo(data.hex()))
 
     def read(self, index: int, sub: int = 0) -> int:
-        """Expedited upload of an unsigned number."""
+        """Make an expedited upload of an unsigned number."""
         reply = bytes.fromhex(self.sdo((b"\x40" + mux(index, sub)).hex()))
         assert reply[0] & 0xF3 == 0x43, reply.hex()
         return int.from_bytes(reply[4 : 8 - (reply[0] >> 2 & 3)], "little")
@@ -148,7 +148,7 @@ class Rig:
         return code(self.sdo((b"\x40" + mux(index, sub)).hex()))
 
     def advance(self, ms: float) -> list[tuple[float, str]]:
-        """Let time pass, waking the node exactly when it asks: (ms since the call, frame)."""
+        """Let time pass and wake the node exactly when it requests it; return (ms since the call, frame)."""
         start, end = self.now_ns, self.now_ns + int(ms * NS_PER_MS)
         sent: list[tuple[float, str]] = []
         for _ in range(100_000):
@@ -169,7 +169,7 @@ def mux(index: int, sub: int) -> bytes:
 
 
 def code(reply: str) -> str:
-    """The abort code of a reply, '' if it is none."""
+    """Return the abort code of a reply, '' if it is not an abort."""
     raw = bytes.fromhex(reply)
     assert raw, "no reply"
     return raw[:3:-1].hex().upper() if raw[0] == 0x80 else ""

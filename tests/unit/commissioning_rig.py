@@ -1,4 +1,4 @@
-"""What the tests of the commissioning verbs share: hidden register maps on a wire in memory, in virtual time."""
+"""Helpers for the tests of the commissioning commands: hidden register maps on a wire in memory, in virtual time."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ CAN_URL = "can:fieldtwin/127.0.0.1:1"
 
 
 def loop() -> VirtualLoop:
-    """The loop that runs, which is a `Clock` too."""
+    """The running loop, which is a `Clock` too."""
     running = asyncio.get_running_loop()
     assert isinstance(running, VirtualLoop)
     return running
@@ -45,11 +45,11 @@ def unit(made: MapBank, **limits: object) -> ModbusUnit:
 
 
 Mute = Callable[[bytes, int], bool]
-"""``(request ADU, how many came before)`` -> whether it gets no answer."""
+"""Map ``(request ADU, number of earlier ones)`` to whether it gets no answer."""
 
 
 class Wired:
-    """A connector to one unit: each connection is a Modbus TCP wire in memory. `requests` are the PDUs that arrived."""
+    """A connector to one unit: each connection is a Modbus TCP wire in memory. `requests` has the received PDUs."""
 
     def __init__(self, device: ModbusUnit, number: int = 1, latency_s: float = 0.01, mute: Mute | None = None) -> None:
         self._slave = MbapSlave({number: device})

@@ -12,7 +12,7 @@ from fieldtwin.testing.runner import Runner
 
 @contextmanager
 def started_runner() -> Iterator[Runner]:
-    """Yield a runner whose threads run already, so that no test is charged with having started them."""
+    """Yield a runner whose threads run already, so that the thread check of a test does not report them."""
     runner = Runner()
     runner.call("hello")
     yield runner
@@ -21,7 +21,7 @@ def started_runner() -> Iterator[Runner]:
 
 @contextmanager
 def emulated(runner: Runner, profile: str, **asked: Any) -> Iterator[Device]:
-    """Yield an emulated device of `profile`; `asked` are the other arguments of the runner's call `device`."""
+    """Yield an emulated device of `profile`; `asked` has the other arguments of the runner's call `device`."""
     answer = runner.call("device", device=profile, **asked)
     yield Device(runner, answer["id"], "device", answer)
     runner.call("end", id=answer["id"])

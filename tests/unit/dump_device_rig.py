@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 Answer = Callable[[int, int, int], list[int] | int | None]
-"""``(function, address, count)`` -> the registers of the reply (of any number), an exception code, or None for silence."""
+"""Map ``(function, address, count)`` to the registers of the reply (any number), an exception code, or None for silence."""
 
 
 class _Handler(socketserver.StreamRequestHandler):

@@ -11,11 +11,11 @@ from fieldtwin.gateway.protocols.canopen.dictionary import DictionaryEntry, Obje
 
 NODE = 5
 TYPE_AREA = 0x1000
-"""Indices below this one define data types; the gateway does not keep them."""
+"""Indices below this one define data types; the gateway does not store them."""
 
 
 def differences(node: Dictionary, master: ObjectDictionary, node_id: int = NODE) -> list[str]:
-    """Return what the readers understand differently, one line for each object and property."""
+    """Return the differences between the readers, one line for each object and property."""
     of_node = {entry.key: entry for entry in node.entries() if entry.index >= TYPE_AREA}
     of_master = dict(master.entries)
     found: list[str] = []
@@ -39,10 +39,10 @@ def differences(node: Dictionary, master: ObjectDictionary, node_id: int = NODE)
 
 
 def _same_default(raw: bytes, entry: DictionaryEntry) -> bool:
-    """A default that the file does not give, or not readably, is None for the gateway and zeros for the node.
+    """If the file has no readable default, it is None for the gateway and zeros for the node.
 
-    Of a ParameterValue that cannot be read the gateway keeps that it was wanted, so that it configures no node with a part of
-    the file; the node starts with its DefaultValue.
+    For an unreadable ParameterValue the gateway stores that one was present, so that it does not configure a node with a part
+    of the file; the node starts with its DefaultValue.
     """
     if entry.default is None:
         return entry.configured or not any(raw)

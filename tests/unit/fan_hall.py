@@ -90,7 +90,7 @@ def hall(
     writable: str = "mode",
     safe: str = "",
 ) -> Path:
-    """Write the files; the system file."""
+    """Write the files; return the system file."""
 
     def fill(text: str, **values: object) -> str:
         for name, value in values.items():
@@ -109,13 +109,13 @@ def hall(
 
 
 def writes(folder: Path) -> list[tuple[str, Any, Any, str]]:
-    """Every write that was on its way, by the audit log: tag, old and new value, and who asked for it."""
+    """Return every write in the audit log: tag, old and new value, and its requester."""
     lines = [json.loads(line) for line in (folder / "audit.jsonl").read_text(encoding="utf-8").splitlines()]
     return [(e["tag"], e["old"], e["new"], e["by"]) for e in lines if (e["action"], e["result"]) == ("write", "asked")]
 
 
 class VirtualHall:
-    """The system in virtual time, for so many seconds; `during` runs at the end with everything still running."""
+    """Run the system in virtual time for so many seconds; `during` runs at the end, before anything is stopped."""
 
     def __init__(self, system: Path, run_dir: Path) -> None:
         self.system = load_system(str(system))

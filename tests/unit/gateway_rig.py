@@ -36,7 +36,7 @@ PROFILES = Path(__file__).resolve().parents[2] / "profiles" / "devices"
 
 
 class MemoryEnd(ByteConnection):
-    """One end of a wire in memory: what is written arrives whole at the other end."""
+    """One end of a wire in memory: written data arrives whole at the other end."""
 
     peer: MemoryEnd
 
@@ -62,9 +62,9 @@ def wire(endpoint: Endpoint) -> tuple[MemoryEnd, MemoryEnd]:
 
 
 class FieldBus:
-    """A Connector with emulated units behind its one endpoint. `plugged` False: nobody is there.
+    """A Connector with emulated units behind its one endpoint. `plugged` False: no unit is connected.
 
-    `heard` holds every request ADU in order, `tries` when somebody tried to open (loop time in s).
+    `heard` holds every request ADU in order, `tries` the times of attempts to open it (loop time in s).
     """
 
     def __init__(self, units: dict[int, ModbusUnit], latency_s: float = 0.0) -> None:
@@ -98,7 +98,7 @@ class FieldBus:
             self.heard.append(adu)
 
     def unplug(self) -> None:
-        """Pull the cable; nobody is there until `plugged` is set again."""
+        """Pull the cable; no unit is connected until `plugged` is set again."""
         self.plugged = False
         if self._far is not None:
             self._far.unplug()
@@ -145,7 +145,7 @@ async def running_bus(
 
 
 def profile(text: str) -> DeviceProfile:
-    """A Modbus profile; `text` is what stands below the head."""
+    """A Modbus profile; `text` follows the head."""
     head = 'device: test/device\nsource: "a test"\nprotocol: modbus\n'
     return resolve(parse(head + text, "test.yaml"))
 

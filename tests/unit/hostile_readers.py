@@ -1,6 +1,6 @@
-"""Reads hostile files in a process of its own, with a limit on memory and time: `python hostile_readers.py FOLDER KIND...`.
+"""Read hostile files in a separate process, with a limit on memory and time: `python hostile_readers.py FOLDER KIND...`.
 
-Prints a JSON line for each file: reader, file, outcome ("read", or the name of the error), and what the error said.
+It prints a JSON line for each file: reader, file, result ("read", or the name of the error), and the error message.
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ from fieldtwin.twin.site.system import load_system
 from fieldtwin.twin.template.package import open_package
 
 MEMORY_BYTES = 192 * 1024 * 1024
-"""What reading may take on top of the program itself."""
+"""Memory limit for reading, in addition to the program itself."""
 SECONDS = 20
-"""For one file; a file that is refused at once takes milliseconds."""
+"""Time limit per file; a file that is refused at once takes milliseconds."""
 SHIPPED = Path(__file__).resolve().parents[2] / "profiles"
 SYSTEM = load_system("observatory")
 
@@ -175,7 +175,7 @@ def yaml_files(folder: Path, kind: str, shipped: str) -> Iterator[Path]:
 
 
 def odd_files(folder: Path) -> Iterator[Path]:
-    """Pipes, devices, links and files without an end, as the test made them."""
+    """Pipes, devices, links and files without an end, as the test created them."""
     yield from sorted(folder.glob("odd-*"))
 
 

@@ -1,6 +1,6 @@
-"""Generated register maps whose truth is known, as samples of many devices: what `infer` claims is compared with what they hold.
+"""Generated register maps with known content, as samples of many devices, against which the claims of `infer` are compared.
 
-Nothing here is shared with the code under test: values are packed with `struct`.
+This shares no code with the code under test: values are packed with `struct`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ FORMS = {
 
 @dataclass(frozen=True)
 class Field:
-    """A value of a generated device: where it begins, and the words of its registers, a row for each pass."""
+    """A value of a generated device: its start, and the words of its registers, one row per pass."""
 
     address: int
     kind: str
@@ -80,7 +80,7 @@ class _Maker:
         self.at += len(rows[0])
 
     def counter(self) -> None:
-        """A count of pulses or energy, whose low word often wraps while it is watched."""
+        """A count of pulses or energy, whose low word often wraps during observation."""
         r = self.r
         step = int(10 ** r.uniform(0, 4.2))
         start = int(10 ** r.uniform(1, 8.5))
@@ -128,7 +128,7 @@ class _Maker:
             self.put("uint16", [0.0] * self.passes, "always zero")
 
     def status(self) -> None:
-        """Flags, each of which is set or cleared now and then."""
+        """Flags, each of which is set or cleared at random times."""
         r = self.r
         bits = r.sample(range(16), r.randint(1, 5))
         word = sum(1 << b for b in r.sample(range(16), r.randint(0, 4)))
@@ -174,6 +174,6 @@ class _Maker:
 
 
 def corpus(count: int, seed: int) -> Iterator[Map]:
-    """`count` maps; the same for the same `seed`."""
+    """Return `count` maps, the same ones for the same `seed`."""
     for i in range(count):
         yield _Maker(seed * 1_000_003 + i).made()

@@ -46,7 +46,7 @@ def wire(framing: Framing) -> tuple[MemoryEnd, MemoryEnd]:
 
 
 class Device:
-    """The far end, by hand: requests are kept with the time they came; a test sends what it likes."""
+    """The remote end, by hand: requests are recorded with their arrival times; a test sends the answers."""
 
     def __init__(self, end: MemoryEnd) -> None:
         self.end = end
@@ -98,7 +98,7 @@ def register_frame(value: int) -> str:
 
 
 def answering(device: Device, *values: int) -> None:
-    """Answer reads of one register with `values` in turn, at once."""
+    """Answer reads of one register at once, with `values` in turn."""
     left = list(values)
 
     async def answer(request: bytes) -> None:

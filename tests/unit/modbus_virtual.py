@@ -1,6 +1,6 @@
-"""The Modbus client on a clock of its own: an event loop whose time jumps to the next timer, and an in-memory wire.
+"""The Modbus client in virtual time: an event loop whose time jumps to the next timer, and a wire in memory.
 
-What takes seconds takes none, and every time is exact. Waiting for anything but a timer or memory is a deadlock, and raises.
+Seconds pass at once, and every time is exact. Waiting for anything except a timer or memory is a deadlock, and raises.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ T = TypeVar("T")
 
 
 class _Jump(selectors.SelectSelector):
-    """Instead of waiting, the time moves on. Whole nanoseconds, so that the loop and the clock never disagree."""
+    """Instead of waiting, advance the time. Whole nanoseconds, so that the loop and the clock never disagree."""
 
     now_ns = 0
 
@@ -31,7 +31,7 @@ class _Jump(selectors.SelectSelector):
 
 
 class VirtualLoop(asyncio.SelectorEventLoop):
-    """Starts at 0 and is its own `Clock`."""
+    """The loop starts at 0 and is its own `Clock`."""
 
     def __init__(self) -> None:
         self._jump = _Jump()
@@ -52,7 +52,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
 
 
 def run_virtually(coro: Coroutine[Any, Any, T]) -> T:
-    """Run `coro` on a fresh `VirtualLoop`; fail when it leaves tasks behind."""
+    """Run `coro` on a fresh `VirtualLoop`; fail if it leaves tasks."""
     with asyncio.Runner(loop_factory=VirtualLoop) as runner:
         result = runner.run(coro)
         leaked = asyncio.all_tasks(runner.get_loop())
@@ -61,7 +61,7 @@ def run_virtually(coro: Coroutine[Any, Any, T]) -> T:
 
 
 class VirtualWire(ByteConnection):
-    """The near end of a wire whose far end is a script: `on_write` is told what is written, and `feed`s what arrives."""
+    """The near end of a wire with a scripted remote end: `on_write` gets the written data, and `feed`s the replies."""
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""A mosquitto of a test's own, from Debian's package, on a free port."""
+"""A separate mosquitto for a test, from Debian's package, on a free port."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import pytest
 
 
 def program() -> str:
-    """mosquitto's path. Skips the test where there is none."""
+    """Return mosquitto's path. Skip the test if it is missing."""
     found = shutil.which("mosquitto", path=os.environ.get("PATH", "") + ":/usr/sbin")
     if found is None:
         pytest.skip("no mosquitto here (Debian: mosquitto)")
@@ -28,13 +28,15 @@ def free_port() -> int:
 
 
 class Mosquitto:
-    """Started and stopped as often as a test likes, on one port."""
+    """A broker that a test can start and stop any number of times, on one port."""
 
     def __init__(self, folder: Path, *settings: str) -> None:
         self.port = free_port()
         self._program = program()
         self._config = folder / "mosquitto.conf"
-        user = ["user root"] if os.getuid() == 0 else []  # else it becomes one that may not read the test's folder
+        user = (
+            ["user root"] if os.getuid() == 0 else []
+        )  # otherwise it changes to a user that cannot read the test's folder
         self._config.write_text(
             "\n".join((f"listener {self.port} 127.0.0.1", "persistence false", *user, *settings)) + "\n"
         )
@@ -63,7 +65,7 @@ class Mosquitto:
 
 @contextmanager
 def broker(folder: Path, *settings: str) -> Iterator[Mosquitto]:
-    """A broker that runs."""
+    """A running broker."""
     made = Mosquitto(folder, *(settings or ("allow_anonymous true",)))
     made.start()
     try:

@@ -36,7 +36,7 @@ async def local_node(connection: CanConnection, clock: VirtualClock) -> None:
 
 
 def on_bus(serve: Serve, use: Callable[[MemoryNet, str, VirtualClock], Awaitable[T]]) -> T:
-    """What `use` comes to with a node on a bus of 125 kbit/s. `use` gets the net, the bus's url and the clock."""
+    """Return the result of `use` with a node on a bus of 125 kbit/s. `use` gets the net, the bus's URL and the clock."""
     loop = VirtualLoop()
 
     async def main() -> T:

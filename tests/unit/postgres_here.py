@@ -1,4 +1,4 @@
-"""A PostgreSQL server of a test's own, from Debian's package: a new cluster, a Unix socket, no port."""
+"""A separate PostgreSQL server for a test, from Debian's package: a new cluster, a Unix socket, no port."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ USER = "postgres"
 
 
 def programs() -> Path | None:
-    """Where initdb and postgres are, newest version first."""
+    """The folders of initdb and postgres, newest version first."""
     found = sorted(Path("/usr/lib/postgresql").glob("*/bin/initdb"), key=lambda p: int(p.parts[-3]), reverse=True)
     return found[0].parent if found else None
 
@@ -58,7 +58,7 @@ class Cluster:
 
 @contextmanager
 def cluster(data: Path | None = None) -> Iterator[Cluster]:
-    """A cluster that runs. Skips the test where there is none to start."""
+    """A running cluster. Skips the test if PostgreSQL is missing."""
     folder = programs()
     if folder is None:
         pytest.skip("no PostgreSQL here (Debian: postgresql)")
@@ -73,7 +73,7 @@ def cluster(data: Path | None = None) -> Iterator[Cluster]:
         try:
             yield made
         finally:
-            with suppress(subprocess.CalledProcessError):  # it may have ended by itself
+            with suppress(subprocess.CalledProcessError):  # it may have ended already
                 made.stop()
     finally:
         shutil.rmtree(place, ignore_errors=True)
@@ -81,6 +81,6 @@ def cluster(data: Path | None = None) -> Iterator[Cluster]:
 
 @contextmanager
 def server() -> Iterator[str]:
-    """Start a server; the URL of its database. Skips the test where there is none to start."""
+    """Start a server; return the URL of its database. Skips the test if PostgreSQL is missing."""
     with cluster() as made:
         yield made.url

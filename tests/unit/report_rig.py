@@ -1,4 +1,4 @@
-"""What the tests of decoding and reports share: traces of the observatory, written by hand."""
+"""Helpers for the tests of decoding and reports: handwritten traces of the observatory."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def chunk(t_ms: float, sent: bool, data: bytes | str, bus: str = "line1") -> Eve
 
 
 def ask(t_ms: float, pdu: str, unit: int = 1) -> Event:
-    """A request of the gateway's on the serial line."""
+    """A request of the gateway on the serial line."""
     return chunk(t_ms, True, with_crc(bytes([unit]) + bytes.fromhex(pdu)))
 
 
@@ -39,7 +39,7 @@ def adu(transaction: int, pdu: str, unit: int = 1) -> bytes:
 
 
 def can(t_ms: float, text: str, **flags: Any) -> Event:
-    """``605#40 18 10 04`` as on a bus; the gateway sends what a master sends."""
+    """``605#40 18 10 04`` as on a bus; frames that a master sends come from the gateway."""
     number, _, data = text.partition("#")
     can_id, sent = int(number, 16), number in ("000", "080") or number.startswith(("20", "60")) or number == "7E5"
     fields = {"dir": "sent" if sent else "received", "id": can_id, "bytes": bytes.fromhex(data).hex(), **flags}
@@ -56,7 +56,7 @@ READ_CTD = "04 0000 000A"
 
 
 def run_trace(seconds: int = 20, lost: tuple[float, float] = (12.0, 15.0)) -> list[Event]:
-    """The observatory at work: polls, process data, heartbeats, states; `lost`: when the CTD is silent."""
+    """The running observatory: polls, process data, heartbeats, states; `lost`: the time from which the CTD is silent."""
     events = [
         note(0, Kind.STATE, "relay.state", value=0), note(0, Kind.STATE, "relay.period_s", value=0),
         note(2010, Kind.STATE, "relay.period_s", value=1), note(2010, Kind.STATE, "relay.state", value=1),

@@ -1,6 +1,6 @@
-"""An SDO server for tests of the client: segmented and block, both ways, pure, with what a careless one may leave out.
+"""An SDO server for tests of the client: segmented and block transfers in both directions, pure, with optional omissions.
 
-It is written from the standard for these tests alone. It acknowledges early where it sees a gap when `early` is set.
+It is written from the standard for these tests alone. With `early`, it acknowledges at once when it detects a gap.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class BlockServer:
         return [b"\x80" + self.mux.ljust(3, b"\0") + code.to_bytes(4, "little")]
 
     def plain(self, mux: bytes) -> Frames:
-        """Expedited only: what probes read."""
+        """Expedited only: the objects read by probes."""
         self.state, self.mux = "idle", mux
         value = self.objects.get(mux)
         if value is None or not 1 <= len(value) <= 4:

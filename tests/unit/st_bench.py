@@ -1,4 +1,4 @@
-"""Runs small pieces of Structured Text for the tests."""
+"""Run small pieces of Structured Text for the tests."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def scan(made: StProgram, number: int = 1, ms: int | None = None) -> None:
 
 
 def run(variables: str, body: str, before: str = "", scans: int = 1) -> dict[str, Any]:
-    """Variables, in lower case, after `scans` scans of a program with `body`."""
+    """Return variables, in lower case, after `scans` scans of a program with `body`."""
     made = program(f"{before}\nPROGRAM p VAR {variables} END_VAR\n{body}\nEND_PROGRAM")
     for number in range(1, scans + 1):
         scan(made, number)
@@ -26,5 +26,5 @@ def run(variables: str, body: str, before: str = "", scans: int = 1) -> dict[str
 
 
 def value(kind: str, expression: str, variables: str = "", before: str = "") -> Any:
-    """What `expression` is as a `kind`."""
+    """Return the value of `expression` as a `kind`."""
     return run(f"{variables} result : {kind};", f"result := {expression};", before)["result"]

@@ -1,4 +1,4 @@
-"""A system of our own, packed; and what a stranger may have made of it."""
+"""A packed system of our own, and manipulated versions of it."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Blinker(Program):
 
 
 def own_system(folder: Path) -> Path:
-    """A system with nothing in it that is shipped: profile, EDS, recording, control logic in Structured Text and Python."""
+    """A system without shipped files: profile, EDS, recording, control logic in Structured Text and Python."""
     for sub in ("plant", "devices", "logic"):
         (folder / sub).mkdir(parents=True)
     profile = (SHIPPED / "devices" / "inclinometer-cia410.yaml").read_text()
@@ -54,7 +54,7 @@ def own_system(folder: Path) -> Path:
 
 
 def with_python(path: Path, marker: Path) -> None:
-    """Let the system at `path` have a program in Python that leaves a marker when it is imported."""
+    """Give the system at `path` a Python program that leaves a marker when it is imported."""
     text = path.read_text().replace("programs:", "programs:\n    blink: {source: 'python: site_logic:Blinker'}")
     path.write_text(text)
     (path.parent / "helper.py").write_text(f"open({str(marker)!r}, 'w').close()\n")
@@ -75,7 +75,7 @@ def no(template: Stranger) -> bool:
 
 
 def fieldtwin(tmp_path: Path, *words: str) -> subprocess.CompletedProcess[str]:
-    """Our command line, without a terminal."""
+    """Run our command line without a terminal."""
     return subprocess.run(
         [sys.executable, "-m", "fieldtwin", *words],
         env={**os.environ, "PYTHONPATH": str(CHECKOUT), "FIELDTWIN_RUN": str(tmp_path / "r")},
@@ -84,7 +84,7 @@ def fieldtwin(tmp_path: Path, *words: str) -> subprocess.CompletedProcess[str]:
 
 
 def reworked(source: Path, target: Path, change: Callable[[dict[str, bytes]], None]) -> Path:
-    """The zip with other contents, its manifest made to fit where `change` leaves the manifest alone."""
+    """Return the zip with changed contents; its manifest is adapted unless `change` edits the manifest."""
     with zipfile.ZipFile(source) as archive:
         files = {name: archive.read(name) for name in archive.namelist()}
     change(files)

@@ -1,4 +1,4 @@
-"""The water between processes: served on a socket, with a modem's end of it in another process, here in this one."""
+"""The acoustic channel between processes: served on a socket, with a modem's end in a different process, here in this one."""
 
 from __future__ import annotations
 
@@ -40,10 +40,10 @@ def test_what_one_says_the_other_hears(tmp_path: Path) -> None:
             await eventually(all_heard)
             assert heard == said
             assert (a.sent, b.delivered) == (20, 20)
-            medium.say("b", b"ahoy", clock.monotonic_ns())  # somebody in this process: the server wakes up for it
+            medium.say("b", b"ahoy", clock.monotonic_ns())  # an end in this process: the server wakes up for it
             await eventually(lambda: a.arrived(0) == b"ahoy")
             await server.aclose()
-            await eventually(lambda: not a.submit(b"x", 0))  # nobody takes it any more; nothing breaks
+            await eventually(lambda: not a.submit(b"x", 0))  # no client takes it any more; nothing breaks
             assert a.arrived(0) is None
             await a.aclose()
             await b.aclose()
@@ -54,7 +54,7 @@ def test_what_one_says_the_other_hears(tmp_path: Path) -> None:
 def test_a_modem_hands_over_so_much_and_no_more(tmp_path: Path) -> None:
     async def main() -> None:
         server = AcousticServer(AcousticMedium(WATER, PLACES, 1), WallClock())
-        await server.open(tmp_path / "w")  # and nobody runs it
+        await server.open(tmp_path / "w")  # and no task runs it
         a = await AcousticEnd.open(tmp_path / "w", "a")
         assert [a.submit(b"x", 0) for _ in range(ROOM + 1)] == [True] * ROOM + [False]
         await a.aclose()

@@ -1,4 +1,4 @@
-"""The water between modems: who hears whom and when, what is lost and why, and that what was said is accounted for."""
+"""The acoustic channel between modems: receivers and delays, losses and their causes, and the accounting of all messages."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.errors import UsageError
 
 ROW = {"west": (0.0, 0.0), "middle": (3000.0, 0.0), "east": (6000.0, 0.0)}
-"""East and west do not hear each other; the middle hears both, 2 s after they speak."""
+"""East and west do not reach each other; the middle receives both, 2 s after they send."""
 WATER = Water(range_m=4000.0, bytes_per_s=20.0, overhead_bytes=8)
 
 
@@ -24,7 +24,7 @@ def test_neighbours_hear_it_later_and_others_not() -> None:
     sea = AcousticMedium(WATER, ROW, seed=1)
     assert sea.neighbours("west") == ["middle"]
     assert sea.say("west", b"ahoy", 0)
-    assert sea.take("middle", s(2.59)) is None  # 12 bytes at 20 B/s are 0.6 s, on the way for 2 s
+    assert sea.take("middle", s(2.59)) is None  # 12 bytes at 20 B/s are 0.6 s, in transit for 2 s
     assert sea.take("middle", s(2.6)) == b"ahoy"
     assert sea.take("middle", s(9)) is None
     assert sea.take("east", s(9)) is None
@@ -45,7 +45,7 @@ def test_two_at_once_spoil_each_other_where_both_are_heard() -> None:
 def test_who_speaks_hears_nothing() -> None:
     sea = AcousticMedium(WATER, ROW, seed=1)
     sea.say("west", b"one", 0)
-    sea.say("middle", b"two", s(1.9))  # speaks until 2.45 s, and what west said begins at 2 s
+    sea.say("middle", b"two", s(1.9))  # it sends until 2.45 s, and the message from west arrives from 2 s on
     assert sea.take("middle", s(10)) is None
     assert sea.counters["middle"].lost["speaking"] == 1
     assert sea.take("west", s(10)) == b"two"
@@ -55,7 +55,7 @@ def test_who_speaks_hears_nothing() -> None:
 def test_a_modem_waits_while_it_hears() -> None:
     sea = AcousticMedium(WATER, ROW, seed=1)
     sea.say("west", b"one", 0)
-    sea.say("middle", b"two", s(2.2))  # in the middle of what it hears, to 2.55 s
+    sea.say("middle", b"two", s(2.2))  # in the middle of its reception, to 2.55 s
     assert sea.take("middle", s(2.55)) == b"one"
     assert sea.take("west", s(4.55)) is None
     assert sea.take("west", s(6)) == b"two"
@@ -64,7 +64,7 @@ def test_a_modem_waits_while_it_hears() -> None:
 def test_a_modem_takes_so_much_and_no_more() -> None:
     sea = AcousticMedium(WATER, ROW, seed=1)
     taken = sum(sea.say("west", bytes([n]), 0) for n in range(10))
-    assert taken == QUEUE + 1  # one is under way
+    assert taken == QUEUE + 1  # one is in transit
     assert [sea.take("middle", s(60)) for _ in range(taken + 1)] == [*(bytes([n]) for n in range(taken)), None]
 
 

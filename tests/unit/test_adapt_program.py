@@ -1,4 +1,5 @@
-"""The network's control logic on the water alone: whatever is lost, and whoever is restarted, all know the same in the end."""
+"""The network's control logic on the acoustic channel alone: with any losses and restarts, all reach the same state in the
+end."""
 
 from __future__ import annotations
 
@@ -24,7 +25,7 @@ SCAN_S = 0.5
 
 
 class Station:
-    """The program, its modem's mailboxes and a sensor that takes a sample when its time has come."""
+    """The program, its modem's mailboxes and a sensor that samples when due."""
 
     def __init__(self, sea: AcousticMedium, name: str) -> None:
         self.name, self.sea = name, sea
@@ -36,7 +37,7 @@ class Station:
         self.begin()
 
     def begin(self) -> None:
-        """A restart, warm."""
+        """Restart, warm."""
         self.program: Program = load_program("adapt.st", [str(SYSTEMS)])
         self.program.restore(self.kept)
         self.program._lookup = lambda name: TagValue(getattr(self.program, name), Quality.GOOD, Reason.NONE, 0)
@@ -112,7 +113,7 @@ def test_an_order_and_a_front_go_from_one_end_to_the_other_and_are_over_everywhe
     ocean.run(60)
     spoken = [ocean.stations[n].spoken for n in NAMES]
     ocean.run(3600)
-    assert [ocean.stations[n].spoken for n in NAMES] == spoken  # when all have it, nobody says it again
+    assert [ocean.stations[n].spoken for n in NAMES] == spoken  # when all have it, no member repeats it
     assert any(b'"command"' in entry for entry in ocean.stations["west"].log)
 
 
@@ -122,7 +123,7 @@ def test_an_order_and_a_front_go_from_one_end_to_the_other_and_are_over_everywhe
     seed=st.integers(0, 10_000),
     told=st.lists(st.tuples(st.sampled_from(["order", "front", "deaf", "restart"]), st.integers(1, 60)), max_size=6),
 )
-@example(0.0, 0, [("order", 1)])  # so fast that a period can be written at no moment between two samples
+@example(0.0, 0, [("order", 1)])  # so fast that a period cannot be written between two samples
 def test_in_the_end_all_know_the_same(loss: float, seed: int, told: list[tuple[str, int]]) -> None:
     ocean, random = Ocean(loss, seed), Random(seed)
     ocean.order(20)
@@ -142,7 +143,7 @@ def test_in_the_end_all_know_the_same(loss: float, seed: int, told: list[tuple[s
     ocean.deaf.clear()
     ocean.order(last + 1)
     ocean.run(100)
-    while ocean.stations["west"].base_s != last + 1:  # the ship's three were lost, or came too soon: it says it again
+    while ocean.stations["west"].base_s != last + 1:  # the ship's three were lost, or came too early: it repeats them
         assert ocean.now_s < 3000
         ocean.order(last + 1)
         ocean.run(60)
@@ -192,7 +193,7 @@ def test_an_observatory_that_forgot_its_numbers_learns_them_from_the_others() ->
     ocean.stations["east"].kept = {}
     ocean.stations["east"].begin()
     ocean.run(60)
-    front(ocean, "east", 15)  # older than what they know, until it is told so
+    front(ocean, "east", 15)  # an outdated period, until it is informed
     ocean.run(20)
     assert ocean.stations["east"].kept["kept"] > number
     assert ocean.periods() == [2, 2, 2]

@@ -1,4 +1,4 @@
-"""The strict oracle: what a device held inside a value's age, to the instant, is right; all else is not."""
+"""The strict oracle: a value that a device held within the value's age, to the instant, is right; any other is wrong."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ EMULATED = frozenset({"d"})
     [
         (b"a", 100, 150, True),
         (b"a", 199, 199, True),
-        (b"a", 200, 200, True),  # it was asked at the very instant in which it changed
+        (b"a", 200, 200, True),  # it was requested at the instant of its change
         (b"b", 200, 200, True),
         (b"b", 199, 199, False),  # that came later
         (b"b", 150, 200, True),
-        (b"a", 201, 300, False),  # that was over
+        (b"a", 201, 300, False),  # that value had ended
         (b"c", 100, 400, False),  # never
-        (b"a", 50, 90, False),  # nothing was known of it then
+        (b"a", 50, 90, False),  # no value was known at that time
     ],
 )
 def test_held_inside_its_age(raw: bytes, asked_ns: int, now_ns: int, right: bool) -> None:

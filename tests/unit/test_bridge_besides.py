@@ -1,4 +1,4 @@
-"""A bridge's cache, replies of no fixed length, ports that are not there, and the other direction: a master on a line."""
+"""A bridge's cache, replies without fixed length, missing ports, and the reverse direction: a client on a line."""
 
 from __future__ import annotations
 
@@ -63,8 +63,10 @@ def test_a_serial_port_that_is_not_there_is_no_path(tmp_path: Path) -> None:
             (tmp_path / "line").unlink()
             assert r.bus._client is not None
             await r.bus._client.aclose()
-            assert await refused(client, 1) == 0x0A  # nothing was sent, so it waited until the port could not be opened
-            assert await refused(client, 1) == 0x0A  # and now it is known
+            assert (
+                await refused(client, 1) == 0x0A
+            )  # nothing was sent, so it waited until the attempt to open the port failed
+            assert await refused(client, 1) == 0x0A  # and now the failure is known
             assert r.bus.down is not None
 
     run(main())
@@ -74,7 +76,7 @@ def test_a_serial_port_that_is_not_there_is_no_path(tmp_path: Path) -> None:
 async def reverse(
     tmp_path: Path, latency_s: float
 ) -> AsyncIterator[tuple[ModbusClient, Bridge, dict[int, ModbusUnit]]]:
-    """A master on a serial line in front; units on Modbus TCP behind."""
+    """A client on a serial line; units on Modbus TCP."""
     units = {3: a_unit(300)}
     near, far = tmp_path / "near", LINE.with_path(str(tmp_path / "near"))
     end = await PtyEnd.open(near, far, None)
@@ -99,7 +101,7 @@ def test_a_master_on_a_line_reaches_units_on_tcp(tmp_path: Path) -> None:
     async def main() -> None:
         async with reverse(tmp_path, 0.0) as (client, bridge, _):
             assert (await client.read_registers(7, "holding", 1, 2)).registers == (301, 302)
-            with pytest.raises(ReplyTimeout):  # MB-029: somebody else's unit
+            with pytest.raises(ReplyTimeout):  # MB-029: a foreign unit
                 await client.read_registers(3, "holding", 1, 1, timeout_s=0.1)
             assert (await client.read_registers(7, "holding", 2, 1)).registers == (302,)
             assert bridge.describe()["requests"] == 2
@@ -112,7 +114,7 @@ def test_mb_012_an_answer_that_comes_after_the_master_went_on_is_never_sent(tmp_
         async with reverse(tmp_path, 0.2) as (client, bridge, _):
             with pytest.raises(ReplyTimeout):
                 await client.read_registers(7, "holding", 1, 1, timeout_s=0.02)
-            # the master's own quarantine is long over; a cheaper one would ask at once
+            # the client's own quarantine has long ended; a simpler client would ask at once
             assert (await client.read_registers(7, "holding", 2, 1)).registers == (302,)
             assert client.counters.desyncs == 0
             front = bridge.front

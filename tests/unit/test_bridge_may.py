@@ -1,4 +1,4 @@
-"""What a client of a bridge may: units, functions, addresses, networks; and that it is on record."""
+"""Permissions of a bridge's clients: units, functions, addresses, networks; and their audit records."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_writes_are_on_record_and_so_are_refusals(tmp_path: Path) -> None:
             for _ in range(5):
                 await raw.write(bytes.fromhex("0001 0000 0006 01 06 0004 0001"))
                 assert (await take(raw, 9))[-1] == 1
-            assert [e["action"] for e in r.audit] == ["refuse"]  # one a second and client
+            assert [e["action"] for e in r.audit] == ["refuse"]  # one a second per client
             assert r.heard == []
 
     run(main())

@@ -1,4 +1,4 @@
-"""What clients and masters send, parsed: any bytes, in any pieces. Never an exception but Modbus's own, never a wrong border."""
+"""Parsing of client requests: any bytes, in any pieces. Only Modbus's own exceptions, never a wrong frame boundary."""
 
 from __future__ import annotations
 
@@ -138,8 +138,8 @@ def test_mb_050_a_frame_of_256_bytes_and_one_of_257() -> None:
 
 
 def passed_on(pdu: str, reply: bytes, *, pieces: int = 1, silence: bool = False) -> bytes | None:
-    """The reply PDU that the master takes for the answer to a forwarded request on RTU, or None while it waits; with
-    `silence`, what it takes once the line has been silent behind it."""
+    """Return the reply PDU that the client accepts for a forwarded request on RTU, or None while it waits; with `silence`, the
+    PDU that it accepts after silence on the line."""
     data = bytes.fromhex(pdu)
     framer = make_framer("rtu", char_time_ns=86_000, echo=False, strict=False, accepts_zero_id=False)
     request = Forwarded(5, data, examine(data), on_line=True)
@@ -213,13 +213,13 @@ def test_lengths_of_replies_are_within_a_frame(pdu: bytes, head: bytes) -> None:
     assert length >= -1
 
 
-# -- who may, and what is kept ---------------------------------------------------------------------------------------------
+# -- permissions and cache ------------------------------------------------------------------------------------------------
 
 
 def test_networks() -> None:
     nets = (network("10.1.0.0/16"), network("fd00::/8"))
     assert within("10.1.200.3", nets)
-    assert within("::ffff:10.1.200.3", nets)  # as a socket for both families shows an IPv4 client
+    assert within("::ffff:10.1.200.3", nets)  # how a dual-stack socket shows an IPv4 client
     assert within("fd00::1%eth0", nets)
     assert not within("10.2.0.1", nets)
     assert not within("nonsense", nets)
@@ -237,7 +237,7 @@ def test_without_leave_nothing_that_may_change_a_unit_passes(pdu: bytes) -> None
     assert (Policy((everything,)).judge("127.0.0.1", 1, asked) == ALLOWED) == (not asked.changes)
     assert Policy((everything,), allow_writes=True).judge("127.0.0.1", 1, asked) == ALLOWED
     if Policy((AllowRule(),), allow_writes=True).judge("127.0.0.1", 1, asked) == ALLOWED:
-        assert not asked.changes  # a rule that only reads lets nothing through that writes, whatever the leave
+        assert not asked.changes  # a rule for reading passes no write, whatever the permissions
 
 
 def test_the_cache_keeps_no_reply_beyond_its_age() -> None:

@@ -1,4 +1,4 @@
-"""Whose turn it is on a bus that polls, writes for the PLC and carries the requests of bridge clients; and the queue itself."""
+"""Order of requests on a bus that polls, writes for the PLC and carries requests of bridge clients; and the queue itself."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_mb_063_a_write_of_the_plc_goes_before_clients_and_polls() -> None:
             await eventually(lambda: bool(ended))
             assert ended == [None]
             functions = [adu[1] for adu in r.field.heard[before:]]
-            assert 0x10 in functions[:2]  # after the one that was under way at most
+            assert 0x10 in functions[:2]  # after the current one at most
             await eventually(lambda: len(results) == 40)
 
     run(main())

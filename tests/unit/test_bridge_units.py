@@ -1,4 +1,4 @@
-"""A bridge in one process: Modbus TCP clients of the gateway in front, emulated units on a virtual serial port behind."""
+"""A bridge in one process: Modbus TCP clients, the gateway, and emulated units on a virtual serial port."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_mb_059_a_silent_target_is_0b_once_with_the_client_s_transaction_id(tmp_
             assert await take(raw, 9) == bytes.fromhex("BEEF 0000 0003 09 83 0B")
             assert [frame[0] for frame in r.heard] == [9, 9]
             assert r.bus.totals()["timeouts"] == 2  # one attempt and the bus's one retry
-            await raw.write(read_adu(0xBEF0, 9, 0, 1))  # left alone now: answered without the wire
+            await raw.write(read_adu(0xBEF0, 9, 0, 1))  # backing off now: answered without the wire
             assert await take(raw, 9) == bytes.fromhex("BEF0 0000 0003 09 83 0B")
             assert r.bus.totals()["timeouts"] == 2
             assert r.bridge.counters.spared == 1
@@ -84,9 +84,9 @@ def test_mb_060_a_client_gone_mid_request(tmp_path: Path) -> None:
                 goes.sendall(read_adu(1, 1, 0, 1) + read_adu(2, 1, 1, 1) + read_adu(3, 1, 2, 1))
                 await eventually(lambda: len(r.heard) == 1)
                 goes.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # it ends by a reset
-            await eventually(lambda: r.bridge.counters.unread == 1)  # the reply that was under way is dropped
+            await eventually(lambda: r.bridge.counters.unread == 1)  # the reply in transit is dropped
             assert (await stays.read_registers(2, "holding", 5, 1)).registers == (205,)
-            assert [frame[0] for frame in r.heard] == [1, 2]  # what still waited in line for it never went out
+            assert [frame[0] for frame in r.heard] == [1, 2]  # its queued requests were never sent
             assert r.bus.guests.counters.gone == 2
             assert r.bus.totals()["late_bytes"] == 0
 
@@ -145,7 +145,7 @@ def test_mb_028_a_broadcast_goes_out_once_and_nobody_answers(tmp_path: Path) -> 
             assert await take(raw, 11) == bytes.fromhex("0002 0000 0005 01 03 02 1234")  # no answer to the first
             assert r.units[2].bank.read("holding", 5, 1, 0) == [0x1234]
             assert [frame[0] for frame in r.heard] == [0, 1]
-            assert await refused_raw(raw, 0) == 0x01  # what cannot be broadcast
+            assert await refused_raw(raw, 0) == 0x01  # a function that cannot be broadcast
 
     run(main())
 
@@ -156,7 +156,7 @@ def test_mb_028_a_broadcast_is_answered_where_that_is_wanted_and_only_when_it_we
         async with rig(tmp_path, config) as r, r.raw() as raw:
             await raw.write(bytes.fromhex("0001 0000 0009 00 10 0005 0001 02 4321"))
             assert await take(raw, 12) == bytes.fromhex("0001 0000 0006 00 10 0005 0001")
-            await eventually(lambda: r.units[2].bank.read("holding", 5, 1, 0) == [0x4321])  # it went out; it arrives
+            await eventually(lambda: r.units[2].bank.read("holding", 5, 1, 0) == [0x4321])  # it was sent, so it arrives
         blocked = rig(tmp_path / "again", config, blocked=lambda bus, unit: "held")
         (tmp_path / "again").mkdir()
         async with blocked as r, r.raw() as raw:

@@ -1,4 +1,4 @@
-"""A whole bus on a serial port that goes away, comes back, or is held by somebody else: real ptys, nothing restarted by hand."""
+"""A whole bus on a serial port that disappears, returns, or is held by a different program: real ptys, no manual restart."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def plant(path: Path) -> Endpoint:
 
 @asynccontextmanager
 async def plugged(path: Path, cells: MapBank) -> AsyncIterator[None]:
-    """A unit on an adapter, as long as that is plugged in."""
+    """A unit on an adapter, while that is plugged in."""
     end = await PtyEnd.open(path / "line", plant(path), None)
     task = asyncio.create_task(serve_rtu(end, RtuSlave({1: ModbusUnit(cells)}), CLOCK))
     try:
@@ -46,7 +46,7 @@ async def plugged(path: Path, cells: MapBank) -> AsyncIterator[None]:
 
 
 class Watched:
-    """A bus with one device, and what its tag says."""
+    """A bus with one device, and the state of its tag."""
 
     def __init__(self, path: Path) -> None:
         self.tags = TagTable(CLOCK)

@@ -1,4 +1,4 @@
-"""The pace of a Modbus bus in virtual time: dead units, pauses, periods and phases, and what goes before what."""
+"""Timing of a Modbus bus in virtual time: dead units, pauses, periods and phases, and priorities."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def observed(
 def test_mb_062_dead_units_cost_the_others_no_more_than_the_share_of_their_probes(
     dead: list[int], share: float
 ) -> None:
-    """Units that answer lose no more polls than the share of the bus that probes may take, however many units are silent."""
+    """Units that answer lose no more polls than the share of the bus that probes may use, whatever the number of silent units."""
     living = [a for a in range(1, 5) if a not in dead][:3]
     config = BusConfig("line", LINE, 0.5, 1, probe_share=share)
     end_s, rate = 240.0, 5
@@ -76,14 +76,14 @@ def test_mb_062_dead_units_cost_the_others_no_more_than_the_share_of_their_probe
         assert without == pytest.approx((end_s - settled_s) * rate, abs=2)
         assert with_dead >= (1 - share) * without - 1.2 * rate  # a probe may just have ended
     probes = sorted(t for a in dead for t in beside.line.times(a, settled_s))
-    assert len(probes) >= 0.8 * share * (end_s - settled_s) - 2  # they are asked again: the share is used
+    assert len(probes) >= 0.8 * share * (end_s - settled_s) - 2  # they are probed again: the share is used
     shortened_s = 0.05 + 0.013  # the timeout while the latency seen is 5 ms, and what the request itself takes
     assert len(probes) * shortened_s <= share * (end_s - settled_s) + 3.0 + len(dead) * shortened_s
     assert {d.driver.config.address for d in beside.bus.devices if d.online} == set(living)
 
 
 def test_mb_062_a_unit_that_comes_and_goes_has_no_larger_share() -> None:
-    """It says who it is, and then nothing more: every time it seems to be back."""
+    """It answers the identification and then nothing more, each time it seems to be back."""
 
     async def main() -> VirtualBus:
         def make(tags: TagTable) -> list[RegisterDriver]:
@@ -111,8 +111,8 @@ def test_a_dead_unit_that_is_plugged_in_is_back_within_its_back_off() -> None:
             assert v.tags.current("d1.level", 0).reason is Reason.TIMEOUT
             tries = v.line.times(1)
             pauses = [b - a for a, b in pairwise(tries[1:])]
-            assert pauses[0] == pytest.approx(0.7, abs=0.1)  # a timeout, and the pause behind it
-            assert max(pauses) == pytest.approx(4.2, abs=0.1)  # alone on its bus it costs nobody anything
+            assert pauses[0] == pytest.approx(0.7, abs=0.1)  # a timeout, and the pause after it
+            assert max(pauses) == pytest.approx(4.2, abs=0.1)  # alone on its bus it delays no other unit
             v.line.units[1] = unit()
             await wait(4.3)
             assert v.bus.devices[0].online
@@ -124,7 +124,7 @@ def test_a_dead_unit_that_is_plugged_in_is_back_within_its_back_off() -> None:
 
 
 def test_a_unit_has_its_own_timeout_and_retries() -> None:
-    """Once a unit was heard. Before that, where other units wait for the line, it is asked with shortened timeouts."""
+    """This applies after a unit answered once. Before that, if other units wait for the line, its timeouts are shortened."""
 
     async def main() -> None:
         def make(tags: TagTable) -> list[RegisterDriver]:
@@ -137,7 +137,7 @@ def test_a_unit_has_its_own_timeout_and_retries() -> None:
         async def scenario(v: VirtualBus) -> None:
             v.line.slow[1] = 1.5
             await wait(12)
-            assert v.bus.devices[2].online  # slower than the bus allows, and granted it
+            assert v.bus.devices[2].online  # slower than the bus allows, as it may be
             assert v.bus.devices[0].online
             assert not v.bus.devices[1].online
             del v.line.units[2]
@@ -157,7 +157,7 @@ def test_a_unit_has_its_own_timeout_and_retries() -> None:
 
 
 def test_while_a_unit_has_its_pause_others_have_the_line() -> None:
-    """Unit 1 wants 80 ms between two requests; a group of it takes four. Unit 2 is read every 20 ms all the same."""
+    """Unit 1 needs 80 ms between two requests; a group of it takes four. Unit 2 is still read every 20 ms."""
 
     async def main() -> None:
         def make(tags: TagTable) -> list[RegisterDriver]:
@@ -291,11 +291,11 @@ def test_a_missed_period_is_skipped_and_counted_and_never_made_up_for() -> None:
             times = v.line.times(1, 9)
             gaps = [b - a for a, b in pairwise(times)]
             assert [round(g, 1) for g in gaps if g > 0.15] == [1.0] * 2
-            assert min(gaps[1:]) > 0.02  # no burst: at once behind the gap, and then on the grid again
+            assert min(gaps[1:]) > 0.02  # no burst: at once after the gap, and then on the grid again
             assert all(t % 0.1 < 0.03 or t % 0.1 > 0.099 for t in times if not 0 < t % 10 < 1.1)
             assert (
                 v.bus.devices[0].schedule.missed["values"] - missed == 16
-            )  # the one that was late each time is none of them
+            )  # the one that was late each time is not among them
 
         await run_bus(make, {1: unit(), 2: unit()}, scenario)
 

@@ -1,5 +1,5 @@
-"""A device that says busy (exception 06) to everything for a while, in virtual time: it gets one growing pause, whatever it is
-asked, and is back soon after it is ready."""
+"""A device that answers busy (exception 06) to everything for a while, in virtual time: it gets one growing pause for all
+requests, and returns soon after it is ready."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ BUSY_FROM_S, READY_S = 2.0, 5.0
 
 
 class Device:
-    """The connector to one unit. `busy` says to which register, when, it says so."""
+    """The connector to one unit. `busy` decides by register and time whether it answers busy."""
 
     def __init__(self, busy: Callable[[float, int], bool]) -> None:
         self._busy = busy
         self.asked: list[tuple[float, int, bool]] = []
-        """When, for which register, and whether it was busy."""
+        """Time, register, and whether it was busy."""
         self.wire = VirtualWire(LAN, self._on_request)
 
     def _on_request(self, adu: bytes) -> None:

@@ -1,4 +1,4 @@
-"""Any CAN interface of python-can as a connection: its virtual bus, slcan to the software bus, and what is refused."""
+"""Any CAN interface of python-can as a connection: its virtual bus, slcan to the software bus, and refused configurations."""
 
 from __future__ import annotations
 

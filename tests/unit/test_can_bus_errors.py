@@ -1,4 +1,4 @@
-"""Errors on the modelled CAN bus: what each costs in bits, who counts it, error-passive, bus-off and the way back.
+"""Errors on the modelled CAN bus: cost of each in bits, the counters, error-passive, bus-off and recovery.
 
 125 kbit/s: a bit is 8 us. Identifier 000h without data takes 53 bits (test_can_timing, by hand), 40 of them stuffed.
 """
@@ -51,7 +51,7 @@ def changes(bus: CanBus, node: int) -> list[CanErrorState]:
 
 def test_an_error_frame_and_the_frame_again() -> None:
     bus, (a, b, c) = make(3)
-    # Bit 3 of "00000 1 00000 1..." is read as 1 by everybody. The sender's flag begins at bit 4; the receivers have seen
+    # Bit 3 of "00000 1 00000 1..." is read as 1 by all nodes. The sender's flag begins at bit 4; the receivers have seen
     # 0001 and after six dominant bits a broken stuffing, so they add six: 12 of flags, 8 of delimiter, 3 of interframe space.
     bus.disturb(spoil(Disturbance(at_bit=3)))
     bus.submit(a, ZERO, 0)
@@ -59,7 +59,7 @@ def test_an_error_frame_and_the_frame_again() -> None:
     (fault,) = bus.take_faults()
     assert (fault.kind, fault.t_ns, fault.bits, fault.senders) == ("bit", 4 * BIT_NS, 4 + 12 + 8 + 3, (a,))
     assert (done.start_ns, done.frame.t_ns) == (27 * BIT_NS, (27 + 50) * BIT_NS)
-    # +8 and then -1 for the frame that came through; +1 and -1.
+    # +8 and then -1 for the successful frame; +1 and -1.
     assert fault.counters == ((a, 8, 0), (b, 0, 1), (c, 0, 1))
     assert [counters(bus, n) for n in (a, b, c)] == [(7, 0), (0, 0), (0, 0)]
     assert (bus.frames, bus.error_frames, bus.bits) == (1, 1, 27 + 53)
@@ -70,7 +70,7 @@ def test_a_receiver_that_objects_alone_counts_nine() -> None:
     bus.disturb(spoil(Disturbance(seen_by=frozenset({b}))))
     bus.submit(a, ZERO, 0)
     bus.advance(43 * BIT_NS)
-    assert bus.take_faults() == []  # not yet: an attempt is judged when its regular end has come
+    assert bus.take_faults() == []  # not yet: an attempt is evaluated after its regular end
     assert len(bus.advance(END)) == 1
     (fault,) = bus.take_faults()
     # A wrong check sum: b's flag follows the acknowledge delimiter, at bit 40 + 3; the others see it at once: 7 bits of flags.
@@ -134,7 +134,7 @@ def test_flags_overlap_as_bits_do(can_id: int, data: bytes, where: float, flippe
     at = int(where * (len(wire) - 3))
     last = wire[at] if not flipped else "10"[int(wire[at])]
     if at >= bits_to_end(frame) - 10:
-        last = wire[at]  # in the fixed form an error shows at once; the flag after it is what is asked about
+        last = wire[at]  # in the fixed form an error is detected at once; the test is about the flag after it
     seen = wire[:at] + last
     assert error_flag_bits(frame, seen) == flags_by_brute_force(frame, seen)
     assert 6 <= error_flag_bits(frame, seen) <= 12
@@ -170,7 +170,7 @@ def test_in_bus_off_a_node_neither_hears_nor_acknowledges_nor_sends() -> None:
     bus.advance((32 * 27 + 16 * 8 + 50) * BIT_NS)
     assert bus.error_state(a)[0] is BUS_OFF
     bus.submit(b, ONE, 1000 * BIT_NS)
-    assert bus.advance(2000 * BIT_NS) == []  # nobody acknowledges it
+    assert bus.advance(2000 * BIT_NS) == []  # no node acknowledges it
     assert {f.kind for f in bus.take_faults()[32:]} == {"ack"}
     done = bus.advance(END)
     assert [d.frame.can_id for d in done] == [0x000, 0x001, 0x010]
@@ -196,7 +196,7 @@ def test_recovery_counts_the_ends_of_others_frames() -> None:
 
 
 def bits_of_error() -> int:
-    """What one error at bit 3 of 7FFh costs."""
+    """Return the cost of one error at bit 3 of 7FFh."""
     bus, (a, _) = make(2)
     bus.disturb(spoil(Disturbance(at_bit=3)))
     bus.submit(a, CanFrame(0x7FF), 0)
@@ -209,7 +209,7 @@ def test_an_error_passive_node_waits_eight_bits_and_others_do_not() -> None:
     bus.disturb(spoil(Disturbance(at_bit=3), times=16))
     bus.submit(a, ZERO, 0)
     bus.submit(a, ZERO, 0)
-    bus.submit(b, ONE, (16 * 27 + 1) * BIT_NS)  # within the suspension: it may start at once, though 000h waits
+    bus.submit(b, ONE, (16 * 27 + 1) * BIT_NS)  # within the suspension: it may start at once, although 000h waits
     done = bus.advance(END)
     assert [d.frame.can_id for d in done] == [1, 0, 0]
     assert done[0].start_ns == (16 * 27 + 1) * BIT_NS
@@ -221,7 +221,7 @@ def test_a_passive_receiver_goes_without_and_spoils_nothing() -> None:
     bus.disturb(spoil(Disturbance(seen_by=frozenset({b})), times=None))
     bus.submit(a, ZERO, 0)
     (done,) = bus.advance(END)
-    # 15 objections at 9 make 135: passive. The next attempt goes through, c has it and b has not.
+    # 15 rejections at 9 make 135: passive. The next attempt succeeds, c receives it and b does not.
     assert (done.receivers, bus.error_frames) == ((c,), 15)
     assert counters(bus, b) == (0, 136)
     assert bus.error_state(b)[0] is PASSIVE
@@ -239,23 +239,23 @@ def test_a_good_frame_brings_a_passive_receiver_back() -> None:
     bus.undisturb(rule)
 
 
-# -- nobody acknowledges --------------------------------------------------------------------------------------------
+# -- without acknowledgement ----------------------------------------------------------------------------------------
 
 
 def test_nobody_acknowledges_passive_and_never_bus_off() -> None:
     bus, (a,) = make(1, monitored=False)
     bus.submit(a, ZERO, 0)
-    assert bus.advance(3600 * 10**9) == []  # an hour, in no time: tries that change nothing are counted, not made
+    assert bus.advance(3600 * 10**9) == []  # an hour at once: attempts that change nothing are counted, not simulated
     assert bus.error_state(a) == (PASSIVE, 128, 0)
     assert changes(bus, a) == [WARNING, PASSIVE]
     # 42 bits to the acknowledge slot, a flag of 6, 8 and 3: 59 bits, and 8 more once it is passive.
     assert bus.error_frames == pytest.approx(3600 * 125_000 / 67, rel=1e-4)
-    assert bus.next_event_ns() is None  # and nothing wakes anybody up
+    assert bus.next_event_ns() is None  # and no node is woken
     b = bus.join(3600 * 10**9)
     (done,) = bus.advance(3601 * 10**9)
     assert (done.receivers, done.senders) == ((b,), (a,))
     assert done.start_ns - 3600 * 10**9 <= 67 * BIT_NS
-    assert (done.start_ns // BIT_NS - 16 * 59 - 8) % 67 == 0  # in the rhythm that it always had
+    assert (done.start_ns // BIT_NS - 16 * 59 - 8) % 67 == 0  # in its usual rhythm
     assert bus.error_state(a) == (WARNING, 127, 0)
 
 
@@ -281,7 +281,7 @@ def test_a_collision_lasts_until_the_recessive_one_is_passive() -> None:
     bus.submit(a, CanFrame(0x181, b"\xff"), 0)
     bus.submit(b, CanFrame(0x181, b"\x7f"), 0)
     first, second = bus.advance(END)
-    # 16 collisions at the data's first bit, TEC + 8 each: 128, error-passive. Then a's objection is recessive: b comes through,
+    # 16 collisions at the data's first bit, TEC + 8 each: 128, error-passive. Then a's flag is recessive: b's frame succeeds,
     # a counts that too and sends alone after its suspension.
     assert (bus.conflicts, bus.error_frames) == (17, 16)
     assert (first.senders, first.frame.data, first.receivers) == ((b,), b"\x7f", (c,))
@@ -306,7 +306,7 @@ def test_collisions_of_three_and_the_same_frame_twice() -> None:
 
 def test_who_gives_way_again_and_again_goes_to_bus_off_too() -> None:
     bus, (a, b, _) = make(3)
-    # 16 collisions; then a, error-passive, gives way to b, whose frame is spoilt each time: + 8 for both until they are off.
+    # 16 collisions; then a, error-passive, yields to b, whose frame is corrupted each time: + 8 for both until they are off.
     bus.disturb(spoil(match=lambda frame: frame.data == b"\x7f", times=16))
     bus.submit(a, CanFrame(0x181, b"\xff"), 0)
     bus.submit(b, CanFrame(0x181, b"\x7f"), 0)
@@ -324,11 +324,11 @@ def test_collisions_go_on_to_bus_off() -> None:
     for _ in range(40):
         assert bus.submit(a, CanFrame(0x181, b"\xff"), 0)
         assert bus.submit(b, CanFrame(0x181, b"\x7f"), 0)
-    assert len(bus.advance(END)) == 80  # late, and whole
+    assert len(bus.advance(END)) == 80  # late, and complete
     assert BUS_OFF in changes(bus, a)
 
 
-# -- whatever happens -----------------------------------------------------------------------------------------------
+# -- arbitrary sequences --------------------------------------------------------------------------------------------
 
 frames = st.builds(CanFrame, st.integers(0, 6), st.sampled_from([b"", b"\x00", b"\x7f", b"\xff", bytes(8)]))
 troubles = st.lists(
@@ -367,7 +367,7 @@ def test_no_frame_is_lost_and_looking_changes_nothing(
 
     done, notices, bus = run([])
     assert run(looks)[:2] == (done, notices)
-    # Conservation: each frame that was submitted is sent by its node once, in its order.
+    # Conservation: each submitted frame is sent by its node once, in order.
     for node in range(4):
         sent = [d.frame.key() for d in done if node + 1 in d.senders]
         assert sent == [f.key() for n, f, _ in sorted(items, key=lambda i: i[2]) if n == node]
@@ -383,7 +383,7 @@ def test_no_frame_is_lost_and_looking_changes_nothing(
     assert stats["bits"] == sum(d.bits for d in done) + sum(errors)
     assert all(0 <= n["tec"] < 256 and 0 <= n["rec"] <= 255 and n["queued"] == 0 for n in stats["nodes"])
     assert sum(n["sent"] for n in stats["nodes"]) == len(items)
-    # States change one step after another, and only bus-off ends by itself.
+    # States change one step at a time, and only bus-off ends automatically.
     for node in range(1, 5):
         own = [n for n in notices if n.node == node]
         assert all(a.state is b.before and a.t_ns <= b.t_ns for a, b in itertools.pairwise(own))

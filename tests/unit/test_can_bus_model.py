@@ -1,4 +1,4 @@
-"""The bus model: who goes first, exact times, who receives, bounds and counts. 125 kbit/s: a bit is 8 us."""
+"""The bus model: arbitration, exact times, receivers, bounds and counts. 125 kbit/s: a bit is 8 us."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def test_who_comes_before_the_start_takes_part_whoever_has_looked() -> None:
     bus.submit(a, ONE, 0)
     bus.submit(a, CanFrame(0x300), 0)
     assert keys(bus.advance(380 * US)) == [0x001]
-    assert bus.next_event_ns() is not None  # 300h, from 400 us on, as things stand
+    assert bus.next_event_ns() is not None  # 300h, from 400 us on, in the present state
     bus.submit(b, ZERO, 400 * US)
     assert keys(bus.advance(END)) == [0x000, 0x300]
 
@@ -158,7 +158,7 @@ def test_a_full_queue_refuses_and_takes_again_when_a_frame_has_gone() -> None:
     bus = CanBus(125_000, queue_frames=2)
     a, b = bus.join(0), bus.join(0)
     assert [bus.submit(a, ZERO, 0) for _ in range(3)] == [True, True, False]
-    assert bus.submit(b, ONE, 0)  # only the sender itself is held back
+    assert bus.submit(b, ONE, 0)  # only the sender itself is delayed
     assert not bus.submit(a, ZERO, 400 * US - 1)
     assert bus.submit(a, ZERO, 400 * US)
     assert len(bus.advance(END)) == 4

@@ -1,4 +1,4 @@
-"""The catalogue's rows that concern the bus: tests/vectors/canopen_bus.toml on the model, then what CANopen nodes make of it."""
+"""The rows of the test-case list that concern the bus: tests/vectors/canopen_bus.toml on the model, then on CANopen nodes."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def test_row(row: dict[str, Any], look_bits: int | None) -> None:
         assert bus.error_frames == row["errors"]
 
 
-# -- length codes of classic frames, and frames that are none -------------------------------------------------------
+# -- length codes of classic frames, and invalid frames --------------------------------------------------------------
 
 
 @pytest.mark.parametrize("length_code", range(9, 16))
@@ -111,7 +111,8 @@ def test_co_064_a_classic_record_cannot_carry_can_fd() -> None:
 
 
 def on_bus(node_end: NodeEnd, happens: Happens, **options: bool) -> list[str]:
-    """What another node hears, from the emulated node's boot-up on, with its time in ms; `happens` at 100 ms."""
+    """Return the frames that another node receives, from the emulated node's boot-up on, with times in ms; `happens` at 100
+    ms."""
 
     async def main() -> list[str]:
         loop = asyncio.get_running_loop()
@@ -162,7 +163,7 @@ def test_co_061_a_node_in_bus_off_is_silent_and_says_8140h_when_it_is_back() -> 
 
     heard = on_bus(plain, happens)
     # 32 attempts of some 40 bits, 128 more of suspension, and 128 * 11 bits: 23 ms.
-    # 8120h was queued on the way to bus-off: it goes out when the rest does.
+    # 8120h was queued before bus-off: it is sent with the rest.
     assert [line.split()[1] for line in heard] == [
         "705#00", "585#4F01100000000000", "085#2081110000000000", "085#0000000000000000", "085#4081110000000000"
     ]  # fmt: skip
@@ -174,13 +175,13 @@ def test_co_062_a_node_whose_receive_queue_overflows_says_8110h() -> None:
         return bus.attach(where, "node", max_pending=4)
 
     async def happens(bus: BusRunner, tester: AttachedConnection) -> None:
-        for _ in range(20):  # all at once: nobody can take them in between
+        for _ in range(20):  # all at once: no node can receive them in between
             await tester.send(CanFrame(0x000, b"\x01\x10"))
 
     assert [line.split()[1] for line in on_bus(small, happens, paced=False)] == ["705#00", "085#1081110000000000"]
 
 
-# -- synchronous TPDOs that do not get onto the bus within their window ----------------------------------------------
+# -- synchronous TPDOs that miss their window ------------------------------------------------------------------------
 
 
 def behind_faults(bus: BusRunner, where: Endpoint) -> CanConnection:
@@ -197,7 +198,7 @@ def behind_faults(bus: BusRunner, where: Endpoint) -> CanConnection:
 def test_co_048_a_synchronous_tpdo_that_waits_beyond_the_window_is_never_sent(
     window_us: int, in_front: int, said: list[str], end: NodeEnd
 ) -> None:
-    """Each frame in front takes about 0.9 ms of the bus, and wins against the TPDO."""
+    """Each frame in front takes about 0.9 ms of the bus, and wins the arbitration against the TPDO."""
 
     async def happens(bus: BusRunner, tester: AttachedConnection) -> None:
         window = window_us.to_bytes(4, "little").hex()

@@ -1,4 +1,4 @@
-"""Several tasks that send on one end of the software bus while its transmit queue is full: nobody overtakes."""
+"""Several tasks that send on one end of the software bus while its transmit queue is full: none overtakes another."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def test_senders_that_wait_for_room_keep_their_order() -> None:
         heard += [(await listener.recv()).can_id for _ in range(FRAMES)]
         await asyncio.gather(*senders)
         assert heard == [*range(0x100, 0x100 + FRAMES), 0x001]
-        # Each try at a full queue is counted, once.
+        # Each attempt at a full queue is counted once.
         assert runner.stats()["nodes"][0]["refused"] == FRAMES
 
     VirtualLoop().run_until_complete(main())

@@ -1,6 +1,6 @@
-"""CAN FD frames on the modelled bus: their bits, and how long they take with the bit-rate switch (ISO 11898-1:2015, 10.4.2).
+"""CAN FD frames on the modelled bus: their bits, and their duration with the bit-rate switch (ISO 11898-1:2015, 10.4.2).
 
-CAN FD frames were refused before.
+Defect: CAN FD frames were refused.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ ALTERNATING = CanFrame(0x2AA, b"\x55" * 64, fd=True, brs=True)
 
 
 def unstuffed(bits: str) -> tuple[str, int]:
-    """Take out the bit after each run of five, as a receiver does; the bits, and how many were taken out."""
+    """Remove the bit after each run of five, as a receiver does; return the bits, and the number of removed ones."""
     out, run, at, taken = "", 0, 0, 0
     while at < len(bits):
         run = run + 1 if at and bits[at] == bits[at - 1] else 1
@@ -50,7 +50,7 @@ def unstuffed(bits: str) -> tuple[str, int]:
 
 
 def remainder(bits: str, polynomial: int, length: int) -> int:
-    """Divide with the check sum's register preset to its highest bit, on integers."""
+    """Divide with the checksum's register preset to its highest bit, on integers."""
     value = int(bits, 2) ^ (1 << len(bits) - 1)
     while value.bit_length() > length:
         value ^= polynomial << value.bit_length() - length - 1

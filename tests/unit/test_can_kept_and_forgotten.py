@@ -1,6 +1,6 @@
-"""What is kept between two frames is forgotten when what it follows from changed: node, bus, master and driver.
+"""Values cached between two frames are dropped when their source changes: node, bus, master and driver.
 
-And a node that is run by its timer's callback does what one with a task of its own would do.
+A node that is run by its timer's callback also behaves like one with a separate task.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ PROFILE = load_profile(Path(__file__).parents[2] / "profiles" / "devices" / "inc
 
 
 def cyclic(ms: int) -> Rig:
-    """OPERATIONAL, TPDO1 each so many ms, what it had to say at the start being said."""
+    """OPERATIONAL, TPDO1 every so many ms, after all frames of the start."""
     rig = Rig()
     assert rig.write(0x1800, 5, ms, 2) == ""
     rig.nmt(1)
@@ -66,9 +66,9 @@ def test_an_event_timer_that_the_device_changes_itself_is_heeded_from_the_next_o
 def test_a_tpdo_that_the_device_itself_makes_synchronous_is_no_longer_sent_by_time() -> None:
     rig = cyclic(100)
     rig.advance(150)
-    rig.node.set_value(0x1800, 2, b"\x01", rig.now_ns)  # nobody wrote it: no hook tells of it
+    rig.node.set_value(0x1800, 2, b"\x01", rig.now_ns)  # it was not written, so no hook reports it
     assert rig.advance(500) == []
-    assert len(rig.node.set_value(0x1800, 2, b"\xfe", rig.now_ns)) == 1  # its time came meanwhile
+    assert len(rig.node.set_value(0x1800, 2, b"\xfe", rig.now_ns)) == 1  # it became due meanwhile
 
 
 def test_a_new_mapping_is_sent_and_watched() -> None:
@@ -80,11 +80,11 @@ def test_a_new_mapping_is_sent_and_watched() -> None:
         assert rig.write(index, sub, value, size) == ""
     assert rig.send(0x180 + NODE, remote=True) == ["185#0000"]
     assert [str(f) for f in rig.node.set_value(0x2002, 0, b"\x07\x00", rig.now_ns)] == ["185#0700"]
-    assert rig.node.set_value(0x2000, 0, b"\x08\x00", rig.now_ns) == []  # mapped no more
+    assert rig.node.set_value(0x2000, 0, b"\x08\x00", rig.now_ns) == []  # no longer mapped
 
 
 def test_parts_of_objects_are_cut_out_of_them() -> None:
-    """A BOOLEAN mapped by its one bit is no whole object: the next one begins in the same byte."""
+    """A BOOLEAN mapped by its one bit is not a whole object: the next one begins in the same byte."""
     text = RICH.replace(pdo("1800", "1A00", "$NODEID+0x180", 254, [0x20000010, 0x20020010]), "")
     text += var("2020", 1, "ro", 1, 1) + var("2021", U16, "ro", 3, 1)
     rig = Rig(text + pdo("1800", "1A00", "$NODEID+0x180", 254, [0x20200001, 0x20210010]))
@@ -111,7 +111,7 @@ def test_a_node_that_is_mute_asks_for_nothing_that_it_could_not_send() -> None:
 
 
 class Mirror(DeviceModel):
-    """Shows 2006h in 2002h, and how often it was asked in 6000h."""
+    """Show 2006h in 2002h, and its number of reads in 6000h."""
 
     def __init__(self) -> None:
         self.steps = 0
@@ -175,7 +175,7 @@ def test_a_device_holds_a_number_within_its_type(number: float) -> None:
 
 
 def delivered(bus: CanBus, sender: int, at_ms: int) -> tuple[int, ...]:
-    """Who receives a frame that `sender` sends."""
+    """Return the receivers of a frame that `sender` sends."""
     bus.submit(sender, CanFrame(0x123), at_ms * NS_PER_MS)
     (delivery,) = bus.advance((at_ms + 5) * NS_PER_MS)
     return tuple(delivery.receivers)
@@ -229,7 +229,7 @@ def test_a_frame_is_stamped_and_stays_what_it_was() -> None:
 
 
 def on_bus(node: CanopenNode, script: Any, *, queue_frames: int = 64, faulty: bool = False) -> None:
-    """Serve `node` on a bus in virtual time, beside `script(bus, listener, task)`."""
+    """Serve `node` on a bus in virtual time, parallel to `script(bus, listener, task)`."""
     loop = VirtualLoop()
 
     async def main() -> None:
@@ -335,7 +335,7 @@ def test_another_scale_holds_for_the_next_frame() -> None:
 
 
 def test_a_node_that_is_watched_anew_is_missed_in_its_own_time() -> None:
-    """Its heartbeats are no news, and the timer that is set is that of another node, far away."""
+    """Its heartbeats change nothing, and the active timer belongs to a different node, far in the future."""
     lost: list[tuple[int, int]] = []
 
     async def main() -> None:
@@ -370,7 +370,7 @@ def test_a_heartbeat_like_the_last_one_counts_from_when_it_came() -> None:
     assert [e.kind for e in consumer.observe(5, b"\x05", 0)] == ["state"]
     assert consumer.observe(5, b"\x05", 90 * NS_PER_MS) == ()
     assert consumer.deadline_ns(5) == 190 * NS_PER_MS
-    late = consumer.observe(5, b"\x05", 191 * NS_PER_MS)  # nobody checked in between
+    late = consumer.observe(5, b"\x05", 191 * NS_PER_MS)  # no check took place in between
     assert [e.kind for e in late] == ["heartbeat-lost", "heartbeat-back"]
     assert consumer.state(5) is NmtState.OPERATIONAL
     assert consumer.deadline_ns(7) is None

@@ -1,4 +1,4 @@
-"""Reading the kernel's word about a CAN interface."""
+"""Reading the kernel's information about a CAN interface."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Frame lengths and arbitration keys, against vectors worked out by hand and an oracle written another way."""
+"""Frame lengths and arbitration keys, against vectors computed by hand and an oracle with a different method."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from fieldtwin.gateway.core.canframe import CanFrame
 def frames(draw: st.DrawFn) -> CanFrame:
     extended, remote = draw(st.booleans()), draw(st.booleans())
     can_id = draw(st.integers(0, 0x1FFFFFFF if extended else 0x7FF))
-    # Bytes of few kinds: long runs are what stuffing is about.
+    # Bytes of few kinds, because stuffing depends on long runs.
     data = draw(st.lists(st.sampled_from([0x00, 0xFF, 0x0F, 0xF8, 0x55]) | st.integers(0, 255), max_size=8))
     if remote:
         return CanFrame(can_id, extended=extended, remote=True, dlc=len(data))
@@ -49,7 +49,7 @@ def test_a_stuff_bit_starts_a_new_run() -> None:
 
 
 def _oracle_length(frame: CanFrame) -> int:
-    """The same by other means: polynomial division of big integers, and stuffing by a regular expression."""
+    """Compute the same by other means: polynomial division of big integers, and stuffing by a regular expression."""
     rtr = str(int(frame.remote))
     if frame.extended:
         text = f"{frame.can_id:029b}"

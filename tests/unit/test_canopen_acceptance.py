@@ -1,4 +1,4 @@
-"""The emulated node's acceptance filter: what it keeps out could not have meant anything, and it follows the dictionary."""
+"""The emulated node's acceptance filter: a frame that it rejects could have had no effect, and it follows the dictionary."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""How the gateway boots the nodes of a CAN bus: identity, DCF and its date, store, LSS, SYNC and TIME; and what it survives.
+"""How the gateway boots the nodes of a CAN bus: identity, DCF and its date, store, LSS, SYNC and TIME; and the errors it
+survives.
 
 In virtual time, against a small node of the tests.
 """
@@ -45,7 +46,7 @@ def u32(value: int) -> bytes:
 
 
 def node(*, heartbeat_s: float = 0.1, serial: int = 0x44) -> PeerNode:
-    """The inclinometer, mapped to TPDO1 and started by whoever may."""
+    """The inclinometer, mapped to TPDO1 and started by any master."""
     objects = {(0x1000, 0): u32(0x2019A), (0x1001, 0): b"\0", (0x1017, 0): b"\0\0", (0x1010, 1): u32(1)}
     objects |= {(0x1018, sub): u32(v) for sub, v in enumerate((0x11, 0x22, 0x33, serial), 1)} | {(0x1018, 0): b"\x04"}
     objects |= {(0x1020, 1): u32(0), (0x1020, 2): u32(0), (0x2000, 0): b"\x07", (0x2001, 3): b"\0\0"}
@@ -138,7 +139,7 @@ def test_the_dcf_is_written_once_and_again_when_the_node_has_lost_it(tmp_path: P
             written = [(0x2000, 0, "09"), (0x2001, 3, "3412"), (0x1020, 1, "983a0000"), (0x1020, 2, "d2040000")]
             assert r.peer.writes == [*written, (0x1017, 0, "6400")]
             assert r.peer.state == 0x05
-            r.peer.power_off()  # and on again at once: no heartbeat is missed, the boot-up alone tells it (CO-035)
+            r.peer.power_off()  # and on again at once: no heartbeat is missed, only the boot-up shows it (CO-035)
             r.peer.power_on()
             await asyncio.sleep(0.01)
             assert r.status.boots == 1
@@ -161,7 +162,7 @@ def test_a_node_that_holds_the_date_is_not_written_to_again(tmp_path: Path) -> N
             r.peer.power_on()
             await asyncio.sleep(0.01)
             assert r.status.online
-            assert r.peer.writes == [(0x1017, 0, "6400")]  # the system file's heartbeat, and nothing of the DCF
+            assert r.peer.writes == [(0x1017, 0, "6400")]  # the system file's heartbeat, and not that of the DCF
 
     run_virtually(main())
 
@@ -170,7 +171,7 @@ def test_a_node_that_runs_is_halted_before_its_configuration_changes(tmp_path: P
     async def main() -> None:
         peers = PeerBus([node(heartbeat_s=0.001)])
         peers.nodes[0].power_on()
-        peers.nodes[0].command(1)  # somebody has started it already
+        peers.nodes[0].command(1)  # a different master has started it already
         async with rig(tmp_path, peers, CanopenNodeConfig(configuration=DCF)) as r:
             await asyncio.sleep(0.6)
             assert [f.data for f in r.peers.sent if f.can_id == 0] == [bytes([0x80, NODE]), bytes([1, NODE])]
@@ -239,7 +240,7 @@ def test_a_lost_heartbeat_makes_values_bad_at_once_and_is_recovered_from(tmp_pat
             r.peer.say(0x180, bytes.fromhex("D2040CFE"))
             await asyncio.sleep(0.001)
             assert r.tags.current("incl.slope_long", 0).value == 12.34
-            r.peer.state = 0  # it hangs: no boot-up, nothing
+            r.peer.state = 0  # it hangs: it sends neither a boot-up nor anything else
             await asyncio.sleep(0.352)
             assert r.quality() == ("bad", "heartbeat lost")
             r.peer.state = 0x7F
@@ -317,7 +318,7 @@ def test_a_node_id_is_given_over_lss_to_the_one_that_shall_have_it(tmp_path: Pat
                     if reply is not None:
                         end.peer.feed(CanFrame(0x7E4, reply.ljust(8, b"\0")))
                     if slave.node != before == 0xFF:
-                        peers.nodes[0].power_on()  # it boots under its node id
+                        peers.nodes[0].power_on()  # it boots under its node ID
 
         peers.listeners.append(lss)
         boot = CanopenNodeConfig(identity=ExpectedIdentity(serial=0x44), lss=WHO)
@@ -353,7 +354,7 @@ def test_emergencies_are_kept(tmp_path: Path) -> None:
             assert r.status.emcy_log.describe(2_000_000_000)[0]["meaning"] == "CAN overrun (objects lost)"
             r.peer.command(0x82)
             await asyncio.sleep(0.001)
-            assert r.status.emcy_log.active == ()  # it boots afresh; the history stays
+            assert r.status.emcy_log.active == ()  # it boots again; the history remains
             assert r.status.emcys == 1
 
     run_virtually(main())

@@ -1,4 +1,4 @@
-"""The CANopen keys of a system file: what they become, and what is wrong with them, told with file and line."""
+"""The CANopen keys of a system file: their effects, and errors in them, reported with file and line."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ RPDO1 = "writable: [controlword, target_velocity, mode], rpdo1: "
 
 
 def drive(tmp_path: Path, **keys: str) -> str:
-    """The system with a drive in the inclinometer's place."""
+    """The system with a drive in place of the inclinometer."""
     path = Path(write(tmp_path, **keys))
     path.write_text(path.read_text(encoding="utf-8").replace("inclinometer-cia410", "drive-cia402"), encoding="utf-8")
     return str(path)

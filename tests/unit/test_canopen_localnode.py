@@ -1,4 +1,4 @@
-"""The rows of the emulated node on `canopen`'s LocalNode: what it does otherwise is known, row by row, and nothing else is."""
+"""The rows of the emulated node on `canopen`'s LocalNode: its deviations are listed, row by row, and there are no others."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The CANopen master over a bus in memory: dispatch, NMT, heartbeats, PDOs, EMCY, and what happens when it ends."""
+"""The CANopen master over a bus in memory: dispatch, NMT, heartbeats, PDOs, EMCY, and its end."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from fieldtwin.gateway.protocols.canopen.sdo_channel import NodeRestarted
 
 
 class Bench:
-    """A master, the other end of its bus, and the events it told."""
+    """A master, the other end of its bus, and its events."""
 
     def __init__(self) -> None:
         ours, self.node = bus()
@@ -30,7 +30,7 @@ class Bench:
         return [event.kind for event in self.events]
 
     async def send(self, *frames: str) -> None:
-        """Let the master receive these, to the last."""
+        """Let the master receive all of these."""
         before = self.master.counters.frames_in
         for text in frames:
             await self.node.send(frame(text))
@@ -180,7 +180,7 @@ def test_a_heartbeat_that_waits_unread_is_not_late() -> None:
             heard = bench.events[0].t_ns
             clock = LoopClock()
             await clock.sleep_until_ns(heard + 950_000_000)
-            # A heartbeat of 0.9 s is in the stream; the reader is busy elsewhere and is not woken till 1.3 s.
+            # A heartbeat of 0.9 s is in the stream; the reader is busy elsewhere and is not woken until 1.3 s.
             bench.ours.inbound.write(CanFrame(0x705, b"\x05", t_ns=heard + 900_000_000))
             await clock.sleep_until_ns(heard + 1_300_000_000)
             assert bench.master.counters.heartbeats == 1
@@ -211,7 +211,7 @@ def test_co035_a_boot_up_that_nobody_asked_for_is_unexpected() -> None:
     async def main() -> None:
         bench = Bench()
         async with running(bench.master):
-            await bench.send("705#00")  # power on: the first that is heard
+            await bench.send("705#00")  # power on: the first one received
             await asyncio.sleep(1)
             await bench.master.nmt(NmtCommand.RESET_NODE, 5)
             await bench.send("705#00")
@@ -343,7 +343,7 @@ def test_a_lost_bus_fails_what_waits_at_once_and_what_comes_later() -> None:
 
 
 def test_a_boot_up_ends_the_transfer_under_way_and_it_is_asked_again_at_once() -> None:
-    """The node will never answer what it forgot: nobody waits for it, and no late reply is expected."""
+    """The node will never answer a request that it forgot: the master does not wait for it, and expects no late reply."""
 
     async def main() -> None:
         bench = Bench()

@@ -1,4 +1,4 @@
-"""EDS and DCF files as vendors write them: what is read, what is mended, what is refused and where."""
+"""EDS and DCF files as vendors write them: accepted constructs, corrections, and refusals with their position."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Our master against our emulated node on the modelled bus, in virtual time: two readings of one standard.
+"""Our master against our emulated node on the modelled bus, in virtual time: two implementations of one standard.
 
-They share no protocol code. On this bus identical frames of several nodes are one, as LSS wants it.
+They share no protocol code. On this bus identical frames of several nodes are one, as LSS requires.
 """
 
 from __future__ import annotations

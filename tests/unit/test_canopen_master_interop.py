@@ -1,4 +1,5 @@
-"""Our master against the `canopen` package's own LocalNode, over python-can's `virtual` bus: another reading of CiA 301."""
+"""Our master against the `canopen` package's LocalNode, over python-can's `virtual` bus: an independent implementation of CiA
+301."""
 
 from __future__ import annotations
 
@@ -194,7 +195,7 @@ def test_identity_heartbeat_and_nmt() -> None:
         async with pair() as p:
             p.master.add_node(NODE, heartbeat_consumer_ms=2000)
             assert await read_identity(p.master, NODE) == Identity(0x2019A, 1, 2, 3, 4)
-            p.node.nmt.send_command(0)  # as after power on
+            p.node.nmt.send_command(0)  # as after power-on
             await p.master.nmt(NmtCommand.ENTER_PRE_OPERATIONAL, NODE)
             await eventually(lambda: p.node.nmt.state == "PRE-OPERATIONAL")
             await set_heartbeat_producer(p.master, NODE, 50)
@@ -221,7 +222,7 @@ def test_a_tpdo_is_configured_read_back_and_received() -> None:
             assert (after.cob_id, after.enabled, after.transmission_type, after.event_ms) == (0x1A5, True, 254, 100)
             assert after.mapping == mapping
             store = p.node.data_store
-            assert store[0x1800][1] == bytes.fromhex("A5010040")  # remote frames stay forbidden
+            assert store[0x1800][1] == bytes.fromhex("A5010040")  # remote frames remain forbidden
             assert store[0x1800][3] == b"\x14\x00"
 
             seen: list[bytes] = []

@@ -1,7 +1,7 @@
-"""The rows of the catalogue of CANopen edge cases that concern the master, each on the whole master.
+"""The rows of the list of CANopen edge cases that concern the master, each on the whole master.
 
-A row of tests/vectors/canopen_master.toml is frames and times in, frames and times out, outcomes, and the resulting state. It is
-played in virtual time: the times are exact.
+A row of tests/vectors/canopen_master.toml has frames and times in, frames and times out, results, and the final state. It runs
+in virtual time, so times are exact.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ MS = 1_000_000
 
 
 class Play:
-    """One row: a master on a bus of two whose other end is the row, and what became of it."""
+    """One row: a master on a bus of two whose other end is the row, and its result."""
 
     def __init__(self, row: dict[str, Any]) -> None:
         self.row = row

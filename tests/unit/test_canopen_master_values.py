@@ -1,4 +1,4 @@
-"""Data types, PDO mappings and EMCY messages: pure, both ways, and against any bytes."""
+"""Data types, PDO mappings and EMCY messages: pure, in both directions, and with arbitrary bytes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a PLC commands CANopen nodes: RPDOs, downloads, safe values; polls over SDO and what grows stale. In virtual time.
+"""A PLC's commands to CANopen nodes: RPDOs, downloads, safe values; polls over SDO and stale values. In virtual time.
 
 The nodes are the emulated drive and I/O module, on a bus in memory.
 """
@@ -57,7 +57,7 @@ MODULED = replace(
 
 
 class Field:
-    """A `Connector` to a bus with one emulated node. `sent` is what the gateway sent, with its time."""
+    """A `Connector` to a bus with one emulated node. `sent` has the gateway's frames with their times."""
 
     def __init__(self, loop: VirtualLoop, config: DeviceConfig) -> None:
         self.sent: list[CanFrame] = []
@@ -102,7 +102,7 @@ class Field:
 
     @property
     def rpdos(self) -> list[str]:
-        """RPDOs of the node, as candump writes them."""
+        """Return RPDOs of the node, in candump's notation."""
         return [str(f) for f in self.sent if f.can_id in (0x207, 0x307, 0x407)]
 
     @property
@@ -144,7 +144,7 @@ class Rig:
 async def rig(
     path: Path, config: DeviceConfig = DRIVEN, *, allow_writes: bool = True, sync_ms: int = 0
 ) -> AsyncIterator[Rig]:
-    """A writer that ticks every 10 ms over a bus that runs; 0.3 s later the node is up."""
+    """A writer that ticks every 10 ms over a running bus; after 0.3 s the node is up."""
     loop = asyncio.get_running_loop()
     assert isinstance(loop, VirtualLoop)
     field, tags, audit = Field(loop, config), TagTable(loop), AuditLog(path / "audit", loop)
@@ -177,14 +177,14 @@ def test_what_a_scan_commands_goes_in_one_frame_and_only_when_it_changes(tmp_pat
     async def main() -> None:
         async with rig(tmp_path) as r:
             assert r.status.online
-            assert r.field.rpdos == []  # nobody commanded anything
+            assert r.field.rpdos == []  # no program commanded anything
             r.want(controlword=6, target_velocity=1000)
             await asyncio.sleep(0.3)
             assert r.field.rpdos == ["207#0600E8030000"]
             assert r.tags.current("d.statusword", 0).value & 0x6F == 0x21  # type: ignore[operator]
             r.want(controlword=7)
             await asyncio.sleep(0.05)
-            r.want(target_velocity=-1)  # too soon after the last: it waits, and what changes meanwhile goes with it
+            r.want(target_velocity=-1)  # too soon after the last: it waits, and changes made meanwhile go with it
             await asyncio.sleep(0.02)
             r.want(controlword=15)
             await asyncio.sleep(0.3)
@@ -202,11 +202,11 @@ def test_what_a_scan_commands_goes_in_one_frame_and_only_when_it_changes(tmp_pat
 def test_the_drive_runs_and_a_lost_plc_stops_it(tmp_path: Path) -> None:
     async def main() -> None:
         async with rig(tmp_path) as r:
-            r.want(mode=3)  # no RPDO carries it: over SDO
+            r.want(mode=3)  # no RPDO carries it, so it is written by SDO
             for word in (6, 7, 15):
                 r.want(controlword=word, target_velocity=0)
                 await asyncio.sleep(0.15)
-            r.want(target_velocity=800)  # the controlword goes with it, as it was
+            r.want(target_velocity=800)  # the controlword goes with it, unchanged
             await asyncio.sleep(1)
             assert r.field.downloaded(0x6060) == [b"\x03"]
             assert r.tags.current("d.velocity", 0).value == 800
@@ -225,24 +225,24 @@ def test_nothing_goes_to_a_node_that_is_not_operational_and_all_of_it_when_it_is
             r.want(controlword=6, target_velocity=5)
             await asyncio.sleep(0.2)
             sent = len(r.field.rpdos)
-            await r.status.driver.master.send(CanFrame(0, bytes([0x80, NODE])))  # another master's doing
+            await r.status.driver.master.send(CanFrame(0, bytes([0x80, NODE])))  # a change by a different master
             await asyncio.sleep(0.2)
             r.want(controlword=7)
             await asyncio.sleep(0.5)
             assert len(r.field.rpdos) == sent
             assert not r.bus.takes(r.status.driver, "controlword")
-            assert r.writer.failures == 0  # it waits, and is not tried in vain
+            assert r.writer.failures == 0  # it waits, without futile attempts
             await r.status.driver.master.send(CanFrame(0, bytes([0x01, NODE])))
             await asyncio.sleep(0.2)
             assert r.field.rpdos[sent:] == ["207#070005000000"]
-            for command in (0x80, 0x01):  # who knows what it did with its outputs meanwhile
+            for command in (0x80, 0x01):  # the state of its outputs meanwhile is unknown
                 await r.status.driver.master.send(CanFrame(0, bytes([command, NODE])))
                 await asyncio.sleep(0.2)
             assert r.field.rpdos[sent:] == ["207#070005000000"] * 2
             await r.status.driver.master.send(CanFrame(0, bytes([0x80, NODE])))
             await asyncio.sleep(1.9)
             assert r.status.bring_ups == 1
-            await asyncio.sleep(0.5)  # nobody started it: it is brought up again
+            await asyncio.sleep(0.5)  # it was not started: the gateway brings it up again
             assert r.status.bring_ups == 2
             assert r.field.rpdos[sent:] == ["207#070005000000"] * 3
 
@@ -262,9 +262,9 @@ def test_a_node_that_restarts_is_mapped_again_and_told_again(tmp_path: Path, hea
             assert r.field.rpdos == ["207#060005000000"] * 2
             assert r.field.downloaded(0x6060) == [b"\x03"] * 2
             assert (r.field.held(0x6040), r.field.held(0x60FF)) == (6, 5)
-            assert r.writer.rewrites == 0  # its boot-up said it; nobody had to find out by reading
+            assert r.writer.rewrites == 0  # the boot-up reported it; no read was needed
             await r.field.power_off()
-            await asyncio.sleep(1)  # its heartbeat is missed: nothing is on its way for ever
+            await asyncio.sleep(1)  # its heartbeat is missing: no write stays in transit for ever
             r.want(controlword=7)
             await asyncio.sleep(1)
             assert not any(o.pending for o in r.writer.outputs)
@@ -287,7 +287,7 @@ def test_a_read_only_plant_is_sent_no_rpdo_and_no_download(tmp_path: Path) -> No
             assert {line[:2] for line in r.audit("refuse")} >= {("d.mode", "plc")}
             ends: list[FieldtwinError | None] = []
             driver = r.status.driver
-            r.bus.write(driver, "mode", driver.command("mode", 1), ends.append)  # nor round the writer
+            r.bus.write(driver, "mode", driver.command("mode", 1), ends.append)  # nor past the writer
             assert isinstance(ends[0], NotAllowed)
 
     run_virtually(main())
@@ -320,7 +320,7 @@ def test_the_nodes_own_rpdos_are_used_where_all_in_them_may_be_written(tmp_path:
         config = replace(MODULED, canopen=CanopenNodeConfig(adopt_rpdos=True))
         async with rig(tmp_path, config) as r:
             assert [rpdo.tags for rpdo in r.status.driver.rpdos] == [("outputs_1", "outputs_2")]
-            r.want(outputs_1=0xA5, analogue_out_1=2.5)  # RPDO2 has analogue_out_2 too, which nobody may write
+            r.want(outputs_1=0xA5, analogue_out_1=2.5)  # RPDO2 also has analogue_out_2, which is not writable
             await asyncio.sleep(0.3)
             assert r.field.rpdos == ["207#A500"]
             assert r.field.downloaded(0x6411) == [(8192).to_bytes(2, "little")]
@@ -380,7 +380,7 @@ def test_a_device_that_holds_something_else_is_told_again(tmp_path: Path) -> Non
         async with rig(tmp_path, replace(DRIVEN, poll={"values": 50})) as r:
             r.want(mode=3)
             await asyncio.sleep(0.5)
-            await r.status.driver.master.sdo_download(NODE, 0x6060, 0, b"\x01")  # somebody else's doing
+            await r.status.driver.master.sdo_download(NODE, 0x6060, 0, b"\x01")  # a change by a different client
             await asyncio.sleep(0.5)
             assert r.field.downloaded(0x6060) == [b"\x03", b"\x01", b"\x03"]
             assert r.writer.rewrites == 1
@@ -443,11 +443,11 @@ def _rpdo(number: int, *objects: tuple[int, int, int], enabled: bool = True) -> 
     ("held", "writable", "expected"),
     [
         ([_rpdo(1, (0x6040, 0, 16))], {"controlword"}, [1]),
-        ([_rpdo(1, (0x6040, 0, 16))], set(), []),  # nobody may write it
+        ([_rpdo(1, (0x6040, 0, 16))], set(), []),  # it is not writable
         ([_rpdo(1, (0x6040, 0, 16), enabled=False)], {"controlword"}, []),
         ([_rpdo(1, (0x6040, 0, 16), (0x6060, 0, 8))], {"controlword"}, []),  # it would write the mode too
-        ([_rpdo(1, (0x6040, 0, 16), (0x2345, 0, 8))], {"controlword"}, []),  # nor what nobody knows
-        ([_rpdo(1, (0x6040, 0, 8))], {"controlword"}, []),  # of another size
+        ([_rpdo(1, (0x6040, 0, 16), (0x2345, 0, 8))], {"controlword"}, []),  # nor an unknown object
+        ([_rpdo(1, (0x6040, 0, 8))], {"controlword"}, []),  # of a different size
         ([_rpdo(1, (5, 0, 8), (0x6040, 0, 16))], {"controlword"}, [1]),  # a gap
         ([_rpdo(1, (5, 0, 8))], {"controlword"}, []),
         ([_rpdo(1, (0x6040, 0, 16)), _rpdo(2, (0x6040, 0, 16), (0x60FF, 0, 32))], WRITABLE, [2]),

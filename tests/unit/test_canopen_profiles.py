@@ -1,5 +1,5 @@
-"""The reference nodes of the CiA device profiles: data sheets that three readers take alike, short profiles, recordings
-that their script makes again, and each node on the software bus, read and commanded by the gateway's own driver."""
+"""The reference nodes of the CiA device profiles: data sheets that three readers interpret identically, short profiles,
+recordings that their script can regenerate, and each node on the software bus, read and commanded by the gateway's driver."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def test_three_readers_take_a_data_sheet_alike(name: str) -> None:
         assert (variable.min, variable.max) == (entry.low, entry.high)
         assert variable.encode_raw(variable.default) == entry.initial(node)
         if isinstance(variable.default, float):
-            assert other.default == pytest.approx(variable.default, rel=1e-6)  # what a REAL32 keeps of it
+            assert other.default == pytest.approx(variable.default, rel=1e-6)  # the part of it that a REAL32 holds
         else:
             assert variable.default == other.default
 
@@ -249,7 +249,7 @@ def test_the_driver_reads_what_the_node_holds(name: str, tmp_path: Path) -> None
                     column = [rig.track.at(t, tag.name) for t in range(61)]
                     assert isinstance(got.value, int | float)
                     assert min(column) - tag.scale <= got.value <= max(column) + tag.scale
-                    early = rig.track.at(0.0, tag.name)  # it has only just begun to play
+                    early = rig.track.at(0.0, tag.name)  # its replay has only just started
                     assert got.value == pytest.approx(early, rel=0.2, abs=max(1.0, tag.scale))
 
     run(main())

@@ -1,4 +1,5 @@
-"""The SDO server under any client on any wire: what it holds is always what some client wrote whole, and it always comes back."""
+"""The SDO server with any client on any wire: it always holds a value that some client wrote completely, and it always
+recovers."""
 
 from __future__ import annotations
 
@@ -16,16 +17,17 @@ BLOCK = 5
 
 
 class Chaos(RuleBasedStateMachine):
-    """A client that downloads and uploads in all ways, over a wire that loses, doubles and reorders, and that stops at will.
+    """A client that downloads and uploads in all ways, over a wire that loses, doubles and reorders, and that stops at any
+    time.
 
-    Values carry their length and check sum, so that a value put together from two transfers is seen at once.
+    Values carry their length and checksum, so a value combined from two transfers is detected at once.
     """
 
     def __init__(self) -> None:
         super().__init__()
         self.rig = Rig(RICH, NodeContext(sdo_block=BLOCK))
-        self.complete = {b""}  # all values that a client ever began to write
-        self.frames: list[bytes] = []  # what the client of the present download still has to send
+        self.complete = {b""}  # all values that a client ever started to write
+        self.frames: list[bytes] = []  # data that the client of the present download still has to send
         self.serial = 0
 
     def request(self, data: bytes) -> list[bytes]:
@@ -78,10 +80,10 @@ class Chaos(RuleBasedStateMachine):
 
     @rule(block=st.integers(1, BLOCK), acknowledged=st.lists(st.integers(0, BLOCK), min_size=1, max_size=30))
     def block_upload(self, block: int, acknowledged: list[int]) -> None:
-        """A client that loses segments of every sub-block, and gives up when it runs out of patience."""
+        """A client that loses segments of every sub-block, and gives up after a number of attempts."""
         answer = self.request(b"\xa4" + mux(NAME, 0) + bytes([block, 0]))
         if not answer or answer[0][0] != 0xC6:
-            return  # taken for a segment of a download that is under way
+            return  # treated as a segment of the current download
         got, sent = b"", self.request(b"\xa3")
         for number in acknowledged:
             good = min(number, len(sent))
@@ -100,7 +102,7 @@ class Chaos(RuleBasedStateMachine):
         assert self.rig.node.data.get(BLOB) in self.complete
 
     def teardown(self) -> None:
-        """Never stuck: after a second of silence the node is as good as new."""
+        """It never hangs: after a second of silence the node is in its initial state."""
         self.rig.advance(1000)
         assert self.rig.read(0x1000) == 0
         value = self.value(30)
@@ -134,7 +136,7 @@ test_chaos = Chaos.TestCase
 @given(value=st.binary(max_size=400), lost=st.sets(st.integers(0, 120), max_size=60), block=st.integers(1, 127))
 @settings(max_examples=60, deadline=None)
 def test_a_block_download_arrives_whatever_is_lost(value: bytes, lost: set[int], block: int) -> None:
-    """A client by the book, whose n-th segment gets lost for each n in `lost`; the acknowledgement says what to send again."""
+    """A correct client whose n-th segment is lost for each n in `lost`; the acknowledgement tells which segments to repeat."""
     rig = Rig(RICH, NodeContext(sdo_block=block))
     head = 0x600 + rig.node_id
     rig.send(head, (b"\xc6" + mux(BLOB, 0) + len(value).to_bytes(4, "little")).hex())
@@ -150,7 +152,7 @@ def test_a_block_download_arrives_whatever_is_lost(value: bytes, lost: set[int],
         answer = answer or [frame for _, frame in rig.advance(500)]
         assert len(answer) == 1
         if answer == [f"585#80{mux(BLOB, 0).hex()}00000405"]:
-            return  # a second without a frame that arrives is the end of any transfer
+            return  # a second without a received frame ends any transfer
         assert answer[0].startswith("585#A2")
         offset += int(answer[0][6:8], 16)
     end = bytes([0xC1 | (7 - len(chunks[-1])) << 2]) + crc_hqx(value, 0).to_bytes(2, "little")

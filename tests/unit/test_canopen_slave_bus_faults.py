@@ -1,4 +1,4 @@
-"""An emulated node on a bus whose errors drive it to error-passive and bus-off: what it says, and when nothing."""
+"""An emulated node on a bus whose errors drive it to error-passive and bus-off: its frames, and when it must be silent."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from fieldtwin.gateway.core.errors import FieldtwinError
 
 
 async def spoiled(times: int) -> tuple[list[str], CanopenNode]:
-    """What a node with a heartbeat of 50 ms says when so many of its frames are spoiled from 100 ms on."""
+    """Return the frames of a node with a heartbeat of 50 ms when so many of its frames are corrupted from 100 ms on."""
     loop = asyncio.get_running_loop()
     assert isinstance(loop, VirtualLoop)
     bus = BusRunner(125_000)

@@ -1,4 +1,4 @@
-"""Reading data sheets: what real ones hold, what is refused, and with which line."""
+"""Reading data sheets: contents of real ones, refused constructs, and the line in the error."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from fieldtwin.emulators.canopen.node_data import NodeData
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 
 SHARED = ROOT.parent / "shared" / "data" / "eds"
-"""Real data sheets beside the checkout; tests that want them skip without."""
+"""Real data sheets next to the checkout; tests that need them are skipped without them."""
 
 
 def test_the_inclinometer() -> None:
@@ -39,7 +39,7 @@ def test_the_inclinometer() -> None:
     "path", [INCLINOMETER, SHARED / "sample.eds", SHARED / "cia402_slave.eds"], ids=lambda p: p.name
 )
 def test_agrees_with_the_canopen_package(path: Path) -> None:
-    """Two readings of one file: the gateway's side uses that package, this side its own reader."""
+    """Two readers of one file: the gateway's side uses that package, this side its own reader."""
     if not path.exists():
         pytest.skip("the file is not here")
     ours, theirs = load_eds(path), canopen.import_od(str(path), node_id=5)
@@ -52,7 +52,7 @@ def test_agrees_with_the_canopen_package(path: Path) -> None:
         elif entry.subindex in other.subindices and entry.name != "Highest subindex supported":
             variable = other[entry.subindex]
         else:
-            continue  # a compact array: that package makes up what the file leaves out
+            continue  # a compact array: that package invents the omitted values
         assert variable.pdo_mappable == entry.mappable, entry
         assert variable.access_type == entry.access, entry
         if variable.default is not None and codec.is_number(entry.data_type):

@@ -1,4 +1,4 @@
-"""The emulated node and a stranger: the `canopen` package's client over python-can's virtual bus, in real time."""
+"""The emulated node and a third-party client: the `canopen` package over python-can's virtual bus, in real time."""
 
 from __future__ import annotations
 

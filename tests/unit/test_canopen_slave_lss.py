@@ -1,4 +1,4 @@
-"""LSS with several nodes on one bus, in virtual time: replies that overlap are one frame, and a scan finds all."""
+"""LSS with several nodes on one bus, in virtual time: overlapping replies are one frame, and a scan finds all nodes."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def unnamed(identity: tuple[int, ...]) -> CanopenNode:
 
 
 class Scanner:
-    """A master that asks for 128 bits one by one. `gap_s` after the question is when it asks the next."""
+    """A master that asks for 128 bits one by one, each `gap_s` after the previous request."""
 
     def __init__(self, end: AttachedConnection, gap_s: float) -> None:
         self._end = end
@@ -48,7 +48,7 @@ class Scanner:
         return replies > 0
 
     async def scan(self) -> tuple[int, ...] | None:
-        """The lowest identity of those without a node id; that node is left in configuration."""
+        """Return the lowest identity of the nodes without a node ID; that node remains in configuration."""
         if not await self.ask(0x51, 0, 0, 0, 0, 0x80, 0, 0):
             return None
         found = []
@@ -98,7 +98,7 @@ def test_co_056_all_are_found_and_named_lowest_first(identities: list[tuple[int,
 
 
 def test_co_059_a_scan_that_is_too_fast_corrupts_no_identity() -> None:
-    """Asked again before the reply can be there, nobody is named by mistake."""
+    """If the master asks again before the reply can arrive, no wrong node is identified."""
 
     async def main() -> tuple[int, int]:
         loop = asyncio.get_running_loop()

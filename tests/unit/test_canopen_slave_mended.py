@@ -1,4 +1,4 @@
-"""Data sheets as tools leave them: what is mended is said with its line; what cannot be used names file, section and key."""
+"""Data sheets as tools write them: corrections are reported with their line; unusable ones with file, section and key."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def test_encodings(tmp_path: Path, encoding: str, told: list[str]) -> None:
 
 
 def test_compact_pdos_work() -> None:
-    """Five TPDOs of which none is described: four on the predefined identifiers, mapped by the client."""
+    """Five undescribed TPDOs: four on the predefined identifiers, mapped by the client."""
     text = "[DeviceInfo]\nCompactPDO=0x13\nNrOfRXPDO=1\nNrOfTXPDO=5\n" + LEAST + var("2002", 6, "ro", 0x1234, 1)
     assert [str(note) for note in parse_eds(text).notes] == [
         "line 2: 1 of 1 PDOs from 1400h on are made by CompactPDO",

@@ -1,4 +1,4 @@
-"""The emulated node on the bus: NMT, error control, PDOs, SYNC and EMCY, row by row of the catalogue (CO-0xx)."""
+"""The emulated node on the bus: NMT, error control, PDOs, SYNC and EMCY, row by row of the test-case list (CO-0xx)."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def rig() -> Rig:
 
 
 def tpdo1(rig: Rig, *, kind: int = 254, inhibit: int = 0, event: int = 0, sync_start: int = 0) -> None:
-    """Configure TPDO1 by the book and leave it valid."""
+    """Configure TPDO1 as the standard requires and leave it valid."""
     cob = 0x180 + NODE
     for sub, value, size in ((1, 1 << 31 | cob, 4), (2, kind, 1), (3, inhibit, 2), (5, event, 2), (6, sync_start, 1)):
         assert rig.write(0x1800, sub, value, size) == ""
@@ -424,7 +424,7 @@ def test_what_no_emcy_can_carry(rig: Rig) -> None:
             rig.node.raise_error(code, rig.now_ns, register=register, info=info)
 
 
-# -- anything ------------------------------------------------------------------------------------------------------
+# -- arbitrary frames -----------------------------------------------------------------------------------------------
 
 SOME_IDS = [0x000, 0x080, 0x185, 0x205, 0x305, 0x605, 0x705, 0x70A]
 SETTINGS = [0x1005, 0x1014, 0x1015, 0x1016, 0x1017, 0x1019, 0x1400, 0x1600, 0x1800, 0x1A00, 0x1801, 0x1A01]

@@ -1,4 +1,4 @@
-"""The emulated node in front of the `canopen` package's client and LSS master, on the software bus, in real time."""
+"""The emulated node with the `canopen` package's client and LSS master, on the software bus, in real time."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def test_sdo_in_all_its_ways() -> None:
             blob = BLOB + bytes([crc])
             with sdo[0x2009].open("wb", size=len(blob), block_transfer=True, request_crc_support=crc) as file:
                 file.write(blob)
-            # Not without CRC: the client then checks the one that it said it does without, and which is 0.
+            # Not without CRC: the client then checks the field although it announced no CRC, and the field is 0.
             with sdo[0x2009].open("rb", block_transfer=True) as file:
                 assert file.read() == blob
         for index, code in ((0x2003, 0x06010001), (0x3000, 0x06020000)):
@@ -123,7 +123,7 @@ def test_nmt_pdo_and_emcy() -> None:
 
 
 def test_lss_fastscan() -> None:
-    """CO-057: the one without an id is found and named; who has an id keeps out."""
+    """CO-057: the node without an ID is found and gets one; nodes with an ID do not respond."""
     factory = {(0x1018, sub): part.to_bytes(4, "little") for sub, part in ((1, 1), (2, 2), (3, 4), (4, 0x80000000))}
     nodes = [
         CanopenNode(parse_eds(RICH), UNCONFIGURED, NodeContext(factory=factory)),
@@ -132,7 +132,7 @@ def test_lss_fastscan() -> None:
 
     def client(network: canopen.Network) -> None:
         lss: Any = network.lss
-        lss.RESPONSE_TIMEOUT = 0.3  # five times nobody answers; on a loaded host an answer takes its time
+        lss.RESPONSE_TIMEOUT = 0.3  # five times without an answer; on a loaded host an answer takes longer
         assert lss.fast_scan() == (True, [1, 2, 4, 0x80000000])
         assert lss.inquire_node_id() == UNCONFIGURED
         lss.configure_node_id(10)

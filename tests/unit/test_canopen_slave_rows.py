@@ -20,7 +20,7 @@ from fieldtwin.gateway.core.errors import FieldtwinError
 ROWS = load()
 BIT_RATE = 1_000_000
 WIRE_MS = 2.0
-"""A handful of frames at 1 Mbit/s, which is what the bus may add to any time of a row."""
+"""A few frames at 1 Mbit/s, which is the delay that the bus may add to any time of a row."""
 
 
 def test_ids_are_unique() -> None:
@@ -50,7 +50,7 @@ def frames(said: list[tuple[float, str]]) -> list[CanFrame]:
 
 
 async def on_bus(row: Row) -> tuple[list[tuple[float, str]], CanopenNode]:
-    """The row with a bus between: what the other end hears, and when, without the boot-up that begins it."""
+    """Run the row with a bus between; return the frames at the other end with their times, without the initial boot-up."""
     loop = asyncio.get_running_loop()
     assert isinstance(loop, VirtualLoop)
     bus = BusRunner(BIT_RATE)
@@ -60,7 +60,7 @@ async def on_bus(row: Row) -> tuple[list[tuple[float, str]], CanopenNode]:
     serving = asyncio.create_task(serve_node(own, node, loop, pokes))
     heard: list[tuple[float, str]] = []
     listening = asyncio.create_task(listen(other, loop, heard))
-    await asyncio.sleep(0.001)  # what is sent along with the boot-up may be one frame with it
+    await asyncio.sleep(0.001)  # a frame sent together with the boot-up may be merged with it
     start_ns = loop.monotonic_ns()
     try:
         for at_ms, what in row.hear:

@@ -1,4 +1,4 @@
-"""The emulated node's SDO server, row by row of the catalogue (CO-0xx), and under any interleaving."""
+"""The emulated node's SDO server, row by row of the test-case list (CO-0xx), and under any interleaving."""
 
 from __future__ import annotations
 
@@ -232,7 +232,7 @@ def test_every_request_is_counted_with_its_reply(rig: Rig) -> None:
 
 
 class AnyClient(RuleBasedStateMachine):
-    """Whatever a client sends, in whatever order: one reply or none, as the state demands, and a sane value after it."""
+    """For any requests in any order: one reply or none, as the state requires, and a valid value afterwards."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -287,7 +287,7 @@ class AnyClient(RuleBasedStateMachine):
 
     @invariant()
     def a_plain_read_always_works(self) -> None:
-        """Never stuck. Asked of a node in every state that answers; it also ends whatever transfer was under way."""
+        """It never hangs. This request is answered in every state; it also ends any current transfer."""
         if self.state is not NmtState.STOPPED and self.rig.node.counters.sdo_requests % 5 == 0:
             assert self.rig.sdo("40 0010 00") == "4300100000000000"
 

@@ -1,6 +1,7 @@
-"""What a system file says of a CANopen node and its bus, done on the software bus by the whole gateway, against an emulated node.
+"""The keys of a system file for a CANopen node and its bus, executed on the software bus by the whole gateway, with an
+emulated node.
 
-In virtual time. What goes wrong is put on the bus by another node: a reset, a heartbeat switched off, a node id taken away.
+In virtual time. Another node causes the errors on the bus: a reset, a disabled heartbeat, a removed node ID.
 """
 
 from __future__ import annotations
@@ -94,7 +95,7 @@ DELIVERED = {(0x6001, 0): 8192, (0x2000, 1): 7, (0x2000, 2): 7, (0x1020, 1): 0, 
 
 
 class Rig:
-    """The run, its node, another node on the bus, and every value of the winch's position that was published."""
+    """The run, its node, another node on the bus, and every published value of the winch's position."""
 
     def __init__(self, run: VirtualPrototype, node: CanopenNode, other: CanConnection) -> None:
         self.run, self.node, self.other = run, node, other
@@ -112,7 +113,7 @@ class Rig:
         await self.other.send(CanFrame(can_id, bytes.fromhex(data).ljust(2 if can_id == 0 else 8, b"\0")))
 
     async def until_lost_and_found(self) -> None:
-        """The position is bad when the heartbeat's 350 ms are over, whatever TPDOs say, and good again within 12 s."""
+        """The position is bad when the heartbeat's 350 ms are over, whatever the TPDOs contain, and good again within 12 s."""
         self.published.clear()
         began_ns = self.run.loop.now_ns
         await asyncio.sleep(12)
@@ -177,17 +178,17 @@ def test_a_node_is_booted_configured_and_kept_so(tmp_path: Path, loop: VirtualLo
             assert rig.status["tpdos"]["1"]["frames"] > 0
             boots = rig.status["boots"]
 
-            await rig.say(0x000, "81 09")  # reset by somebody else: an unexpected boot-up
+            await rig.say(0x000, "81 09")  # reset by a different master: an unexpected boot-up
             await asyncio.sleep(0.001)
             assert rig.holds() == DELIVERED
             await asyncio.sleep(3)
             assert rig.status["boots"] == boots + 1
             assert rig.holds() == CONFIGURED
 
-            await rig.say(0x609, "2B 17 10 00 00 00 00 00")  # its heartbeat is switched off
+            await rig.say(0x609, "2B 17 10 00 00 00 00 00")  # its heartbeat is disabled
             await rig.until_lost_and_found()
 
-            await rig.say(0x000, "02 09")  # stopped, its node id is taken away, and reset
+            await rig.say(0x000, "02 09")  # it is stopped, its node ID is removed, and it is reset
             for frame in ("04 01", "11 FF", "17"):
                 await rig.say(0x7E5, frame)
             await rig.say(0x000, "82 09")

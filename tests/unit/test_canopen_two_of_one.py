@@ -1,7 +1,7 @@
-"""Two nodes with one node id, and two SYNC producers on one bus, are noticed wherever they show.
+"""Two nodes with one node ID, and two SYNC producers on one bus, are detected wherever they are visible.
 
-The first reply of two nodes was believed, and the second one was dropped without a word, because the next request had been sent
-meanwhile. A second SYNC producer was not noticed at all.
+Defect: the first reply of two nodes was accepted, and the second one was dropped without a message, because the next request
+had been sent meanwhile. A second SYNC producer was not detected at all.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def test_scan_reports_two_nodes_with_one_id() -> None:
 
 
 def test_scan_names_the_two_replies() -> None:
-    """The second reply comes late, after the next request: a node with other firmware thinks longer."""
+    """The second reply comes late, after the next request, because a node with different firmware is slower."""
 
     async def main() -> None:
         async with can_bus(node(5, 0x191, 7)) as connector:
@@ -89,7 +89,7 @@ def _endpoint():  # type: ignore[no-untyped-def]
 
 
 async def _answer_late(end, device_type: int) -> None:  # type: ignore[no-untyped-def]
-    """Another node 5: it answers requests for 1000h 2 ms after they came."""
+    """A second node 5: it answers requests for 1000h after 2 ms."""
     while True:
         frame = await end.recv()
         if frame.can_id == 0x605 and frame.data[:4] == bytes.fromhex("40001000"):

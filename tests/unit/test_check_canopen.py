@@ -1,4 +1,4 @@
-"""`fieldtwin check canopen`: our own node passes every case; `canopen`'s LocalNode gets the verdicts that are known."""
+"""`fieldtwin check canopen`: our node passes every case; `canopen`'s LocalNode gets the documented verdicts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Unfair verdicts of `check canopen`: CO-005 failed a node that aborts, and cases were skipped for a false reason."""
+"""Unfair verdicts of `check canopen`: CO-005 failed a node that aborts, and cases were skipped with a wrong reason."""
 
 from __future__ import annotations
 

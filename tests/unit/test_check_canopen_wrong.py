@@ -1,4 +1,4 @@
-"""Each case for CANopen nodes can fail: a node that is wrong in one thing fails the case that is about it."""
+"""Each case for CANopen nodes can fail: a node with one error fails the case for that error."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ from fieldtwin.gateway.core.connection import CanConnection
 from fieldtwin.results.model import Verdict
 
 Twist = Callable[[CanFrame, list[CanFrame]], list[CanFrame]]
-"""What was heard and what a right node sends for it -> what is sent."""
+"""Map a received frame and the correct reply to the frames sent."""
 MAY_WRITE = ((0x2000, 0), (0x2004, 0), (0x1017, 0))
 SDO, REPLY = 0x600 + NODE, 0x580 + NODE
 
 
 class TwistedNode(CanopenNode):
-    """The node of the tests, wrong in one thing."""
+    """The node of the tests, with one error."""
 
     twist: Twist
     deaf: bytes = b"\xff"
-    """Requests that begin so are not executed, whatever is said."""
+    """Do not execute requests that begin with these bytes, whatever the reply is."""
 
     def accepts(self, frame: CanFrame) -> bool:
         return True
@@ -47,7 +47,7 @@ def reply(text: str) -> CanFrame:
 
 
 def instead(heard: str, said: str) -> Twist:
-    """`said` ('' for silence) to SDO requests that begin with `heard`."""
+    """Reply `said` ('' for silence) to SDO requests that begin with `heard`."""
 
     def twist(frame: CanFrame, right: list[CanFrame]) -> list[CanFrame]:
         asked = frame.can_id == SDO and not frame.extended and frame.data.startswith(bytes.fromhex(heard))
@@ -57,7 +57,7 @@ def instead(heard: str, said: str) -> Twist:
 
 
 def other_abort(code: int, said: str) -> Twist:
-    """`said` instead of an abort with that code."""
+    """Reply `said` instead of an abort with that code."""
     ending = code.to_bytes(4, "little")
 
     def twist(frame: CanFrame, right: list[CanFrame]) -> list[CanFrame]:
@@ -69,7 +69,7 @@ def other_abort(code: int, said: str) -> Twist:
 
 
 def after(heard: str, change: Twist) -> Twist:
-    """`change` what follows right behind a request that begins with `heard`."""
+    """`change` the reply that follows directly after a request that begins with `heard`."""
     armed = [False]
 
     def twist(frame: CanFrame, right: list[CanFrame]) -> list[CanFrame]:
@@ -80,17 +80,17 @@ def after(heard: str, change: Twist) -> Twist:
 
 
 def says_besides(frame: CanFrame, right: list[CanFrame]) -> list[CanFrame]:
-    """A sub-block is acknowledged twice."""
+    """Acknowledge a sub-block twice."""
     return [*right, *(f for f in right if f.can_id == REPLY and f.data[0] == 0xA2)]
 
 
 def acknowledges_all(frame: CanFrame, right: list[CanFrame]) -> list[CanFrame]:
-    """A lost segment is taken for granted."""
+    """Treat a lost segment as received."""
     return [reply("A2 03 7F") if f.can_id == REPLY and f.data[:2] == b"\xa2\x01" else f for f in right]
 
 
 def loses_the_first(frame: CanFrame, right: list[CanFrame]) -> list[CanFrame]:
-    """What is sent again begins with the second segment."""
+    """Start the repetition with the second segment."""
     return right[1:] if frame.data[:2] == b"\xa2\x02" else right
 
 
@@ -147,7 +147,7 @@ ALONG = {
     "CO-001a": {"CO-001b"}, "CO-005": {"CO-003a", "CO-027"}, "CO-017": {"CO-015"}, "CO-019": {"CO-016"},
     "CO-020": {"CO-015", "CO-017"}, "CO-032a": {"CO-027", "CO-032b"},
 }  # fmt: skip
-"""What fails as well, because it is about the same thing."""
+"""Cases that fail as well, because they test the same property."""
 
 
 @pytest.mark.parametrize("case_id", TWISTS)

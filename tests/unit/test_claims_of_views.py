@@ -1,8 +1,8 @@
-"""What the terminal and the audit log claim without having seen it.
+"""Unfounded claims of the terminal and the audit log.
 
-Observed: "ok" for a run whose sensor was silent to the end, without a word that a run with faults does not judge devices; a line
-in the audit log that a heartbeat had been written to a node whose heartbeat is only listened to; and an emulator that refused
-the draft of a profile because the dump beside it is no recording.
+Defects: "ok" for a run whose sensor was silent to the end, without a note that a run with faults does not check devices; an
+audit entry that a heartbeat had been written to a node whose heartbeat is only monitored; and an emulator that refused the
+draft of a profile because the dump in the same folder is not a recording.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def test_a_dump_is_not_taken_for_the_recording_of_the_profile_beside_it(tmp_path
 
 @pytest.mark.parametrize("console", [talk, data])
 def test_a_name_between_colons_stays_a_name(console: Console) -> None:
-    """Observed: `boom.py💥 step() failed` for the class `Boom` of a model."""
+    """Defect: `boom.py💥 step() failed` for the class `Boom` of a model."""
     with console.capture() as seen:
         console.print("boom.py:Boom: step() failed", soft_wrap=True)
     assert seen.get() == "boom.py:Boom: step() failed\n"
@@ -70,7 +70,7 @@ def test_a_name_between_colons_stays_a_name(console: Console) -> None:
 
 @pytest.mark.parametrize("console", [talk, data])
 def test_control_characters_of_a_name_are_shown_and_not_sent(console: Console) -> None:
-    """Observed: the name of a scenario with ESC [31m made the rest of the terminal red."""
+    """Defect: the name of a scenario with ESC [31m made the rest of the terminal red."""
     table = Table("name")
     table.add_row("\x1b[31mred\x07")
     with console.capture() as seen:
@@ -83,7 +83,7 @@ def test_control_characters_of_a_name_are_shown_and_not_sent(console: Console) -
 
 
 def test_the_socket_of_a_killed_plc_is_not_an_instance(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Observed: "several instances are running" after the PLC of an earlier one had been killed."""
+    """Defect: "several instances are running" after the PLC of an earlier one had been killed."""
     with tempfile.TemporaryDirectory(dir="/tmp") as folder:  # short, because of the socket's path
         monkeypatch.setattr(plc_client, "runtime_root", lambda: Path(folder))
         for name in ("killed", "running"):

@@ -1,6 +1,6 @@
-"""The command line's contract: exit codes, whose fault, where in which file; and nothing starts that is wrong.
+"""The command line's contract: exit codes, responsibility, position in files; invalid input is refused before anything starts.
 
-In this process, through `main` as the console script calls it: what is refused must be refused before anything runs.
+The tests call `main` in this process as the console script does.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Invoke = Callable[..., tuple[int, str, str]]
 
 @pytest.fixture
 def invoke(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Invoke:
-    """Call the command; exit code, stdout, stderr. Run directories go to `tmp_path`."""
+    """Call the command; return exit code, stdout, stderr. Run directories are in `tmp_path`."""
     monkeypatch.setenv("FIELDTWIN_RUN", str(tmp_path / "run"))
 
     def call(*args: str) -> tuple[int, str, str]:
@@ -154,7 +154,7 @@ def test_a_wrong_system_file_is_named_with_line_and_what_was_expected(
     where = err.split(f"{path}:", 1)[1].split(" ", 1)[0]
     assert int(where.split(":")[0]) in (line_of(path, line), line_of(path, line) + 1), (
         err
-    )  # YAML sees some a line later
+    )  # YAML reports some one line later
     assert told in err
     assert not (tmp_path / "run").exists() or not list((tmp_path / "run").glob("*/*.log"))  # nothing was started
 

@@ -1,4 +1,4 @@
-"""What a person sees of a run, on a narrow and a low terminal and on none: nothing cut that matters, reasons named."""
+"""The live view of a run, on a narrow and a low terminal and without one: no important text is cut, reasons are shown."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SILENT = "tcp://modem:502: unit 1: no reply within 2.0 s; expected unit 1, funct
 
 @pytest.fixture
 def session() -> RunSession:
-    """A run that was not started, with what its gateway and PLC might have answered."""
+    """A run that was not started, with constructed answers of its gateway and PLC."""
     made = RunSession(RunOptions("observatory", prototype=False, duration_s=20))
     made.started_ns = made.clock.monotonic_ns()
     online: dict[str, Any] = {"online": True, "error": "", "errors": 0}
@@ -109,7 +109,7 @@ def test_every_trouble_is_named_once(session: RunSession) -> None:
     assert troubles(session)[-1] == "PLC: program pump, pump.st:8: LogicError: division by zero"
     session.gateway_status = session.plc_status = None
     assert troubles(session) == ["plc: ended with signal 9"]
-    shown(session, 80)  # and nothing breaks while nobody answers
+    shown(session, 80)  # and nothing breaks if no process answers
 
 
 def test_values_for_people() -> None:

@@ -1,4 +1,4 @@
-"""What a full disk, a folder that is not there and a closed pipe come to: one line that names the place, never our bug."""
+"""A full disk, a missing folder and a closed pipe give one line that names the place, never an internal error."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sea-Bird casts: what is read, converted, refused. All inputs but the last one are made up here."""
+"""Sea-Bird casts: reading, conversion, refusals. All inputs except the last one are synthetic."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid, UsageErro
 from fieldtwin.gateway.core.files.recording import RecordingReader
 
 REAL_CAST = Path(os.environ.get("FIELDTWIN_REAL_CAST", "no-such-cast.cnv.gz"))
-"""A whole cast of a real instrument, which does not ship with the project: name one to test with it."""
+"""A complete cast of a real instrument, which is not part of the project: name one to test with it."""
 
 NAMES = ("prDM: Pressure, Digiquartz [db]", "t090C: Temperature", "c0S/m: Conductivity [S/m]", "timeS: Time", "flag: 0")
 ROWS = ((1.5, 20.25, 4.5, 0.0), (2.5, 19.125, 4.25, 0.5), (3.5, -9.99e-29, 4.125, 1.0))

@@ -1,4 +1,4 @@
-"""Reading and writing by name or address: what is asked, what is refused before anything is sent, what is put back."""
+"""Reading and writing by name or address: requests, refusals before anything is sent, restored values."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_values_come_in_the_fewest_requests_and_a_hole_is_an_answer() -> None:
             assert "02h" in answers["input:4"].problem
             asked = len(wire.requests)
             await point.read(tags)
-            assert len(wire.requests) - asked == 2  # what was learnt stays learnt: the missing one is left alone
+            assert len(wire.requests) - asked == 2  # a learned fact persists: the missing one is not asked again
         assert [f.replace(" ", "")[-8:] for f in dry_point(Target(URL, 1)).read_frames(tags[:2])] == ["00000004"]
 
     run_virtually(main())
@@ -83,7 +83,7 @@ def test_a_profiles_limits_and_names_are_kept() -> None:
             assert wire.requests[-2][:1] == b"\x10"
             sent = len(wire.requests)
             again = await carry_out(point, write, await before(point, write))
-            assert again.same  # kept in memory that wears out: not written again
+            assert again.same  # stored in memory with limited writes: not written again
             assert [r[0] for r in wire.requests[sent:]] == [3]
 
     run_virtually(main())
@@ -105,7 +105,7 @@ def test_what_needs_no_device_is_refused_before_anything_is_sent() -> None:
     with pytest.raises(NotAllowed, match="stands twice"):
         plan_writes([(SDM.tags["demand_period"], "15"), (SDM.tags["demand_period"], "16")])
     raw = tags_of(["holding:2"], "modbus", RawForm("float32"), SDM)[0]
-    assert with_care(raw, SDM).nonvolatile  # an address is no way round
+    assert with_care(raw, SDM).nonvolatile  # a plain address does not bypass it
     with pytest.raises(NotAllowed, match="loses contact"):
         plan_write(with_care(tags_of(["holding:20"], "modbus")[0], SDM), "1")
     with pytest.raises(NotAllowed, match="every unit"):

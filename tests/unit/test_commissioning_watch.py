@@ -1,4 +1,4 @@
-"""Watching: samples in time, bounded histories, sparklines, a picture; and the verbs read, write, watch as a user calls them."""
+"""Watching: samples over time, bounded histories, sparklines, a picture; and the commands read, write, watch."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The concise DCF: its bytes, the way from a DCF to it, what a DCF says of TPDOs and of its date, and what is wrong with one."""
+"""The concise DCF: its bytes, its generation from a DCF, TPDOs and date of a DCF, and errors in one."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ def test_a_mapping_alone_switches_its_pdo_off_and_on_with_the_identifier_that_it
 def test_the_date_is_that_of_1020h() -> None:
     with_date = record("1020", [(5, "const", "2", ""), (7, "rw", "0", "15000"), (7, "rw", "0", "0x4D2")])
     assert configuration_date(dcf(with_date, var("2001", 6, "rw", "0", "1"))) == (15000, 1234)
-    assert settings_of(dcf(with_date)) == ()  # it is written by itself, last
+    assert settings_of(dcf(with_date)) == ()  # it is written separately, last
     assert configuration_date(dcf(var("2001", 6, "rw", "0", "1"))) is None
 
 

@@ -148,7 +148,7 @@ def test_what_arrived_is_read_before_the_loss_and_the_first_reason_stays() -> No
 
 
 def test_each_raise_of_the_loss_is_an_error_of_its_own() -> None:
-    """Who adds where it happened must not find the places of everybody who met the same loss before."""
+    """Adding the place of an error must not change the same error for other readers of the loss."""
 
     async def main() -> None:
         end = End()
@@ -160,7 +160,7 @@ def test_each_raise_of_the_loss_is_an_error_of_its_own() -> None:
         assert end.lost is not None
         assert end.lost.where == "line1"
         other = End()
-        other.feed_lost(ModbusExceptionReply(3, 2))  # a class with arguments of its own
+        other.feed_lost(ModbusExceptionReply(3, 2))  # a class with its own arguments
         with pytest.raises(DeviceRefused, match="illegal data address"):
             await other.read()
 

@@ -1,4 +1,4 @@
-"""Recorded Modbus devices answering again (SPEC ruling 3), against a device that is simulated in a few lines here."""
+"""Recorded Modbus devices that are replayed (SPEC ruling 3), against a device simulated in a few lines here."""
 
 from __future__ import annotations
 
@@ -383,7 +383,7 @@ def test_a_recorded_unit_stands_in_for_a_computed_one(tmp_path: Path) -> None:
 
 
 def test_copies_answer_like_the_first_whatever_another_was_asked() -> None:
-    """Devices of one recording: each begins at its beginning, with its own writes and its own counters."""
+    """Devices of one recording: each starts at its beginning, with separate writes and counters."""
     recorded = [
         ok(read(0), reply(1)),
         ok(read(0), reply(2)),

@@ -1,4 +1,4 @@
-"""The control channel over a real Unix socket and a real TCP port: good requests, garbage, bounds."""
+"""The control channel over a real Unix socket and a real TCP port: valid requests, garbage, bounds."""
 
 from __future__ import annotations
 

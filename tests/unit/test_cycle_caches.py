@@ -1,4 +1,4 @@
-"""What a cycle does not look at again: whatever happened in which order, the image shows what a fresh look would."""
+"""Caches of a scan cycle: after any sequence of events, the image shows the same as a fresh computation."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def one(*regions: RegionLayout) -> Image:
 
 
 def same_to_everybody(image: Image, region: str, old: Snapshot) -> Snapshot:
-    """What a reader that was always there sees is what one sees that comes now, but for messages."""
+    """A long-lived reader sees the same as a new one, except for messages."""
     fresh = image.reader(region).snapshot()
     assert (old.values, old.qualities, old.reasons, old.stamps) == (
         fresh.values, fresh.qualities, fresh.reasons, fresh.stamps,
@@ -145,7 +145,7 @@ def test_inputs_are_what_the_table_holds(steps: list[Any]) -> None:
                     held.value, held.quality, held.reason, held.t_ns,
                 ), name  # fmt: skip
             says = taken
-            if "m.out" in exchange.untaken:  # what came just now is not dealt with yet
+            if "m.out" in exchange.untaken:  # an item that came just now is not yet processed
                 says -= exchange.untaken["m.out"] + len(exchange.new_messages.get("m.out", ()))
             assert snapshot.value(taken_name("m.out")) == TagValue(says, Quality.GOOD, t_ns=clock.now_ns)
             sent = int(snapshot.value("m.inbox").value or 0)
@@ -156,7 +156,7 @@ def test_inputs_are_what_the_table_holds(steps: list[Any]) -> None:
 
 
 class Quiet(Program):
-    """Sets what the test wants, and nothing by itself."""
+    """Set what the test requests, and nothing else."""
 
     x: float | None = var_input(TagKind.REAL)
     box: tuple[Message, ...] = message_input()
@@ -194,7 +194,7 @@ SCANS = st.one_of(
     [("want", 1.0), ("scans", 2), ("force", 1.0), ("scans", 2), ("force", None)]
 )  # the value is the same all the time
 @example([("want", 1.0), ("scans", 2), ("stop",)])
-@example([("want", math.nan), ("scans", 1), ("want", None)])  # no value both times, for different reasons
+@example([("want", math.nan), ("scans", 1), ("want", None)])  # no value in both cases, for different reasons
 @example([("want", 1.0), ("scans", 2), ("arrive", 2), ("scans", 1), ("want", 0.0)])
 @example([("want", 1.0), ("scans", 2), ("hold",), ("send", 6), ("scans", 2), ("taken",)])
 def test_outputs_are_what_the_programs_hold(steps: list[Any]) -> None:

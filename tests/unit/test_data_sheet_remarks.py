@@ -1,7 +1,7 @@
-"""What does not fit a node's data sheet is reported before the node is started, with the option that overrides it.
+"""Contradictions to a node's data sheet are reported before the node starts, with the option that overrides it.
 
-A DCF of node 32 was applied to node 17 without a word, so that two nodes shared COB-IDs; 1006h = 1 us put a drive into a fault
-that never ended; a drive whose 1000h has no value got no state machine, and nothing said so.
+Defects: a DCF of node 32 was applied to node 17 without a message, so that two nodes shared COB-IDs; 1006h = 1 us put a drive
+into a fault that never ended; a drive whose 1000h has no value got no state machine, without a message.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def test_the_factory_settings_hold_without_parameter_values() -> None:
 
 
 def emulated(tmp_path: Path, sheet: str, *options: str) -> tuple[list[str], int, int]:
-    """Run `emulate` on a file; what it printed, the COB-ID of TPDO 1, and the statusword."""
+    """Run `emulate` on a file; return its output, the COB-ID of TPDO 1, and the statusword."""
     path, said = tmp_path / "drive.dcf", tmp_path / "said"
     path.write_text(sheet)
     command = [sys.executable, "-m", "fieldtwin", "emulate", str(path), "--node", "17", *options]

@@ -1,8 +1,8 @@
-"""Silent units must not starve the ones that answer, on a serial line and behind one TCP connection, from the first second.
+"""Silent units must not starve the ones that answer, on a serial line and on one TCP connection, from the first second.
 
-Observed before: 31 units at 19200 bit/s, 30 of them silent, a timeout of 1 s and one retry. The unit that answers was polled
-every 500 ms and kept 12 % of its polls in the first two minutes (61 % on TCP), because the first contact with each silent unit
-took two full timeouts, each with as much quarantine, and because every later probe took a full timeout too.
+Defect: with 31 units at 19200 bit/s, 30 of them silent, a timeout of 1 s and one retry, the unit that answers was polled every
+500 ms and kept 12 % of its polls in the first two minutes (61 % on TCP), because the first contact with each silent unit took
+two full timeouts, each with as much quarantine, and because every later probe took a full timeout too.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def device(address: int, tags: TagTable, every_s: float = PERIOD_S, p=LEVEL, **m
 def thirty_silent(
     endpoint: Endpoint, live: int, seconds: float, timeout_s: float = 1.0, latency_s: float = 0.005
 ) -> VirtualBus:
-    """A bus with 31 configured units, after `seconds`; only the unit `live` answers."""
+    """Run a bus with 31 configured units for `seconds`; only the unit `live` answers."""
 
     async def main() -> VirtualBus:
         def make(tags: TagTable) -> list[RegisterDriver]:
@@ -66,7 +66,8 @@ def thirty_silent(
 
 
 def worst_window(times: list[float], seconds: float, period_s: float = PERIOD_S) -> float:
-    """The lowest share of the polls due that took place, over all windows of one minute that begin on a tenth of a second."""
+    """Return the lowest share of the due polls that took place, over all windows of one minute that start on a tenth of a
+    second."""
     shares = []
     for tenth in range(int((seconds - WINDOW_S) * 10) + 1):
         start_s = tenth / 10
@@ -78,7 +79,7 @@ def worst_window(times: list[float], seconds: float, period_s: float = PERIOD_S)
 @pytest.mark.parametrize("endpoint", [LINE, LAN], ids=["serial line", "tcp"])
 @pytest.mark.parametrize("live", [1, 16, 31])
 def test_a_live_unit_beside_thirty_silent_ones_keeps_its_polls_in_every_minute(endpoint: Endpoint, live: int) -> None:
-    """Wherever it stands in the file: from the first minute on, counted from the start of the bus."""
+    """At any position in the file: from the first minute on, counted from the start of the bus."""
     v = thirty_silent(endpoint, live, 900.0)
     assert worst_window(v.line.times(live), 900.0) >= 0.95
     silent = [a for a in range(1, 32) if a != live]
@@ -93,7 +94,7 @@ def test_the_share_of_polls_does_not_depend_on_the_timeout_or_the_latency(timeou
 
 
 def test_a_silent_unit_is_asked_for_the_shortest_block_that_is_polled() -> None:
-    """A reply of 60 registers would take 65 ms of the line, and the master waits for the time that a whole reply takes."""
+    """A reply of 60 registers would take 65 ms of the line, and the client waits for the time that a whole reply takes."""
 
     async def main() -> VirtualBus:
         def make(tags: TagTable) -> list[RegisterDriver]:
@@ -111,7 +112,7 @@ def test_a_silent_unit_is_asked_for_the_shortest_block_that_is_polled() -> None:
 
 @pytest.mark.parametrize("latency_s", [0.12, 0.3, 0.7])
 def test_a_unit_slower_than_the_first_timeouts_is_found_by_its_late_reply(latency_s: float) -> None:
-    """The shortened timeout is no new limit: a reply within the configured timeout brings a unit into service."""
+    """The shortened timeout does not limit replies: one within the configured timeout brings a unit into service."""
 
     async def main() -> None:
         def make(tags: TagTable) -> list[RegisterDriver]:
@@ -147,7 +148,7 @@ def test_a_unit_that_is_switched_on_is_found_while_the_others_stay_silent() -> N
 
 
 def test_all_units_are_reached_in_turn_when_the_connection_is_made_anew() -> None:
-    """Five unanswered requests end a TCP connection. The unit that answers stands after them, and must have its turn."""
+    """Five unanswered requests end a TCP connection. The unit that answers follows them, and must be polled."""
 
     async def main() -> None:
         def make(tags: TagTable) -> list[RegisterDriver]:
@@ -182,7 +183,7 @@ def test_a_gateway_that_says_nobody_answers_does_not_put_a_unit_into_service() -
 
 
 def test_a_single_silent_unit_keeps_its_configured_timeout() -> None:
-    """Nobody else wants the line: the first contact waits as long as the system file says, and repeats as often."""
+    """No other unit needs the line: the first contact uses the timeout and retries of the system file."""
 
     async def main() -> list[float]:
         def make(tags: TagTable) -> list[RegisterDriver]:
@@ -200,7 +201,8 @@ def test_a_single_silent_unit_keeps_its_configured_timeout() -> None:
 
 
 def test_a_late_reply_is_never_taken_for_the_answer_to_the_next_request_of_the_same_unit() -> None:
-    """A shortened timeout leaves a reply under way. The unit is not asked again until the configured timeout is over."""
+    """With a shortened timeout, a reply may still be in transit. The unit is not asked again until the configured timeout is
+    over."""
 
     async def main() -> VirtualBus:
         def make(tags: TagTable) -> list[RegisterDriver]:
@@ -223,7 +225,7 @@ def test_a_late_reply_is_never_taken_for_the_answer_to_the_next_request_of_the_s
 def test_thirty_units_that_fall_silent_at_once_do_not_starve_the_one_that_still_answers(
     endpoint: Endpoint, live: int
 ) -> None:
-    """A cable is cut behind the live unit. Each of the others once cost its whole timeouts, and the live unit waited 120 s."""
+    """A cable is cut behind the live unit. Defect: each of the others cost its full timeouts, and the live unit waited 120 s."""
 
     async def main() -> VirtualBus:
         def make(tags: TagTable) -> list[RegisterDriver]:
@@ -271,7 +273,7 @@ def test_a_slow_unit_stays_in_service_when_its_neighbours_fall_silent() -> None:
 
 @pytest.mark.parametrize("count", [2, 31])
 def test_a_half_open_connection_to_several_units_is_made_anew(count: int) -> None:
-    """Shortened timeouts did not count as unanswered requests, so that such a connection was kept for ever."""
+    """Defect: shortened timeouts did not count as unanswered requests, so such a connection was kept for ever."""
 
     async def main() -> None:
         def make(tags: TagTable) -> list[RegisterDriver]:
@@ -292,7 +294,7 @@ def test_a_half_open_connection_to_several_units_is_made_anew(count: int) -> Non
 
 
 def test_a_unit_that_is_rarely_polled_keeps_its_connection_beside_silent_ones() -> None:
-    """The probes of the silent units end without a reply, and say nothing about the connection."""
+    """The probes of the silent units end without a reply, and give no information about the connection."""
 
     async def main() -> None:
         def make(tags: TagTable) -> list[RegisterDriver]:

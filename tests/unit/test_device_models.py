@@ -1,4 +1,4 @@
-"""The models of CiA 401, 404, 406 and 410: what live settings make of what was recorded with the factory's."""
+"""The models of CiA 401, 404, 406 and 410: conversion of values recorded with factory settings to current settings."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ NODE = 5
 
 
 class Rig:
-    """A started node whose played values the test sets, by object and as numbers."""
+    """A started node whose replayed values the test sets, by object and as numbers."""
 
     def __init__(self, name: str) -> None:
         self.dictionary = load_eds(DEVICES / f"{name}.eds")
@@ -46,7 +46,7 @@ class Rig:
         return self.node.feed(CanFrame(can_id, data), self.now_ns)
 
     def run(self, ms: int) -> list[CanFrame]:
-        """The frames that the node sends by itself in that time."""
+        """Return the frames that the node sends by itself in that time."""
         until_ns, sent = self.now_ns + ms * NS_PER_MS, []
         while (wake_ns := self.node.wake_at_ns()) is not None and wake_ns <= until_ns:
             self.now_ns = wake_ns
@@ -98,7 +98,7 @@ def test_inputs_change_by_themselves_and_the_masks_decide_which_interrupt() -> N
     rig.write(0x6005, 0)
     rig.played[0x6000, 1] = 0b0010
     assert [f for f in rig.run(20) if f.can_id == 0x185] == []
-    assert rig.read(0x6000, 1) == 0b0010  # it is there for who asks
+    assert rig.read(0x6000, 1) == 0b0010  # it can be read on request
 
 
 def test_polarity_turns_inputs_and_outputs_round() -> None:
@@ -146,7 +146,7 @@ def test_analogue_inputs_interrupt_when_they_are_told_to() -> None:
     rig.write(0x6423, 1)
     rig.write(0x6426, 50, sub=1)
     assert told(151) == [151]
-    assert told(190) == []  # less than delta away from what was told
+    assert told(190) == []  # less than delta away from the last sent value
     assert told(202) == [202]
     rig.write(0x6421, 1, sub=1)  # at or above the upper limit only
     rig.write(0x6424, 300, sub=1)
@@ -173,7 +173,7 @@ def test_other_scaling_shows_the_same_current_as_another_value() -> None:
     rig.write(0x6123, 800.0, sub=1)
     assert rig.read(0x6130, 1) == pytest.approx(200.0)
     assert rig.read(0x6100, 1) == pytest.approx(8.0)
-    assert rig.write(0x6122, 4.0, sub=1) == 0x06040043  # the two points would stand above one another
+    assert rig.write(0x6122, 4.0, sub=1) == 0x06040043  # the two points would be above one another
 
 
 def test_taring_wants_the_four_letters() -> None:
@@ -231,7 +231,7 @@ def test_a_preset_moves_the_position_each_time_it_is_written() -> None:
     assert (rig.read(0x6004), rig.read(0x6509)) == (500, -99_500)
     rig.played[0x6004, 0] = 100_010
     assert rig.read(0x6004) == 510
-    rig.write(0x6003, 500)  # the same value is written again: no change of the object, and yet a preset
+    rig.write(0x6003, 500)  # the same value is written again: the object does not change, but it is a preset
     assert rig.read(0x6004) == 500
     assert rig.write(0x6003, STEPS * TURNS) == 0x06090031
 

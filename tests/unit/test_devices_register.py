@@ -1,4 +1,4 @@
-"""Register drivers against an emulated sampling sensor, and their codec against the emulators' own and against `struct`."""
+"""Register drivers against an emulated sampling sensor, and their codec against the emulators' codec and against `struct`."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ SAMPLED = ("pressure", "temperature", "conductivity", "instrument_time")
 
 
 class Ctd:
-    """A driver, its tags, and the emulated sensor behind a line. `at` moves the sensor's own clock (seconds)."""
+    """A driver, its tags, and the emulated sensor on a line. `at` moves the sensor's own clock (seconds)."""
 
     def __init__(self, driver: SensorDriver, tags: TagTable, sensor: SampledSensor, start_ns: int) -> None:
         self.driver, self.tags, self.sensor, self._start_ns = driver, tags, sensor, start_ns
@@ -56,7 +56,7 @@ class Ctd:
         await self.driver.send()
 
     def sample(self, count: int) -> None:
-        """The sensor took `count` samples all in all, the last one now."""
+        """The sensor took `count` samples in total, the last one now."""
         self.sensor.samples = count - 1
         self.sensor._sample(self._start_ns)
 
@@ -116,7 +116,7 @@ def test_a_new_sample_is_good_and_passed_on_once_and_unaltered() -> None:
 
 
 def test_the_first_count_that_is_seen_is_only_a_base_line() -> None:
-    """A driver that starts in the middle does not know how old the sample is that it finds."""
+    """A driver that starts in the middle does not know the age of the sample that it finds."""
 
     async def main() -> None:
         async with ctd() as c:
@@ -151,7 +151,7 @@ def test_missed_samples_are_counted_and_a_restart_is_none() -> None:
             c.sample(1)  # the counter came round: 0 was missed, 1 is new
             await c.poll()
             assert c.driver.samples_missed == missed + 1
-            assert len(c.messages.queue) == 4  # the first was the base line
+            assert len(c.messages.queue) == 4  # the first was the reference
 
     run(main())
 
@@ -200,7 +200,7 @@ def test_what_is_acknowledged_and_not_held_is_an_error() -> None:
             c.sensor._note_tags = lambda *a: c.sensor._cells.poke("holding", 1, 9)  # type: ignore[method-assign]
             with pytest.raises(VerifyFailed, match="acknowledged, and not held"):
                 await c.period(5)
-            assert c.tags.current("ctd.sample_period_s", 0).value == 9  # what is published is what it holds
+            assert c.tags.current("ctd.sample_period_s", 0).value == 9  # the published values are those it holds
 
     run(main())
 
@@ -231,7 +231,7 @@ def test_samples_are_taken_on_time_whoever_looks_and_when(period_s: int, set_at_
         assert count == taken + 1
         expected_s = set_at_s + taken * period_s
         assert time_ms == pytest.approx(1000 * expected_s, abs=1)
-        assert pressure == pytest.approx(time_ms / 1000, rel=1e-6)  # all of one instant, which stands beside them
+        assert pressure == pytest.approx(time_ms / 1000, rel=1e-6)  # all of one instant, which is next to them
         assert temperature == pytest.approx(2 * time_ms / 1000, rel=1e-6)
 
 

@@ -1,4 +1,4 @@
-"""The transmitter's driver against emulated modems and the link between them: nothing lost, nothing twice (SPEC ruling 17)."""
+"""The transmitter's driver against emulated modems and the link between them: no loss, no duplicates (SPEC ruling 17)."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def pair(loss: float = 0.0) -> ModemPair:
 
 
 class Station:
-    """One end: a driver whose messages are taken and acknowledged, over a connection that can be pulled."""
+    """One end: a driver whose messages are taken and acknowledged, over a connection that can be interrupted."""
 
     def __init__(self, bus: ModbusBus, driver: TransmitterDriver, field: FieldBus) -> None:
         self.bus, self.driver, self.field = bus, driver, field
@@ -138,20 +138,20 @@ def test_what_was_emitted_and_not_acknowledged_is_not_emitted_again_after_a_reco
             assert near.driver.to_acknowledge == 1
             await near.reconnect()
             await near.do("read")
-            assert list(near.inbox.queue) == [COMMAND(b"\0\5")]  # the control logic has it: once is enough
+            assert list(near.inbox.queue) == [COMMAND(b"\0\5")]  # the control logic has it: once is sufficient
             assert near.driver.to_acknowledge == 1
             await near.do("acknowledge")
             far.driver.consumer.observe(COMMAND(b"\0\5"))
             await far.do("ask")
             await far.do("send")
             await near.do("read")
-            assert len(near.inbox.queue) == 2  # the same bytes under a new sequence are another command
+            assert len(near.inbox.queue) == 2  # the same bytes with a new sequence are a new command
 
     run(main())
 
 
 def test_a_new_driver_reads_again_what_nobody_acknowledged() -> None:
-    """A gateway that died between reading and acknowledging: the command survives it."""
+    """A gateway that died between reading and acknowledging: the command survives."""
 
     async def main() -> None:
         modems = pair()
@@ -187,7 +187,7 @@ def test_a_write_whose_reply_was_lost_with_the_connection_is_not_sent_a_second_t
             kept = driver.client, driver.connection
             driver.attach_client(here, client)
             with pytest.raises(FieldtwinError):
-                await driver.send()  # nobody answers; what was written is in `there`
+                await driver.send()  # no device answers; the written message is in `there`
             request = there.read_pending()
             await client.aclose()
             with pytest.raises(ConnectionLost):
@@ -200,7 +200,7 @@ def test_a_write_whose_reply_was_lost_with_the_connection_is_not_sent_a_second_t
             await far.do("read")
             assert list(far.inbox.queue) == [RESPONSE(b"once")]
             await far.do("acknowledge")
-            driver.consumer.observe(RESPONSE(b"once"))  # the next one, of the same bytes
+            driver.consumer.observe(RESPONSE(b"once"))  # the next one, with the same bytes
             await near.do("ask")
             assert await near.do("send") is None
             await far.do("read")
@@ -260,9 +260,9 @@ def test_a_transmitter_needs_a_mailbox_and_a_socket() -> None:
 
 @pytest.mark.parametrize("log", ["audit.jsonl", "/dev/full"])
 def test_a_plant_that_says_local_takes_no_command_and_says_so(tmp_path: Path, log: str) -> None:
-    """With a log that can be written, and with one that cannot: the command is refused either way.
+    """With a writable log, and with one that is not: the command is refused in both cases.
 
-    Acknowledging it is a write: it waits for a log that can be written.
+    Acknowledging it is a write, which waits for a writable log.
     """
 
     async def main() -> None:
@@ -293,7 +293,7 @@ def test_a_plant_that_says_local_takes_no_command_and_says_so(tmp_path: Path, lo
 
 
 def test_a_mailbox_that_is_lent_to_a_thread_is_neither_read_nor_written(tmp_path: Path) -> None:
-    """What comes over it is no command; what the control logic sends is not put there; what the thread commands is taken."""
+    """Messages over it are not commands; output of the control logic is not put there; commands of the thread are taken."""
 
     async def main() -> None:
         modems = pair()
@@ -348,7 +348,7 @@ def test_the_link_delivers_everything_once_in_order_and_no_faster_than_it_can(
 
 
 def test_modems_that_do_not_send_again_lose_repeat_and_turn_round_messages() -> None:
-    """By chance, seeded; what is there is whole, and one behind another is at most one place from where it was."""
+    """Random losses with a seed; arriving messages are complete, and at most one position out of order."""
     link = PacketLink(1e6, 1.0, 0.0, Random(1), capacity=10_000, untamed=Untamed(0.2, 0.1, 0.1))
     sent = [n.to_bytes(2) for n in range(2000)]
     assert all(link.submit(payload, 0) for payload in sent)

@@ -1,4 +1,4 @@
-"""Every option that docs/commissioning.md names for line, scan and identify is one that they have."""
+"""Every option that docs/commissioning.md names for line, scan and identify exists."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every command line of docs/maps.md is one that the verbs take."""
+"""Every command line of docs/maps.md is accepted by the commands."""
 
 from __future__ import annotations
 

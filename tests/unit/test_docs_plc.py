@@ -1,4 +1,4 @@
-"""What docs/plc.md shows is what runs: its programs, its proof, its commands."""
+"""The examples of docs/plc.md run: its programs, its proof, its commands."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def snippets(language: str) -> list[str]:
 
 
 def python() -> dict[str, Any]:
-    """All Python of the page, in its order, as one module."""
+    """Return all Python code of the page, in order, as one module."""
     space: dict[str, Any] = {"__name__": "docs_plc"}
     for text in snippets("python"):
         exec(compile(text, "docs/plc.md", "exec"), space)

@@ -1,4 +1,4 @@
-"""What the doctor makes of a computer's numbers, and what it asks the computer for."""
+"""The doctor's conclusions from a computer's figures, and its queries to the computer."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def test_a_run_directory_that_cannot_be_written_is_bad(tmp_path: Path, monkeypat
 
 
 def test_a_folder_that_may_not_be_looked_into_is_no_bug(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Somebody else's, as FIELDTWIN_RUN=/root/x is to a service: every question to the file system may be refused."""
+    """A foreign directory, such as FIELDTWIN_RUN=/root/x for a service: any file system query may be refused."""
 
     def refused(*args: object, **more: object) -> None:
         raise PermissionError(13, "Permission denied")

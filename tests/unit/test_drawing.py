@@ -1,4 +1,4 @@
-"""Wires, drawn: what stands in a system file stands in the text and in the picture, and the shipped pictures are of today."""
+"""Drawn wiring: the content of a system file is in the text and in the picture, and the shipped pictures are current."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The CiA 402 drive: every arrow of its state machine, everything that is no arrow, and how the motor follows."""
+"""The CiA 402 drive: every transition of its state machine, all inputs without a transition, and the motion of the motor."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SHUTDOWN, SWITCH_ON, ENABLE, DISABLE_VOLTAGE, QUICK_STOP, RESET = 0x06, 0x07, 0x
 
 
 class Rig:
-    """A started node with a drive behind it, and a hand on its objects. Time in milliseconds."""
+    """A started node with a drive model, and access to its objects. Time in milliseconds."""
 
     def __init__(self, ready: bool = True) -> None:
         self.drive = Drive()
@@ -37,7 +37,7 @@ class Rig:
             self.run(20)
 
     def run(self, ms: float) -> None:
-        """Let time pass, ticking when the node wants to be."""
+        """Let time pass, ticking when the node requests it."""
         until_ns = self.now_ns + round(ms * NS_PER_MS)
         while (wake_ns := self.node.wake_at_ns()) is not None and wake_ns <= until_ns:
             self.now_ns = max(wake_ns, self.now_ns)
@@ -46,7 +46,7 @@ class Rig:
         self.sent += self.node.tick(until_ns)
 
     def write(self, index: int, value: int, sub: int = 0) -> int:
-        """Expedited download; the abort code, 0 when it was taken."""
+        """Make an expedited download; return the abort code, 0 on success."""
         entry = EDS.entry(index, sub)
         assert entry is not None
         assert entry.size is not None
@@ -74,19 +74,19 @@ class Rig:
         return self.read(0x6041, signed=False)
 
     def state(self) -> DriveState:
-        """As a master reads it from the statusword."""
+        """Return the state as a master decodes it from the statusword."""
         word = self.status
         found = [s for s in S if word & STATE_MASK == s.value]
         assert found == [self.drive.state]
         return found[0]
 
     def bring_to(self, state: DriveState) -> None:
-        """By the shortest way, from SWITCH ON DISABLED."""
+        """Go by the shortest path, from SWITCH ON DISABLED."""
         ways = {
             S.SWITCH_ON_DISABLED: [], S.READY: [SHUTDOWN], S.SWITCHED_ON: [SHUTDOWN, SWITCH_ON],
             S.OPERATION_ENABLED: [SHUTDOWN, SWITCH_ON, ENABLE], S.QUICK_STOP: [SHUTDOWN, SWITCH_ON, ENABLE, QUICK_STOP],
         }  # fmt: skip
-        if state in (S.QUICK_STOP, S.FAULT_REACTION):  # both last only while there is something to stop
+        if state in (S.QUICK_STOP, S.FAULT_REACTION):  # both last only while there is motion to stop
             self.spin()
         for word in ways.get(state, []):
             self.command(word)
@@ -103,7 +103,7 @@ class Rig:
         assert self.read(0x606C) == speed
 
 
-# The states that can be reached and held, and what each controlword makes of them (CiA 402-2, "Power drive system FSA").
+# The states that can be reached and held, and the result of each controlword in them (CiA 402-2, "Power drive system FSA").
 COMMANDED = {
     (S.SWITCH_ON_DISABLED, SHUTDOWN): (S.READY, [2]),
     (S.READY, SWITCH_ON): (S.SWITCHED_ON, [3]),
@@ -125,12 +125,12 @@ WORDS = [SHUTDOWN, SWITCH_ON, ENABLE, DISABLE_VOLTAGE, QUICK_STOP, RESET]
 
 
 EVERY = [pair for pair in product(HELD, WORDS) if pair != (S.OPERATION_ENABLED, QUICK_STOP)]
-"""That one goes through two states: below."""
+"""That one passes through two states: below."""
 
 
 @pytest.mark.parametrize(("state", "word"), EVERY, ids=lambda v: getattr(v, "name", f"{v}"))
 def test_every_command_in_every_state(state: DriveState, word: int) -> None:
-    """The arrows of the standard, and nothing where there is none: taken or ignored, never an abort."""
+    """The transitions of the standard and no others: a command is executed or ignored, never aborted."""
     rig = Rig()
     rig.bring_to(state)
     before = len(rig.drive.transitions)
@@ -144,7 +144,7 @@ def test_the_arrows_by_itself_and_how_long_they_take() -> None:
     rig = Rig(ready=False)
     assert rig.state() is S.NOT_READY
     rig.command(SHUTDOWN)
-    assert rig.state() is S.NOT_READY  # too early, and forgotten
+    assert rig.state() is S.NOT_READY  # too early, and dropped
     rig.run(20)
     assert rig.state() is S.SWITCH_ON_DISABLED
     assert rig.drive.transitions == [1]
@@ -296,7 +296,7 @@ def test_a_second_set_point_waits_or_takes_over_as_bit_5_says() -> None:
         rig.write(0x607A, 0)
         rig.command(ENABLE | 1 << 4 | at_once)
         rig.command(ENABLE)
-        assert bool(rig.status & 1 << 12) == (not at_once)  # the one that waits still holds the only place
+        assert bool(rig.status & 1 << 12) == (not at_once)  # the waiting one still has the only place
         rig.run(1_000)
         places[at_once] = rig.read(0x6064)
         rig.run(5_000)
@@ -376,7 +376,7 @@ def test_by_pdo_alone() -> None:
 
 
 def test_the_same_controlword_again_is_a_command_again() -> None:
-    """A master that sends its RPDO in a cycle: what came too early counts the next time."""
+    """A master that sends its RPDO in a cycle: a command that came too early counts the next time."""
     rig = Rig(ready=False)
     pdo = CanFrame(0x200 + NODE, SHUTDOWN.to_bytes(2, "little"))
     rig.node.feed(pdo, rig.now_ns)

@@ -1,6 +1,7 @@
-"""The modes of the emulated drive beyond the profile ones: homing and the cyclic synchronous modes, and what 6502h says of them.
+"""The modes of the emulated drive beyond the profile ones: homing and the cyclic synchronous modes, and their bits in 6502h.
 
-6502h was what the data sheet said, whatever the model had, so that a master chose a mode and the drive stood still.
+Defect: 6502h was copied from the data sheet, whatever the model supported, so a master chose a mode and the drive did not
+move.
 """
 
 from __future__ import annotations
@@ -94,7 +95,7 @@ def test_supported_homing_methods_are_listed() -> None:
 
 
 def home_of(method: int) -> float:
-    """Where the method's home is, by the figures of the standard: an edge, or the next index pulse on one side of it."""
+    """The home position of each method, by the figures of the standard: an edge, or the next index pulse on one side of it."""
     a, b, low, high = AXIS.home_from, AXIS.home_to, AXIS.negative, AXIS.positive
     edges = {
         1: low, 2: high, 3: a, 4: a, 5: b, 6: b, 7: a, 8: a, 9: b, 10: b, 11: b, 12: b, 13: a, 14: a,
@@ -113,7 +114,7 @@ def home_of(method: int) -> float:
 def test_homing_ends_at_the_place_of_its_method_wherever_it_begins(method: int, x: float, v: float) -> None:
     way = plan(method, AXIS, x, v, Speeds(20_000, 2_000, 100_000))
     kind = method if method < 17 else method - 16
-    if way.home is None:  # a home switch without limit switches, looked for from its wrong side
+    if way.home is None:  # a home switch without limit switches, approached from its wrong side
         assert (kind in (3, 4) and x > AXIS.home_to) or (kind in (5, 6) and x < AXIS.home_from)
     else:
         assert way.home == home_of(method)

@@ -1,8 +1,8 @@
 """Silence, refusal, an invalid reply and "not asked" are four states of a register, in every output of a dump.
 
-Observed: a device that is silent at unknown addresses was reported as "refused 20..28, ~29..2000" although nothing after 28 had
-been asked; its block at 1000 was missed; the exit code was 0. Replies of the wrong size were reported as refusals, and
-32 registers at 352 that the device gives only together were called unreadable.
+Defects: a device that is silent at unknown addresses was reported as "refused 20..28, ~29..2000" although nothing after 28 had
+been asked; its block at 1000 was missed; the exit code was 0. Replies of the wrong size were reported as refusals, and 32
+registers at 352 that the device returns only together were called unreadable.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ BLOCKS = (range(20), range(1000, 1032))
 
 
 def registers(address: int, count: int) -> list[int] | None:
-    """The words of a device whose registers are `BLOCKS`, None where one of the addresses is not among them."""
+    """The words of a device with registers `BLOCKS`; None if one of the addresses is not among them."""
     return list(range(address, address + count)) if any(
         address in block and address + count - 1 in block for block in BLOCKS
     ) else None  # fmt: skip
@@ -38,7 +38,7 @@ def silent_elsewhere(function: int, address: int, count: int) -> list[int] | int
 
 
 def wrong_size_elsewhere(function: int, address: int, count: int) -> list[int] | int | None:
-    """Holding registers 0..19 one by one; 352..383 only as a whole, and any other read in there is answered with all 32."""
+    """Holding registers 0..19 one by one; 352..383 only as a block: any other read in it is answered with all 32."""
     if function != 3:
         return 1
     if 352 <= address < 384:

@@ -31,7 +31,7 @@ HEADER = ("start_time = Jul 05 2012 17:39:14 [NMEA time, header]", "bad_flag = -
 def cnv(
     names: Sequence[str] = NAMES, rows: Sequence[Sequence[float]] = ROWS, header: Sequence[str] = HEADER, end: str = ""
 ) -> bytes:
-    """A .cnv file with CR LF, a Latin-1 letter, and 11 characters a column."""
+    """A .cnv file with CR LF, a Latin-1 letter, and 11 characters per column."""
     lines = ["* Sea-Bird SBE 9 Data File:", "** Ship: Polarstern, Süd", f"# nquan = {len(names)}", "# nvalues = 3"]
     lines += [f"# name {i} = {name}" for i, name in enumerate(names)]
     lines += [f"# {line}" for line in header] + ["*END*"]

@@ -1,4 +1,4 @@
-"""What stands between a digital twin and its plant: the plant's switch, its limits, its rate, and no number twice."""
+"""The gate between a digital twin and its plant: the plant's switch, its limits, its rate, and unique command numbers."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_what_is_admitted_is_the_command_bit_by_bit_and_on_record() -> None:
 
 
 def test_what_was_commanded_before_the_plants_log_began_is_not_obeyed() -> None:
-    """A plant that lost its store does not know what it did before; its twin sends everything again."""
+    """A plant that lost its store does not know its earlier commands; its twin sends everything again."""
     made = CommandGate(remote=True, bounds=Bounds(0, 3600, 5), clock=Hands(), since_ms=NOW_MS - 1000)
     assert made.admit("twin:1", number(1, t_ms=NOW_MS - 1001)) is None
     assert refusals(made) == [

@@ -1,4 +1,4 @@
-"""Differences by named field: between two dumps, and between a dump and what a profile or an EDS says."""
+"""Differences by named field: between two dumps, and between a dump and a profile or an EDS."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Dumps of hidden maps: everything that can be read is found, in counted requests, whatever interrupts it."""
+"""Dumps of hidden maps find everything readable, in a counted number of requests, despite any interruption."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def sweep(readable: set[int], limit: int, *, pairs: bool = False, end: int = 400, **how: int) -> tuple[Sweep, int]:
-    """A sweep of a device that is a set of addresses, and how many requests it took."""
+    """Sweep a device given as a set of addresses; return the number of requests."""
     made = Sweep(RegisterRange("holding", 0, end), **how)
     asking, requests = made.asking(), 0
     try:
@@ -85,7 +85,7 @@ def test_the_fewest_requests_that_the_limits_allow() -> None:
     assert (requests, made.found.limit_proved) == (8, True)
     made, requests = sweep(set(range(1000)), 50, end=1000)
     assert (made.found.max_read, made.found.limit_proved, len(made.found.reads())) == (50, True, 20)
-    assert requests <= 20 + 11  # halving 125 down to 50, and proving that it is no hole
+    assert requests <= 20 + 11  # halving 125 down to 50, and proving that it is not a gap
     made, requests = sweep(set(range(1000)), 50, end=1000, most=50)
     assert requests == 20
     made, _ = sweep(set(range(80)), 40, pairs=True, end=80)

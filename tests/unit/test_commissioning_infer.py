@@ -1,6 +1,6 @@
-"""Hidden maps, dumped over time: what the tool is certain of must be so, and it must be certain of most of what moves.
+"""Hidden maps, dumped over time: certain claims of the tool must be true, and it must be certain of most changing values.
 
-The test packs its values with a codec of its own: words of `struct`, put in order by hand.
+The test packs its values with a separate codec: words of `struct`, put in order by hand.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def words(kind: str, order: str, value: float) -> list[int]:
 
 @dataclass
 class Hidden:
-    """A field that the test knows of."""
+    """A field that the test knows."""
 
     address: int
     kind: str
@@ -71,7 +71,7 @@ def text_words(text: str) -> list[int]:
 
 
 def hidden_device(seed: int, passes: int) -> list[Hidden]:
-    """A device as they are: one order for nearly everything, measurements, counters, settings, states, a name."""
+    """A typical device: one word order for nearly everything, measurements, counters, settings, states, a name."""
     r = random.Random(seed)
     order = r.choice(["ABCD", "ABCD", "CDAB", "BADC", "DCBA"])
     fields: list[Hidden] = []
@@ -255,7 +255,7 @@ def test_costs_are_positive_numbers(kind: str, rows: list[list[int]]) -> None:
 
 
 def test_from_a_hidden_map_over_the_wire_to_a_profile_that_reads_it(tmp_path: Path) -> None:
-    """Dump over time, infer, draft, load, read: the values that come out are those that went in."""
+    """Dump over time, infer, draft, load, read: the values read are the original ones."""
     fields = hidden_device(12, 12)
     end = fields[-1].address + len(fields[-1].rows[0])
 

@@ -1,7 +1,7 @@
-"""Both readers of data sheets take the same files and understand the same of each object.
+"""Both readers of data sheets accept the same files and interpret each object identically.
 
-A DOMAIN with the DefaultValue ``@ABCD`` refused the whole data sheet in `emulate` and `check --eds`, while `read --eds` took
-it. Each construct here stood in a real file or follows from CiA 306-1; the readers took different views of most of them.
+Defect: a DOMAIN with the DefaultValue ``@ABCD`` refused the whole data sheet in `emulate` and `check --eds`, while `read
+--eds` accepted it. Each construct here was in a real file or follows from CiA 306-1; the readers differed in most of them.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ HEAD = "[DeviceInfo]\nVendorName=x\n[1000]\nParameterName=Device type\nDataType=
 
 
 def one(kind: int | str, *lines: str, access: str = "AccessType=rw", object_type: str = "0x7") -> str:
-    """A data sheet with one object of its own at 2000h."""
+    """A data sheet with one object at 2000h."""
     text = f"[2000]\nParameterName=Probe\nObjectType={object_type}\nDataType={kind}\n{access}\n"
     return HEAD + text + "".join(f"{line}\n" for line in lines)
 
@@ -72,7 +72,7 @@ UNREADABLE = {
     "a bit rate in bit/s": one(7, "[DeviceComissioning]", "Baudrate=125000"),
     "a vendor number in words": one(7).replace("VendorName=x", "VendorNumber=none"),
 }
-"""What a file can hold that cannot be meant: it is left out or taken as something, and both readers say so."""
+"""Invalid content of a file is omitted or interpreted, and both readers report it."""
 
 
 @pytest.mark.parametrize("text", UNREADABLE.values(), ids=UNREADABLE)
@@ -118,7 +118,7 @@ PLAIN = {
         7,
     ),
 }  # fmt: skip
-"""What is plain, with the value that 2000h starts with."""
+"""Valid content, with the value that 2000h starts with."""
 
 
 @pytest.mark.parametrize(("text", "value"), PLAIN.values(), ids=PLAIN)
@@ -159,7 +159,7 @@ def test_what_decides_what_an_object_is_is_refused_by_both_readers_at_the_same_l
     key = line.partition("=")[0]
     lines = [old for old in one(7).splitlines() if not old.startswith(key) or old.endswith("ro")]
     text = "\n".join([*lines, line])
-    if key in ("DataType", "AccessType"):  # of the device type, keep the good line
+    if key in ("DataType", "AccessType"):  # keep the valid line of the device type
         text = "\n".join([*HEAD.splitlines(), "[2000]", "ParameterName=P", *_rest(key), line])
     errors = []
     for read in (parse_eds, lambda text, path: parse_dictionary(text, NODE, path=path)):
@@ -174,7 +174,7 @@ def _rest(key: str) -> list[str]:
 
 
 def test_a_configuration_that_cannot_be_read_is_refused_when_it_would_be_sent() -> None:
-    """To read the sheet is harmless; to configure a node with a part of it is not."""
+    """Reading the sheet is harmless, but configuring a node with a part of it is not."""
     for line in ("ParameterValue=none", "DownloadFile=none.bin"):
         text = one(0xF, line, object_type="2")
         with pytest.raises(FileInvalid, match=r"\[2000\]|2000h|2000sub0"):
@@ -193,7 +193,7 @@ TEXTS = st.one_of(
 @given(KINDS, TEXTS, TEXTS, TEXTS, TEXTS, st.sampled_from(["7", "2"]))
 @example(0xF, "@ABCD", "", "", "", "7")
 @example(0xC, "0", "", "", "", "7")
-@example(0xC, "", "0x1000000000", "", "", "7")  # a number, as long as six octets
+@example(0xC, "", "0x1000000000", "", "", "7")  # a number with a length of six octets
 def test_both_readers_agree_on_any_value(
     kind: int, default: str, parameter: str, low: str, high: str, object_type: str
 ) -> None:

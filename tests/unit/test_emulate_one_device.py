@@ -1,7 +1,7 @@
-"""One emulated Modbus device: data after the run indicator, any unit id on TCP, and `emulate` with values and faults.
+"""One emulated Modbus device: data after the run indicator, any unit ID on TCP, and `emulate` with values and faults.
 
-Observed before: function 11h ended with the run indicator, a single device on TCP refused unit ids other than its own, 0 and
-255, and `fieldtwin emulate` of one device took neither faults nor the values of registers.
+Defects: function 11h ended with the run indicator, a single device on TCP refused unit IDs except its own, 0 and 255, and
+`fieldtwin emulate` of one device accepted neither faults nor values of registers.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ def test_a_count_that_no_request_can_have_is_refused(count: str | int) -> None:
 
 @contextmanager
 def emulated(folder: Path, *options: str) -> Iterator[tuple[int, list[str]]]:
-    """`fieldtwin emulate meter.yaml` on a port; the lines of its diagnostics are complete after the block."""
+    """Run `fieldtwin emulate meter.yaml` on a port; the lines of its diagnostics are complete after the block."""
     (folder / "meter.yaml").write_text(METER)
     said: list[str] = []
     command = [sys.executable, "-m", "fieldtwin", "emulate", str(folder / "meter.yaml"), *options]
@@ -111,7 +111,7 @@ def emulated(folder: Path, *options: str) -> Iterator[tuple[int, list[str]]]:
 
 
 def ask(port: int, pdu: str, unit: int = 1, within_s: float = 10.0) -> bytes:
-    """The reply PDU; empty if none comes."""
+    """Return the reply PDU; empty if none arrives."""
     request = bytes.fromhex(pdu)
     with socket.create_connection(("127.0.0.1", port), timeout=within_s) as client:
         client.sendall(b"\0\1\0\0" + (len(request) + 1).to_bytes(2) + bytes([unit]) + request)

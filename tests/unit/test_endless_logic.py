@@ -1,6 +1,6 @@
-"""Logic that does not end: a limit per scan in Structured Text, in real and in virtual time, and signals in virtual time.
+"""Endless logic: a limit per scan in Structured Text, in real and in virtual time, and signals in virtual time.
 
-An endless loop hung a run in virtual time for ever, and SIGTERM did not end it.
+Defect: an endless loop blocked a run in virtual time for ever, and SIGTERM did not end it.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def test_a_loop_without_an_end_stops_the_plc_and_names_file_and_line(tmp_path: P
     image.writer(INPUTS).publish([], 0)
     now = [0]
     plc = PlcConfig("", layout.describe(), "", (config,), python_path=(str(tmp_path),), max_restarts=0)
-    runner = Runner(plc, image, lambda: now[0])  # no wall clock, no alarm: as in virtual time
+    runner = Runner(plc, image, lambda: now[0])  # no wall clock and no timer signal, as in virtual time
     runner.start()
     now[0] = runner.deadline_ns
     runner.run_once()
@@ -102,7 +102,7 @@ VirtualLoop().run_until_complete(main())
 
 
 def test_sigterm_ends_a_virtual_run_whose_callback_never_ends() -> None:
-    """One signal is enough: logic in Python has no limit of its own."""
+    """One signal is sufficient: logic in Python has no separate limit."""
     with subprocess.Popen([sys.executable, "-c", SPINS], stdout=subprocess.PIPE, text=True) as child:
         assert child.stdout is not None
         assert child.stdout.readline() == "spinning\n"

@@ -1,4 +1,4 @@
-"""Endpoint URLs: what is written is read, what is wrong is refused with the reason."""
+"""Endpoint URLs: valid ones round-trip, invalid ones are refused with the reason."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Producer and Consumer: exactly what occurred, to everybody, in order, bounded (SPEC rows EventHandler to Consumer)."""
+"""Producer and Consumer: every event, to all consumers, in order, bounded (SPEC rows EventHandler to Consumer)."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def test_every_consumer_gets_what_occurred_in_order_and_counts_what_it_lost(item
     producer: Producer[DATA] = Producer("response")
     wide: Consumer[DATA] = Consumer("response", capacity=max(1, len(items)))
     narrow: Consumer[DATA] = Consumer("response", capacity=capacity)
-    for consumer in (wide, narrow, wide):  # twice is once
+    for consumer in (wide, narrow, wide):  # registering twice has no further effect
         producer.subscribe(consumer)
     occurred = [DATA(item) for item in items]
     for item in occurred:

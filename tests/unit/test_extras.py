@@ -1,4 +1,4 @@
-"""What an extra brings is asked for when it is used, by its name; without `perf` all goes on as it does."""
+"""The package of an extra is imported only when used, and an error names the extra; without `perf` everything works."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def test_perf_only_makes_it_faster(there: bool, monkeypatch: pytest.MonkeyPatch)
         return type(asyncio.get_running_loop()).__module__.partition(".")[0]
 
     assert (loops.run(which()) == "uvloop") == there
-    assert loops.run(which(), serial=True) != "uvloop"  # which waits in whole milliseconds
+    assert loops.run(which(), serial=True) != "uvloop"  # it waits in whole milliseconds
 
 
 def test_every_extra_is_on_the_page_and_the_rest_is_there_without() -> None:

@@ -1,4 +1,4 @@
-"""Faults that a seed chooses, and the few of them that it takes."""
+"""Faults chosen by a seed, and the minimal set that causes a failure."""
 
 from __future__ import annotations
 

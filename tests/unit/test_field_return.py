@@ -1,4 +1,4 @@
-"""A field side elsewhere that goes and comes back: the run finds it again, says so, and takes what it lost for unknown."""
+"""A remote field simulator that disappears and returns: the run reconnects, reports it, and treats lost facts as unknown."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def system() -> System:
 
 
 class Field:
-    """The control channel of a field side, with a life of its own."""
+    """The control channel of a field simulator that can be stopped and restarted."""
 
     def __init__(self, system: System, life: str, far: str = "tcp://127.0.0.1:5") -> None:
         self.status = {
@@ -74,7 +74,7 @@ def test_it_is_found_again(system: System, life: str, far: str, another: bool, m
         assert not back.trouble
         await first.server.aclose()
         back.lost()
-        back.lost()  # each question that fails says so
+        back.lost()  # each failed request reports it
         assert back.client is None
         assert "was lost: nobody knows what its devices held" in back.trouble
         await second.server.listen_tcp("127.0.0.1", port)
@@ -131,7 +131,7 @@ def test_values_of_the_gap_are_neither_right_nor_wrong(system: System, tmp_path:
         field.held = {"ctd": [[1, "t", "0001", 0], [2, "t", "0002", 0]]}
         await oracle.update(ask, held)
         assert (oracle.checked, oracle.wrong_count, oracle.unknown) == (2, 0, 0)
-        published.append([3, "ctd.t", "0003", 0, 3])  # held by the first one just before it died: nobody saw that
+        published.append([3, "ctd.t", "0003", 0, 3])  # held by the first one just before it died: no request saw that
         await field.server.aclose()
         await held.aclose()
         await after.server.listen_unix(tmp_path / "f2")

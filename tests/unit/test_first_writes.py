@@ -1,6 +1,7 @@
-"""The first writes of a run. With the temperature at 21.6 a program set the fan from 2 to 1 and back: its first scans saw 0.0.
+"""The first writes of a run. Defect: at a temperature of 21.6 a program set the fan from 2 to 1 and back: its first scans saw
+0.0.
 
-Also: what a device holds already is not written again, and a safe value is written although no program writes its tag.
+Also: a value that a device already holds is not written again, and a safe value is written although no program writes its tag.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ def test_a_restart_of_the_programs_writes_nothing(tmp_path: Path) -> None:
 
 
 def test_a_safe_value_is_written_although_no_program_writes_the_tag(tmp_path: Path) -> None:
-    """The tag was left out without a word: another master had set it, and on stop it stayed."""
+    """Defect: the tag was omitted without a message: a different client had set it, and it kept that value on stop."""
     VirtualHall(hall(tmp_path, writable="mode, speed", safe="speed: 0"), tmp_path).run(5)
     assert writes(tmp_path) == [("fan.speed", 3, 0, "safe: the gateway stops")]
 
@@ -72,7 +73,7 @@ def test_a_safe_value_without_a_program_is_written_when_the_plc_is_lost_and_not_
         run.plc.run_once()  # it is alive again
         await run.clock.sleep_until_ns(run.loop.now_ns + NS_PER_S // 10)
         assert not run.gateway.outputs.safe_active
-        run.field.faults.set_value("fan", "speed", 9)  # another client commands it now
+        run.field.faults.set_value("fan", "speed", 9)  # a different client commands it now
         written = len(writes(tmp_path))
         while run.loop.now_ns - run.started_ns < 10 * NS_PER_S:
             run.plc.run_once()

@@ -1,7 +1,7 @@
-"""Stores of SQLite and PostgreSQL on a disk that is full or read-only: a typed error, and nothing is lost or written twice.
+"""Stores of SQLite and PostgreSQL on a full or read-only disk: a typed error, and nothing is lost or written twice.
 
-The disk is a tmpfs of 256 KiB, or a file system in a file that turns read-only as after a fault of the disk, so the tests need
-root. Before, a full disk at the start was reported as a file that is no store.
+The disk is a tmpfs of 256 KiB, or a file system in a file that turns read-only as after a disk fault, so the tests need root.
+Defect: a full disk at the start was reported as a file that is not a store.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ def test_a_store_that_cannot_be_made_is_reported_as_the_disks_fault(disk: Path, 
 
 
 class FaultyDisk:
-    """An ext4 file system in a file. `fault` makes the kernel turn it read-only under open files, as a disk's fault does."""
+    """An ext4 file system in a file. `fault` makes the kernel turn it read-only under open files, as after a disk fault."""
 
     def __init__(self, image: Path, place: Path, mebibytes: int) -> None:
         self.place, self._image = place, image
@@ -107,7 +107,7 @@ class FaultyDisk:
     def fault(self) -> None:
         table = (line.split() for line in Path("/proc/mounts").read_text().splitlines())
         device = next(words[0] for words in table if words[1] == str(self.place))
-        os.sync()  # what was written before the fault is on the disk
+        os.sync()  # data written before the fault is on the disk
         Path(f"/sys/fs/ext4/{Path(device).name}/trigger_fs_error").write_text("a test")
         with pytest.raises(OSError):
             (self.place / "anything").write_text("x")
@@ -116,7 +116,7 @@ class FaultyDisk:
         subprocess.run(["umount", str(self.place)], capture_output=True, check=False, timeout=10)
 
     def repair(self) -> None:
-        """What is done after such a fault: unmounted, checked, mounted again."""
+        """The procedure after such a fault: unmount, check, mount again."""
         self.unmount()
         subprocess.run(["e2fsck", "-fy", str(self._image)], capture_output=True, check=False, timeout=30)
         assert self.mount()
@@ -124,7 +124,7 @@ class FaultyDisk:
 
 def faulty(mebibytes: int) -> Iterator[FaultyDisk]:
     folder = Path(tempfile.mkdtemp(prefix="ftdisk.", dir="/tmp"))
-    folder.chmod(0o755)  # the server of PostgreSQL is another user
+    folder.chmod(0o755)  # the PostgreSQL server runs as a different user
     try:
         try:
             made = FaultyDisk(folder / "image", folder / "disk", mebibytes)
@@ -212,7 +212,7 @@ def test_a_disk_that_turns_read_only_under_open_knowledge_is_unreachable_and_kee
 
 
 async def until_written(store: KnowledgeStore, origin: str) -> int:
-    """The server recovers by itself, which takes it a moment."""
+    """The server recovers automatically after a moment."""
     deadline = time.monotonic() + 40
     while True:
         try:
@@ -232,7 +232,7 @@ def test_postgresql_on_a_full_disk_is_a_typed_error_and_goes_on_when_there_is_ro
         last = await store.append(origin, [value(n) for n in range(100)])
         ballast = fill(large_faulty.place)
         refused: list[Unreachable] = []
-        for _ in range(400):  # 40 MB: more than what is still free in the files that there are
+        for _ in range(400):  # 40 MB: more than the free space in the existing files
             try:
                 last = await store.append(origin, [value(n, 1000) for n in range(100)])
             except Unreachable as e:
@@ -264,7 +264,7 @@ def test_postgresql_on_a_disk_that_turns_read_only_is_a_typed_error_and_keeps_wh
         origin = await store.own("plant", system="x", prototype=True, log="aa")
         last = await store.append(origin, [value(n) for n in range(100)])
         db = store._db  # type: ignore[attr-defined]
-        await db.execute("CHECKPOINT")  # fsync is off in this cluster: a fault of the disk loses what was not written
+        await db.execute("CHECKPOINT")  # fsync is off in this cluster: a disk fault loses unwritten data
         large_faulty.fault()
         refused = 0
         for n in range(20):

@@ -1,4 +1,4 @@
-"""A CAN bus of the gateway with an emulated node on the software bus: bringing up, losing, finding another; and hands off."""
+"""A CAN bus of the gateway with an emulated node on the software bus: bring-up, loss, a wrong node, and read-only mode."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ SDO_TO_NODE, TPDO1 = 0x600 + NODE, 0x180 + NODE
 
 
 class Rig:
-    """The bus, the gateway's side of it, and every frame that went over it."""
+    """The bus, the gateway's side of it, and every frame on it."""
 
     def __init__(self, server: SoftBusServer, bus: CanopenBus, tags: TagTable, nursery: Nursery, audit: Path) -> None:
         self.server, self.bus, self.tags, self._nursery, self._audit = server, bus, tags, nursery, audit
@@ -84,7 +84,7 @@ class Rig:
             while True:
                 self.frames.append(await watch.recv())
         except ConnectionLost:
-            pass  # the bus is gone, and with it what there is to see
+            pass  # the bus is closed, so nothing can be observed
         finally:
             await watch.aclose()
 
@@ -137,13 +137,13 @@ def test_a_node_is_identified_configured_and_started_and_its_values_come(tmp_pat
             assert r.audit()[:2] == [("sdo", "start-up"), ("nmt", "start-up")]
             first_write = next(f for f in r.frames if f.can_id == SDO_TO_NODE and f.data[0] >> 5 == 1)
             serial_read = next(f for f in r.frames if f.can_id == SDO_TO_NODE and f.data[1:4] == b"\x18\x10\x04")
-            assert r.frames.index(serial_read) < r.frames.index(first_write)  # who it is, before anything is written
+            assert r.frames.index(serial_read) < r.frames.index(first_write)  # its identity, before anything is written
 
     run(main())
 
 
 def test_a_second_node_with_the_id_stays_an_error_of_the_device(tmp_path: Path) -> None:
-    """The error was forgotten with the next bring-up, and a second reply after the next request was not noticed."""
+    """Defect: the error was forgotten at the next bring-up, and a second reply after the next request was not detected."""
 
     async def main() -> None:
         async with rig(tmp_path) as r:
@@ -179,7 +179,7 @@ def test_a_second_sync_producer_is_noticed(tmp_path: Path) -> None:
 
 
 def test_syncs_that_come_twice_in_a_cycle_are_noticed_by_a_gateway_that_produces_none(tmp_path: Path) -> None:
-    """Without --allow-writes the gateway only listens, and the system file still says how often SYNC is to come."""
+    """Without --allow-writes the gateway only listens, and the system file still gives the expected SYNC interval."""
 
     async def main() -> None:
         async with rig(tmp_path, allow_writes=False, canopen=CanopenBusConfig(sync_ms=50)) as r:
@@ -228,7 +228,7 @@ def test_a_lost_heartbeat_makes_the_values_bad_at_once_and_the_node_is_looked_fo
             assert r.quality("slope_long") == ("bad", "heartbeat lost")
             assert loop.time() - start < 0.35  # well before the values would be stale
             assert not r.status.online
-            await eventually(lambda: r.quality("slope_long") == ("bad", "timeout"))  # asked again: nobody answers
+            await eventually(lambda: r.quality("slope_long") == ("bad", "timeout"))  # asked again: no answer
             asked = len([f for f in r.frames if f.can_id == SDO_TO_NODE])
             await eventually(lambda: len([f for f in r.frames if f.can_id == SDO_TO_NODE]) > asked)
 
@@ -257,7 +257,7 @@ def test_without_leave_the_mapping_is_adopted_and_nothing_is_written(tmp_path: P
         async with rig(tmp_path, allow_writes=False) as r:
             node = r.plug_node()
             await eventually(lambda: r.status.online)
-            assert r.quality("slope_long")[0] == "bad"  # nobody started it
+            assert r.quality("slope_long")[0] == "bad"  # no master started it
             operator = r.server.attach("operator")
             await operator.send(CanFrame(0, bytes([1, NODE])))  # the plant's own master does
             await eventually(lambda: r.quality("slope_long") == ("good", "none"))

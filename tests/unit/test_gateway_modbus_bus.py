@@ -1,4 +1,4 @@
-"""One Modbus bus: whose turn it is, who is left alone, and what a lost connection or a refusal makes of the tags."""
+"""One Modbus bus: order of requests, units in back-off, and the effect of a lost connection or a refusal on tags."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def test_a_dead_unit_costs_the_others_nothing_and_is_still_asked() -> None:
 
 
 def test_a_write_goes_before_every_poll_that_is_due() -> None:
-    """MB-063. Ten groups are overdue; the job that was submitted last is next."""
+    """MB-063. Ten groups are overdue; the newest submitted job is next."""
 
     async def main() -> None:
         lines = "".join(f"  t{i}: {{at: 'holding:{20 * i}', poll: g{i}}}\n" for i in range(10))
@@ -98,7 +98,7 @@ def test_a_write_goes_before_every_poll_that_is_due() -> None:
             await eventually(lambda: bool(ended))
             assert ended == [None]
             functions = [adu[1] for adu in r.field.heard[before:]]
-            assert 0x10 in functions[:2]  # after the one that was under way at most
+            assert 0x10 in functions[:2]  # after the current one at most
             assert cells.peek("holding", 500) == 7
 
     run(main())
@@ -147,13 +147,13 @@ def test_a_job_that_waits_when_the_connection_is_lost_is_told() -> None:
             ended: list[FieldtwinError | None] = []
             for _ in range(MAX_JOBS + 5):
                 r.bus.submit(Job(driver, driver.send, ended.append))
-            assert len(ended) == 5  # there is a bound, and whoever is over it knows
+            assert len(ended) == 5  # there is a bound, and a caller beyond it gets an error
             assert all(isinstance(e, EndpointBusy) for e in ended)
             driver.consumer.observe(driver.command("slow", 1))
             r.field.unplug()
             await eventually(lambda: len(ended) == MAX_JOBS + 5)
             assert all(isinstance(e, ConnectionLost) for e in ended[5:])
-            assert len(driver.consumer.queue) == 1  # what was not sent is still first in line
+            assert len(driver.consumer.queue) == 1  # the unsent one is still first in the queue
 
     run(main())
 
@@ -213,7 +213,7 @@ def test_the_wrong_device_has_no_values_and_is_asked_again() -> None:
             driver = r.bus.devices[0].driver
             assert driver.identity_error == "name is 'abc'"
             assert not r.bus.online(driver)
-            cells.poke("holding", 20, 0x7879, 0x7A00)  # the right one is put there
+            cells.poke("holding", 20, 0x7879, 0x7A00)  # the correct one is used there
             await eventually(lambda: r.quality("d.fast") == ("good", "none"))
             assert driver.identity_error == ""
 

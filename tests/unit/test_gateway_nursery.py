@@ -1,4 +1,4 @@
-"""Tasks that belong together: stopped in order, the first failure stops all, a cancellation is never swallowed."""
+"""A group of tasks: stopped in order, the first failure stops all, a cancellation is never swallowed."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def test_a_child_that_failed_unnoticed_is_raised_on_leaving() -> None:
         async def together() -> None:
             async with Nursery() as nursery:
                 nursery.start(fail(KeyError("x")), "a")
-                await asyncio.sleep(0.01)  # nobody waits for it
+                await asyncio.sleep(0.01)  # no task waits for it
 
         with pytest.raises(KeyError):
             await together()
@@ -97,7 +97,7 @@ def test_a_child_that_failed_unnoticed_is_raised_on_leaving() -> None:
 
 
 def test_whoever_is_cancelled_while_children_end_is_cancelled() -> None:
-    """The children take their time; a timeout around it all still works."""
+    """The children take some time; a timeout around the group still works."""
 
     async def slow_to_end() -> None:
         try:
@@ -112,7 +112,7 @@ def test_whoever_is_cancelled_while_children_end_is_cancelled() -> None:
             async with Nursery() as nursery:
                 nursery.start(slow_to_end(), "slow")
                 await asyncio.sleep(0)
-            ended.append("went on")  # must not be reached: it was cancelled meanwhile
+            ended.append("went on")  # must not be reached, because it was cancelled meanwhile
 
         task = asyncio.get_running_loop().create_task(owner())
         await asyncio.sleep(0.01)

@@ -1,4 +1,4 @@
-"""What the PLC commands and what is safe, all the way into an emulated device's registers; and what must never get there."""
+"""The PLC's commands and safe values up to an emulated device's registers, and values that must never reach them."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ WRITABLE = frozenset({"period", "level", "valve", "code", "switch"})
 
 
 class Rig:
-    """An output writer over a running bus; `cells` are the device's."""
+    """An output writer over a running bus; `cells` are the device's registers."""
 
     def __init__(self, bus: RunningBus, writer: OutputWriter, cells: MapBank, audit: Path) -> None:
         self.bus, self.writer, self.cells, self._audit = bus, writer, cells, audit
@@ -52,7 +52,7 @@ class Rig:
 
     @property
     def writes(self) -> list[bytes]:
-        """The write requests that reached the device, function 05 to 10h."""
+        """The write requests received by the device, function 05 to 10h."""
         return [adu for adu in self.bus.field.heard if adu[1] in (0x05, 0x06, 0x0F, 0x10)]
 
     @property
@@ -60,7 +60,7 @@ class Rig:
         return [json.loads(line) for line in self._audit.read_text(encoding="utf-8").splitlines()]
 
     async def polls(self, count: int = 3) -> None:
-        """Until the device was read `count` more times: time enough for a write that should not come."""
+        """Wait until the device was read `count` more times: time enough for an unexpected write."""
         device = self.bus.bus.devices[0]
         wanted = device.polls + count
         await eventually(lambda: device.polls >= wanted)
@@ -176,7 +176,7 @@ def test_a_device_that_restarted_is_told_again(tmp_path: Path) -> None:
         async with rig(tmp_path / "a", "period") as r:
             r.writer.want("d.period", 5)
             await eventually(lambda: r.holding(0) == 5 and r.writer.settled)
-            r.cells.poke("holding", 0, 0)  # it forgot, and the line never noticed
+            r.cells.poke("holding", 0, 0)  # the device forgot the value, and the line never noticed
             await eventually(lambda: r.holding(0) == 5)
             assert r.writer.rewrites == 1
             r.bus.field.unplug()
@@ -232,9 +232,9 @@ def test_what_may_not_be_written_is_refused_once_and_on_record(
             assert r.writer.refusals == 1
             assert [e["action"] for e in r.audit] == ["refuse"]
             assert told in str(r.audit[0]["result"])
-            assert r.writer.settled  # what is refused holds nothing up
+            assert r.writer.settled  # a refused value does not block others
             if value != value or value > 60:
-                r.writer.want(f"d.{tag}", 2)  # the next value has its own chance
+                r.writer.want(f"d.{tag}", 2)  # the next value is evaluated separately
                 await eventually(lambda: len(r.writes) == 1)
 
     run(main())
@@ -250,7 +250,9 @@ def test_another_device_than_expected_is_not_written(tmp_path: Path) -> None:
             await r.polls(1)
             assert r.writes == []
             r.cells.poke("holding", 100, 0x7879, 0x7A00)
-            r.cells.poke("holding", 0, 7)  # differs from the safe value: a device that already holds it is not written
+            r.cells.poke(
+                "holding", 0, 7
+            )  # differs from the safe value, because a device that already holds it is not written
             await eventually(
                 lambda: len(r.writes) == 1, within_s=15
             )  # the pause before the next identity request grows
@@ -275,14 +277,14 @@ def test_a_device_that_acknowledges_and_does_not_hold_is_a_failure(tmp_path: Pat
 
 
 def test_a_write_that_fails_is_on_record_for_who_asked_for_it(tmp_path: Path) -> None:
-    """Observed: a write of the program was under way when the gateway stopped, and its failure was recorded as one of the
-    safe state, with the program's value."""
+    """Defect: a write of the program was in progress when the gateway stopped, and its failure was recorded as a failure of
+    the safe state, with the program's value."""
     writers: list[OutputWriter] = []
 
     class StopsMeanwhile(MapBank):
         def write(self, table, address, values, now_ns):  # type: ignore[no-untyped-def]
             if values == [5] or values == (5,):
-                writers[0].make_safe("a test")  # while the write is under way; and the value is not held
+                writers[0].make_safe("a test")  # while the write is in progress; and the value is not held
                 return
             super().write(table, address, values, now_ns)
 
@@ -299,12 +301,12 @@ def test_a_write_that_fails_is_on_record_for_who_asked_for_it(tmp_path: Path) ->
 
 
 def test_without_a_record_only_safe_values_are_written() -> None:
-    """/dev/full is a disk without room: the log opens, and cannot be written."""
+    """/dev/full is a full disk: the log opens, and cannot be written."""
 
     async def main() -> None:
         async with rig(Path("/dev/full"), "period", "locked", safe={"period": -1}) as r:
             r.writer.want("d.period", 5)
-            r.writer.want("d.locked", 5)  # a refusal that cannot be recorded must not take the gateway down
+            r.writer.want("d.locked", 5)  # a refusal that cannot be recorded must not stop the gateway
             await eventually(lambda: r.writer.failures >= 1)
             await r.polls(5)
             assert r.writes == []
@@ -331,7 +333,7 @@ NUMBERS = {
 def test_whatever_is_asked_for_is_encoded_or_refused_and_nothing_else(
     kind: str, order: str, scale: float, offset: float, value: float
 ) -> None:
-    """No value of a PLC may raise anything but `NotAllowed`, and what is encoded decodes to itself within a step."""
+    """No value of a PLC may raise an error except `NotAllowed`, and an encoded value decodes to itself within a step."""
     plain = kind == "bool"
     extra = "" if plain else f", scale: {scale!r}, offset: {offset!r}, order: {order}"
     p = profile(f'tags:\n  x: {{at: "holding:0", type: {kind}, access: rw{extra}}}\n')

@@ -1,7 +1,7 @@
-"""The rows of the catalogue that concern the gateway between lines: clients of a bridge in front, a scripted line behind.
+"""The rows of the test-case list that concern the bridge: clients of a bridge, and a scripted line.
 
-A row of tests/vectors/modbus_gateway.toml is bytes and times in, bytes and times out, and what the bridge counted. It is
-played whole (then the times are exact, on virtual time), byte by byte and with trailing garbage.
+A row of tests/vectors/modbus_gateway.toml has bytes and times in, bytes and times out, and the counters of the bridge. It runs
+whole (then the times are exact, in virtual time), byte by byte and with trailing garbage.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ POLICY = Policy((AllowRule(functions=READ_FUNCTIONS | WRITE_FUNCTIONS),), allow_
 
 
 class VirtualClient(ClientConnection):
-    """A client whose socket is memory; `said` is what it was answered, and when."""
+    """A client with a socket in memory; `said` has the replies with their times."""
 
     def __init__(self, number: int, loop: VirtualLoop) -> None:
         super().__init__(LISTEN, "127.0.0.1", 40000 + number)
@@ -88,7 +88,7 @@ class Play:
         raise Unreachable("no CAN here", where=str(endpoint))
 
     def sent(self, data: bytes) -> None:
-        """The bridge's bus asks: it has to be the row's next frame, at its time; and the units answer as the row says."""
+        """The bridge sends: this must be the row's next frame, at its time; the units answer as the row defines."""
         now_ns = self.loop.monotonic_ns()
         assert self.sends, f"sent besides: {data.hex(' ')}"
         wanted = self.sends.pop(0)
@@ -103,7 +103,7 @@ class Play:
                 self.loop.call_at(at_ns / 1e9, self.wire.feed, chunk)
 
     def pieces(self, at_ns: int, data: bytes, byte_ns: int) -> Iterable[tuple[int, bytes]]:
-        """The last byte is there at `at_ns`."""
+        """The last byte arrives at `at_ns`."""
         if self.how != "bytewise":
             return [(at_ns, data)]
         first_ns = at_ns - (len(data) - 1) * byte_ns

@@ -1,4 +1,4 @@
-"""What a gateway keeps: the tag table with its journal, and the exchange log through crashes and full disks."""
+"""Stored data of a gateway: the tag table with its journal, and the exchange log through crashes and full disks."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from fieldtwin.gateway.store.exchange_log import ExchangeLog
 
 
 class Hands:
-    """A clock whose hands the test moves."""
+    """A clock that the test sets."""
 
     def __init__(self) -> None:
         self.now_ns = 1_000
@@ -59,7 +59,7 @@ def test_a_value_that_nobody_refreshes_becomes_stale_and_keeps_its_age() -> None
     assert table.current("d.x", limit).good
     late = table.current("d.x", limit + 1)
     assert (late.quality, late.reason, late.value, late.t_ns) == (Quality.BAD, Reason.STALE, 5, 900)
-    assert table.current("d.serial", limit * 1000).good  # read once: it does not grow stale
+    assert table.current("d.serial", limit * 1000).good  # read once: it does not become stale
     clock.now_ns = limit
     table.put("d.x", good(5, 900))  # the same old sample, seen again
     assert table.current("d.x", limit + 1).good
@@ -149,7 +149,7 @@ def test_what_a_predecessor_stored_and_did_not_tell_the_plc_is_stored_once(tmp_p
     assert log.pending("relay.log") == 0
     log.close()
     log = ExchangeLog(tmp_path / "s", system="obs", prototype=True)
-    log.append(rows)  # the PLC was told of none of them
+    log.append(rows)  # none of them was reported to the PLC
     assert log.pending("relay.log") == 2
     log.close()
     assert [row[2] for row in rows_of(tmp_path / "s")] == [1, 2, 3, 4, 5]
@@ -181,7 +181,7 @@ def test_a_full_queue_drops_its_oldest_and_counts(tmp_path: Path, monkeypatch: p
 
 
 def test_a_disk_that_refuses_loses_nothing(tmp_path: Path) -> None:
-    """Another process holds the database: the rows stay queued, in order, and are written when it lets go."""
+    """A different process holds the database: the rows stay queued, in order, and are written when it is released."""
     path = tmp_path / "s"
     log = ExchangeLog(path, system="obs", prototype=True)
     log._db.execute("PRAGMA busy_timeout=20")
@@ -219,5 +219,5 @@ def test_a_killed_process_leaves_whole_batches(tmp_path: Path) -> None:
     ended = subprocess.run([sys.executable, "-c", CRASH, str(path)], env=environment, check=False, timeout=30)
     assert ended.returncode == -signal.SIGKILL
     assert [row[2] for row in rows_of(path)] == list(range(1, 901))
-    log = ExchangeLog(path, system="obs", prototype=True)  # and the next run goes on
+    log = ExchangeLog(path, system="obs", prototype=True)  # and the next run continues
     log.close()

@@ -1,6 +1,6 @@
 """A client may close its direction of a TCP connection after its last request (FIN) and still wait for the answers.
 
-Observed before: the bridge and the tag server dropped complete requests that were followed by FIN, and closed without an answer.
+Defect: the bridge and the tag server dropped complete requests that were followed by FIN, and closed without an answer.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from fieldtwin.gateway.runtime.bridge.bridge import BridgeConfig
 
 
 async def ask_and_close(port: int, requests: bytes) -> bytes:
-    """Send `requests`, close this direction at once, and return all that comes back until the server closes."""
+    """Send `requests`, close this direction at once, and return all bytes until the server closes."""
     reader, writer = await asyncio.open_connection("127.0.0.1", port)
     try:
         writer.write(requests)
@@ -68,7 +68,7 @@ def test_half_a_request_that_is_followed_by_fin_ends_the_connection(tmp_path: Pa
 
 
 def test_a_client_that_closes_both_directions_costs_the_line_two_requests_at_most(tmp_path: Path) -> None:
-    """FIN alone does not tell it from one that waits; the first answer that is sent to it does."""
+    """A FIN alone does not distinguish a closed client from a waiting one; the first answer sent to it does."""
 
     async def main() -> None:
         async with rig(tmp_path, latency_s=0.05) as r:

@@ -1,8 +1,8 @@
-"""A heartbeat consumer that leaves the node's producer time alone: `heartbeat: {consumer_ms: N}`.
+"""A heartbeat consumer that does not write the node's producer time: `heartbeat: {consumer_ms: N}`.
 
-Defect: the gateway could watch a node only by writing its heartbeat producer time (1017h). A plant whose nodes are configured
-already had to allow that write or go without. And with a heartbeat in the system file, values that a TPDO brings on change only
-never grew stale, also of a node that produced no heartbeat, whose loss nothing would tell.
+Defects: the gateway could monitor a node only by writing its heartbeat producer time (1017h). A plant with configured nodes
+had to allow that write or go without monitoring. With a heartbeat in the system file, values of a change-driven TPDO never
+became stale, even from a node without a heartbeat, whose loss would not be detected.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def test_a_node_is_watched_from_its_first_heartbeat_on() -> None:
     consumer = HeartbeatConsumer()
     consumer.monitor(NODE, 150)
     assert not consumer.is_watched(NODE)
-    consumer.observe(NODE, b"\x00", 0)  # a boot-up is no heartbeat
+    consumer.observe(NODE, b"\x00", 0)  # a boot-up is not a heartbeat
     assert not consumer.is_watched(NODE)
     consumer.observe(NODE, b"\x05", 1)
     assert consumer.is_watched(NODE)

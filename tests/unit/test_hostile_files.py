@@ -1,7 +1,7 @@
-"""Hostile files end in a typed error, within limits on memory and time, whatever kind of file they are given as.
+"""Hostile files end in a typed error, within limits on memory and time, for every kind of file.
 
-Before, a pipe blocked every reader for good, /dev/zero and a file of 1 GB filled the memory as an EDS, as Structured Text, as a
-CAN log and as the file of `run`, and an integer of 5000 digits in a YAML file ended in a traceback.
+Defects: a pipe blocked every reader for ever, /dev/zero and a file of 1 GB filled the memory as an EDS, as Structured Text, as
+a CAN log and as the file of `run`, and an integer of 5000 digits in a YAML file ended in a traceback.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ LARGE = 1 << 30
 
 
 def read_all(folder: Path, *kinds: str) -> list[tuple[str, str, str, str]]:
-    """What became of each attempt: reader, file, outcome, message."""
+    """The result of each attempt: reader, file, result, message."""
     ended = subprocess.run(
         [sys.executable, str(CHILD), str(folder), *kinds], capture_output=True, text=True, timeout=300, check=False
     )
@@ -36,7 +36,7 @@ def untyped(results: list[tuple[str, str, str, str]]) -> list[str]:
 
 
 def sparse(path: Path, head: bytes) -> None:
-    """A file of 1 GB that takes no room on the disk."""
+    """A file of 1 GB that uses no disk space."""
     with path.open("wb") as file:
         file.write(head)
         file.truncate(LARGE)
@@ -60,7 +60,7 @@ def test_pipes_devices_links_and_endless_lines_are_refused_by_every_reader(tmp_p
     results = read_all(tmp_path, "odd")
     assert untyped(results) == []
     for kind, name, result, _ in results:
-        if "pipe" in name or "link" in name:  # no reader may take what is in them
+        if "pipe" in name or "link" in name:  # no reader may consume its content
             assert result != "read" or kind in ("network or system", "import"), (kind, name)
 
 

@@ -1,4 +1,4 @@
-"""`identify` of CANopen nodes: by device type and identity, and never sure of a wrong one."""
+"""`identify` of CANopen nodes: by device type and identity, and never certain of a wrong one."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ async def identify(objects: dict[tuple[int, int], bytes], node: int = 5) -> CanI
 
 
 def test_the_reference_devices_are_likely_and_never_certain() -> None:
-    """Their vendor id is 0, which is nobody's."""
+    """Their vendor ID is 0, which is not assigned."""
 
     async def main() -> None:
         found = await identify(numbers(0x00020192, 0, 0x402, 0x10000, 77) | {(0x1008, 0): b"DRV"})

@@ -1,4 +1,4 @@
-"""`identify` of Modbus units: the right profile first, and never sure of a wrong one."""
+"""`identify` of Modbus units: the correct profile first, and never certain of a wrong one."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def levels(found: ModbusIdentity) -> dict[str, Sureness]:
 
 @pytest.mark.parametrize("name", RECORDED)
 def test_a_shipped_device_is_matched_with_its_own_profile_first(name: str) -> None:
-    """A replayed device tells no identity of its own, so nothing may be certain, except where a SunSpec map says what it is."""
+    """A replayed device has no identity of its own, so nothing may be certain, except if a SunSpec map identifies it."""
 
     async def main() -> None:
         profile = next(p for p in SHIPPED if Path(p.path).stem == name)
@@ -152,7 +152,7 @@ def test_nothing_read_is_nothing_known() -> None:
 
 
 def test_an_exception_that_takes_600_ms_is_an_answer() -> None:
-    """Defect: `identify` waited 500 ms, so a device that thinks longer before it refuses seemed not to answer."""
+    """Defect: `identify` waited 500 ms, so a device that refuses more slowly seemed not to answer."""
 
     async def main() -> None:
         wire = Wired(unit(bank([Span("holding", 0, 4)]), functions=frozenset({3})), 1, latency_s=0.6)

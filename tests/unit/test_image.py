@@ -1,4 +1,4 @@
-"""The process image: any values round trip, messages in order exactly once, two layouts never meet."""
+"""The process image: any values round-trip, messages arrive in order exactly once, two layouts are never mixed."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ def test_a_restarted_writer_goes_on_where_the_dead_one_stopped_mid_write() -> No
     writer._write_messages({"m": [(9, b"lost"), (9, b"lost")]})
     snapshot = reader.snapshot()
     assert (snapshot.counter, snapshot.value("x").value) == (3, 3)
-    assert [m.data for m in snapshot.messages["m"]] == [b"\2", b"\3"]  # depth 2: both still whole
+    assert [m.data for m in snapshot.messages["m"]] == [b"\2", b"\3"]  # depth 2: both are still complete
     again = image.writer("r")
     assert again.publish([good(0), good(4)], 4, {"m": [(4, b"new")]}) == 4
     assert reader.snapshot().messages["m"] == (Message(4, 4, b"new"),)
@@ -156,7 +156,7 @@ def test_a_slot_that_carries_another_number_is_not_believed() -> None:
     image, _ = one_region(TagSpec("x", TagKind.INT))
     writer, reader = image.writer("r"), image.reader("r")
     writer.publish([good(1)], 1)
-    writer._words[0] = 5  # the counter is visible before the slot: a processor that reorders stores
+    writer._words[0] = 5  # the counter is visible before the slot, as on a processor that reorders stores
     assert reader.snapshot().counter == 0
     assert reader.gave_up == 1
 
@@ -269,4 +269,4 @@ def test_released_memory_can_be_closed(readers: int, count: int) -> None:
         image.reader("r").snapshot()
     image.release()
     memory.release()
-    backing.append(0)  # BufferError while any view is left
+    backing.append(0)  # BufferError while any view exists

@@ -1,4 +1,4 @@
-"""Two processes on one image: a writer at full speed, killed at an arbitrary instant. Never a torn value."""
+"""Two processes on one image: a writer at full speed, killed at an arbitrary instant. A value is never torn."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ import pytest
 from fieldtwin.gateway.core.image.image import ImageLayout, RegionLayout, RegionReader, TagKind, TagSpec, message_tag
 
 TAGS = 334
-"""Of each of three kinds: 1,002 mixed tags."""
+"""Number of tags per kind, of three kinds: 1,002 mixed tags."""
 READS = 10_000_000
-"""Tags read, in whole snapshots."""
+"""Number of tags read, in whole snapshots."""
 FRESH = 100
-"""Of the snapshots of each round at least so many are of publications that had not been seen; with a processor each, 97 % are."""
+"""Minimum share of snapshots per round with a new publication; with one processor per process, 97 % are new."""
 ROUNDS = 4
 DEPTH = 512
 
-# Every publication is n in all tags and one message n: any mixture of two publications shows.
+# Every publication has n in all tags and one message n, so any mixture of two publications is detected.
 WRITER = """
 import json, mmap, sys
 from fieldtwin.gateway.core.image.image import ImageLayout
@@ -68,13 +68,13 @@ def test_a_writer_at_full_speed_killed_again_and_again_never_tears_a_value(
                         before, seen = seen, _look(reader, seen)
                         looks, fresh = looks + 1, fresh + (seen != before)
                         if seen == before:
-                            os.sched_yield()  # on a crowded computer the writer gets its turn
+                            os.sched_yield()  # on a busy computer the writer gets CPU time
                 finally:
                     child.kill()
                     child.wait()
                     assert child.stdout is not None
                     child.stdout.close()
-                seen = _look(reader, seen)  # whole right after the kill, too
+                seen = _look(reader, seen)  # consistent right after the kill, too
             assert seen >= fresh >= FRESH * rounds
             assert reader.gave_up == 0
 
@@ -90,7 +90,7 @@ def _start_writer(path: Path, layout: ImageLayout) -> subprocess.Popen[str]:
 
 
 def _look(reader: RegionReader, seen: int) -> int:
-    """One snapshot: all of one publication, messages without a gap that was not counted. Returns the last sequence."""
+    """Read one snapshot: all of one publication, messages without an uncounted gap. Return the last sequence."""
     missed_before = reader.missed["m"]
     snapshot = reader.snapshot()
     n = snapshot.counter
@@ -103,6 +103,6 @@ def _look(reader: RegionReader, seen: int) -> int:
     sequences = [m.seq for m in messages]
     assert sequences == sorted(set(sequences))
     assert all(seen < number <= n for number in sequences)
-    # Whatever the writer overwrote while this process had to wait is counted.
+    # Messages that the writer overwrote while this process had to wait are counted.
     assert len(messages) + reader.missed["m"] - missed_before == n - seen
     return n

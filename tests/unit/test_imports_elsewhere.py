@@ -1,5 +1,5 @@
-"""Every module is imported on a system that has none of Unix's own modules, in a process of its own: Windows' standard library
-minus what else it lacks. What needs them says so when it is used. And none is imported under a second name."""
+"""Every module can be imported without Unix's own modules, in a separate process: Windows' standard library without further
+modules that it lacks. Functions that need them report it when used. No module is imported under a second name."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
-"""What `infer` says of registers that belong together, of those that never move, and of single bits; and what its percentages are
-worth.
+"""Claims of `infer` about registers that belong together, registers that never change, and single bits; and the calibration of
+its percentages.
 
-Observed: the low word of a uint32 CDAB pulse counter was called "uint16, 82 %", and "int16, 81 %" where it wrapped exactly when
-the high word was incremented. Registers that were always 0 were missing in the draft, so that its emulator refused them. Bits of
-a status word that toggled were not named.
+Defects: the low word of a uint32 CDAB pulse counter was called "uint16, 82 %", and "int16, 81 %" if it wrapped exactly when
+the high word was incremented. Registers that were always 0 were missing in the draft, so its emulator refused them. Bits of a
+status word that toggled were not named.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Writing knowledge: nobody waits, a slow or full store loses nothing that fits the queue, and what was lost is known."""
+"""Writing knowledge: no caller waits, a slow or full store loses nothing that fits the queue, and losses are counted."""
 
 from __future__ import annotations
 
@@ -168,7 +168,7 @@ def test_knowledge_replayed_is_what_was_last_known(tmp_path: Path) -> None:
 
 
 def test_a_store_that_refuses_is_told_of_and_what_is_queued_stays(tmp_path: Path) -> None:
-    """A twin's commands: what is not on record is not sent, and the twin goes on."""
+    """A twin's commands: an unrecorded command is not sent, and the twin continues."""
 
     async def main() -> None:
         store, origin = await moody(tmp_path)

@@ -1,4 +1,4 @@
-"""What devices taught about their gaps: kept for the next run, for that device only, and said as a line for its profile."""
+"""Facts learned about a device's gaps: stored for the next run, for that device only, and printed as a line for its profile."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ tags:
   gone: {at: "holding:12"}
 """
 HERE = [Span("holding", 0, 2), Span("holding", 5, 6)]
-"""2 to 4 are a gap, 7 and 9 are there, 12 is not."""
+"""2 to 4 are a gap, 7 and 9 exist, 12 does not."""
 
 
 class Site:
-    """One device on a line, run as often as one likes; `exceptions` are those of the last run."""
+    """One device on a line that can be run repeatedly; `exceptions` are those of the last run."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -84,7 +84,7 @@ def test_mb_025_what_was_learnt_is_said_and_not_asked_again(site: Site) -> None:
     }
     assert site.exceptions > 1
     known = site.run()
-    assert (site.exceptions, site.requests) == (1, 3 + 2 + 2)  # what is missing is asked for once, by itself
+    assert (site.exceptions, site.requests) == (1, 3 + 2 + 2)  # a missing one is requested once, separately
     assert known["line"] == 'gaps: ["holding:2..4"]'
 
 
@@ -94,7 +94,7 @@ def test_mb_025_with_its_line_in_the_profile_nothing_is_left_to_learn(site: Site
     site.profile = profile(f"{line}\n" + TAGS.replace('  gone: {at: "holding:12"}\n', ""))
     assert site.run() == {}
     assert (site.exceptions, site.requests) == (0, 2 * 3)
-    assert json.loads(site.path.read_text()) != {}  # what the old profile was taught, until something new is learnt
+    assert json.loads(site.path.read_text()) != {}  # facts learned with the old profile, until a new fact is learned
 
 
 @pytest.mark.parametrize("change", ["profile", "unit", "endpoint"])

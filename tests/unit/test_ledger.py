@@ -1,4 +1,4 @@
-"""The ledger of virtual hours: what is in it counts, once, and a kill costs at most the line that was being written."""
+"""The ledger of virtual hours: each entry counts once, and a kill costs at most the line being written."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_texts_are_not_mixed_up() -> None:
 
 
 def test_a_campaign_that_the_ledger_knows_as_failed_does_not_end_ok(tmp_path: Path) -> None:
-    """Observed before: with --ledger a seed that had failed was not run again, and the campaign ended with ok."""
+    """Defect: with --ledger a seed that had failed was not run again, and the campaign ended with ok."""
     from click.testing import CliRunner
 
     from fieldtwin.cli.run.run_command import command

@@ -1,4 +1,4 @@
-"""`line`: what is made of a line, a bus or a host, with faults that are known; nothing is sent but a probe that was asked for."""
+"""`line`: diagnosis of a line, a bus or a host with known faults; nothing is sent except a requested probe."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The LSS master against slaves of a bus in memory that answer when they like: found whole, one by one, never mixed up."""
+"""The LSS master against slaves on a bus in memory with arbitrary delays: it finds all, one by one, without confusing them."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ REPLY_S = 0.01
 
 
 class Slave:
-    """One LSS slave (CiA 305), for these tests. `delay_s` is how long it takes to answer."""
+    """One LSS slave (CiA 305), for these tests. `delay_s` is its response time."""
 
     def __init__(self, address: tuple[int, int, int, int], *, node: int = 0xFF, delay_s: float = 0.001) -> None:
         self.address, self.node, self.delay_s = address, node, delay_s
@@ -107,7 +107,7 @@ async def master_of(slaves: list[Slave]) -> AsyncIterator[LssMaster]:
 
 
 def test_co056_of_several_slaves_one_is_found_and_the_others_wait() -> None:
-    """Their replies come one behind the other, at most as late as a reply may be: they count as one."""
+    """Their replies come one after the other, each within the maximum delay: they count as one."""
 
     async def main() -> None:
         slaves = [

@@ -1,4 +1,4 @@
-"""A transmitter's mailboxes, the gateway's side and the far end's, in virtual time."""
+"""A transmitter's mailboxes, the gateway's side and the remote end's, in virtual time."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ MESSAGES = 12
 
 
 def test_a_slow_modem_is_not_asked_all_the_time(tmp_path: Path) -> None:
-    """A message stays in the outbox until the link has room: once it is known how long that takes, a look or two a message are
-    enough, and the link is as busy as it was."""
+    """A message stays in the outbox until the link has room. Once that duration is known, one or two polls per message are
+    sufficient, and the link is as busy as before."""
     loop = VirtualLoop()
 
     async def main() -> None:
@@ -30,7 +30,7 @@ def test_a_slow_modem_is_not_asked_all_the_time(tmp_path: Path) -> None:
             nursery.start(shore.run([]), "far end")
             await asyncio.sleep(3.0)
             pump = run.gateway.pumps[0]
-            pump.offer([bytes(64)] * 30)  # more than the modem and its link take at once
+            pump.offer([bytes(64)] * 30)  # more than the modem and its link accept at once
             while pump.driver.consumer.queue:
                 await asyncio.sleep(0.5)
             began, looks, sent = loop.time(), pump.driver.mailbox_waits, pump.driver.sent
@@ -59,7 +59,7 @@ def test_nor_is_the_far_ends(tmp_path: Path) -> None:
                 far.consumer.observe(COMMAND(bytes(64)))
             while (
                 len(far.consumer.queue) > MESSAGES
-            ):  # more than the modems, their link and the plant's inbox take at once
+            ):  # more than the modems, their link and the plant's inbox accept at once
                 await asyncio.sleep(0.05)
             looks, sent = far.mailbox_waits, far.sent
             while far.consumer.queue:
@@ -72,7 +72,7 @@ def test_nor_is_the_far_ends(tmp_path: Path) -> None:
 
 
 def looks(patience: Patience, begin_ms: int, free_ms: int) -> list[int]:
-    """When the outbox is looked at, each 20 ms from `begin_ms` on, until it is found free."""
+    """Return the times of polls of the outbox, each 20 ms from `begin_ms` on, until it is free."""
     found = []
     for now_ms in range(begin_ms, begin_ms + 100_000, 20):
         if patience.asks(now_ms * NS_PER_MS):
@@ -87,11 +87,11 @@ def test_patience_grows_with_the_modem_and_shrinks_with_it() -> None:
     patience = Patience()
     patience.sent(0)
     first = looks(patience, 0, 1000)
-    assert first == list(range(0, 1021, 60))  # nothing is known: every 50 ms, at a tick
+    assert first == list(range(0, 1021, 60))  # without knowledge: every 50 ms, at a tick
     patience.sent(1020 * NS_PER_MS)
     assert looks(patience, 1040, 2020)[0] == 1020 + 780  # three quarters of 1020 ms, at a tick
     patience.sent(2040 * NS_PER_MS)
-    assert looks(patience, 2060, 2060) == [2820]  # it was free long before; nobody looked
+    assert looks(patience, 2060, 2060) == [2820]  # it was free long before; no poll saw it
     patience.sent(2820 * NS_PER_MS)
     assert looks(patience, 2840, 2840) == [3420]
     patience.sent(3420 * NS_PER_MS)

@@ -1,6 +1,6 @@
-"""Our master against our emulated slave, which share no code, on a wire that damages: typed errors or the right value.
+"""Our client against our emulated server, which share no code, on a damaging wire: typed errors or the right value.
 
-Whatever happened, the next exchange over a sound wire succeeds: both sides are in step again.
+After any damage, the next exchange over an intact wire succeeds: both sides are synchronised again.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def make_unit(cells: int = 500) -> ModbusUnit:
 
 
 class Rig:
-    """One master, one slave, and time."""
+    """One client, one server, and the clock."""
 
     def __init__(self, kind: str) -> None:
         self.kind = kind
@@ -63,7 +63,7 @@ class Rig:
         self.now_ns = 0
 
     def heard(self, data: bytes) -> list[bytes]:
-        """What the slave answers."""
+        """Return the reply of the server."""
         if self.kind == "udp":
             return [e.reply for e in self.stream.receive_datagram(data, self.now_ns) if e.reply]
         if self.kind == "mbap":
@@ -74,12 +74,12 @@ class Rig:
     def exchange(
         self, request: Request[Reply], damage_out: list[bytes] | None = None, damage_back: Damage | None = None
     ) -> Reply | FieldtwinError:
-        """Ask. `damage_out` stands for what arrives at the slave, `damage_back` does to replies what it does."""
+        """Send a request. `damage_out` changes the bytes to the server, `damage_back` the reply."""
         transaction = Transaction(self.framer, UNIT, request, timeout_ns=TIMEOUT_NS)
         sent = transaction.start(self.now_ns)
         arrived = [sent] if damage_out is None else damage_out
         replies = [reply for data in arrived for reply in self.heard(data)]
-        if self.kind in ("rtu", "ascii"):  # a damaged request ends with the silence behind it
+        if self.kind in ("rtu", "ascii"):  # a damaged request ends with the silence after it
             self.now_ns += 60_000_000
             replies += self.heard(b"")
         try:
@@ -98,14 +98,14 @@ class Rig:
             return e
 
     def settle(self) -> None:
-        """A pause longer than any quarantine; the owner of a connection closes one whose slave makes no sense of it."""
+        """A pause longer than any quarantine; the owner of a connection closes it if the server cannot parse it."""
         self.now_ns += PAUSE_NS
         self.heard(b"") if self.kind in ("rtu", "ascii") else None
         self.now_ns += PAUSE_NS
 
 
 class Damage:
-    """To a run of bytes: bits of one burst of at most 16, which every check sum finds; a cut; or the whole said twice."""
+    """Damage bytes: one burst of at most 16 bits, which every checksum finds; a cut; or a complete repetition."""
 
     def __init__(self, where: int, burst: int, cut: int, twice: bool, pieces: int) -> None:
         self.where, self.burst, self.cut, self.twice, self.pieces = where, burst, cut, twice, pieces
@@ -115,7 +115,7 @@ class Damage:
             bits = len(data) * 8
             flipped = int.from_bytes(data) ^ self.burst << self.where % bits & (1 << bits) - 1
             data = flipped.to_bytes(len(data))
-        elif kind == "ascii" and self.burst:  # the sum finds what changes one byte
+        elif kind == "ascii" and self.burst:  # the checksum detects a change of one byte
             at = self.where % len(data)
             data = data[:at] + bytes([data[at] ^ (self.burst & 0xFF or 1)]) + data[at + 1 :]
         if self.cut and kind != "mbap":  # TCP loses nothing
@@ -147,7 +147,7 @@ REQUESTS = st.one_of(
 
 
 def is_true(rig: Rig, request: Request[Reply], reply: Reply) -> bool:
-    """Whether the reply says what the slave holds."""
+    """Return whether the reply matches the server's values."""
     if isinstance(request, ReadRegisters | ReadWriteRegisters):
         table = request.table if isinstance(request, ReadRegisters) else "holding"
         first = 2 * FIRST if table == "input" else FIRST
@@ -219,7 +219,7 @@ def words(*values: int) -> bytes:
 
 
 def write_many(function: int, address: int, count: int, off_by: int, short_by: int) -> bytes:
-    """A write of several cells whose byte count and whose data may be one too many or too few."""
+    """A write of several cells with a byte count and data that may be one too many or too few."""
     size = (count + 7) // 8 if function == 0x0F else 2 * count
     data = bytes(max(0, min(size, 246) - short_by))
     return bytes([function]) + words(address, count) + bytes([max(0, size + off_by) & 0xFF]) + data
@@ -242,7 +242,7 @@ SENSIBLE = st.one_of(
 )  # fmt: skip
 WHOLE = make_unit(0x10000)
 JUDGED = {1, 2, 3, 4, 5, 6, 0x0F, 0x10, 0x16, 0x17}
-"""Functions that both sides know, and that depend on nothing but the request where every cell is there."""
+"""Functions that both sides know, and that depend only on the request if every cell exists."""
 
 
 @settings(max_examples=400, deadline=None)
@@ -264,7 +264,7 @@ def test_both_servers_judge_a_request_alike(pdu: bytes) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_rig_itself_is_sound(kind: str) -> None:
-    """What the properties lean on: an undamaged exchange is true, and a wrong value would be told from a true one."""
+    """Premises of the properties: an undamaged exchange is correct, and a wrong value would be detected."""
     rig = Rig(kind)
     request = ReadRegisters("holding", 5, 3)
     reply = rig.exchange(request)

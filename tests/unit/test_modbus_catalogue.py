@@ -1,7 +1,7 @@
-"""All 70 cases of the catalogue of Modbus edge cases: each a row, each played three ways, each with a mutation that it catches.
+"""All 70 cases of the list of Modbus edge cases: each has a row, run in three ways, and a mutation that it catches.
 
-A row stands in tests/vectors (bytes and times) or is a test named ``test_mb_NNN_...``, where sockets, ports or several masters
-are what the case is about. That the mutations are caught, `scripts/mutate` shows.
+A row is in tests/vectors (bytes and times) or is a test named ``test_mb_NNN_...``, if the case is about sockets, ports or
+several clients. `scripts/mutate` proves that the mutations are caught.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ TESTS = Path(__file__).parents[1]
 CASES = [f"MB-{number:03}" for number in range(1, 71)]
 MUTATIONS = ("modbus_master", "modbus_slave", "modbus_gateway", "gateway_bridge")
 WIRES_ONLY = {58, 59, 60, 61, 62, 63, 65, 66, 67, 28}
-"""Gateways with several clients, connection limits, ports: tests with names, not rows of bytes."""
+"""Gateways with several clients, connection limits, ports: named tests, not rows of bytes."""
 NO_GARBAGE = {
     27: "nothing is sent and nothing comes",
     46: "nothing comes",
     64: "the connection ends in the middle of a frame",
 }
-"""Cases of the master without a row that garbage follows. (068, the wrong baud rate, is garbage and nothing else.)"""
+"""Cases of the client without a row followed by garbage. (068, the wrong baud rate, consists of garbage.)"""
 
 
 def toml(name: str) -> Any:
@@ -38,7 +38,7 @@ GATEWAY: list[dict[str, Any]] = toml("vectors/modbus_gateway")["row"]
 
 
 def named_tests() -> set[str]:
-    """The cases that have a test named after them."""
+    """The cases with a test named after them."""
     texts = (path.read_text() for folder in ("unit", "wires", "system") for path in (TESTS / folder).glob("test_*.py"))
     return {f"MB-{number}" for text in texts for number in re.findall(r"^def test_mb_(\d{3})_", text, re.MULTILINE)}
 
@@ -65,12 +65,12 @@ def test_each_case_has_a_mutation(case: str) -> None:
 
 
 def test_each_row_of_bytes_is_played_three_ways() -> None:
-    """Whole is how all are played. Byte by byte and with garbage behind, at least one row of each case."""
+    """All rows run whole. At least one row of each case runs byte by byte and with trailing garbage."""
     bytewise, garbage = defaultdict[str, bool](bool), defaultdict[str, bool](bool)
     for row in SLAVE:
         bytewise[row["id"][:6]] |= not row.get("whole_only", False)
         garbage[row["id"][:6]] |= row.get("tail", True) and not row.get("closed", False)
-    assert [case for case, played in bytewise.items() if not played] == ["MB-053"]  # one byte is never too many
+    assert [case for case, played in bytewise.items() if not played] == ["MB-053"]  # one byte is always valid
     assert all(garbage.values())
     bytewise.clear()
     garbage.clear()
@@ -82,7 +82,7 @@ def test_each_row_of_bytes_is_played_three_ways() -> None:
 
 
 def test_mutations_name_rows_that_there_are() -> None:
-    """A row that got another name would leave its mutation without a test."""
+    """A renamed row would leave its mutation without a test."""
     ways = ("whole", "bytewise", "garbage")
     there = {
         "tests/unit/test_slave_vectors.py": {row["id"] for row in SLAVE},

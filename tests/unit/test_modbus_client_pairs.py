@@ -1,4 +1,5 @@
-"""No request of the Modbus client is ever given what was meant for another: late, damaged, doubled and unasked replies."""
+"""A request of the Modbus client never gets a reply meant for a different one: late, damaged, repeated and unsolicited
+replies."""
 
 from __future__ import annotations
 
@@ -67,7 +68,7 @@ def test_mb_013_the_quarantine_learns_the_longest_latency() -> None:
         timed_out_ns = CLOCK.monotonic_ns()
         answering(device, 3)
         assert (await client.read_registers(1, "holding", 0, 1)).registers == (3,)
-        assert device.requests[2][0] - timed_out_ns >= latency_ns * 0.95  # though this timeout was only 20 ms
+        assert device.requests[2][0] - timed_out_ns >= latency_ns * 0.95  # although this timeout was only 20 ms
 
     with_client(scenario)
 
@@ -102,7 +103,7 @@ def test_a_babbling_line_is_reported_and_nothing_is_sent() -> None:
         silent_ns = CLOCK.monotonic_ns()
         answering(device, 1)
         assert (await client.read_registers(1, "holding", 0, 1)).registers == (1,)
-        assert device.requests[1][0] - silent_ns < 400_000_000  # what babbled did not count as a latency
+        assert device.requests[1][0] - silent_ns < 400_000_000  # the babbling did not count as a latency
 
     with_client(scenario)
 
@@ -201,6 +202,6 @@ def test_mb_002_the_rest_of_a_damaged_reply_does_not_reach_the_next_request() ->
         answering(device, 6)
         assert (await client.read_registers(1, "holding", 0, 1)).registers == (6,)
         assert client.counters.late_bytes == 5
-        assert device.requests[1][0] - damaged_ns >= 20_000_000  # as long as a USB adapter may hold the rest back
+        assert device.requests[1][0] - damaged_ns >= 20_000_000  # as long as a USB adapter may delay the rest
 
     with_client(scenario)

@@ -1,7 +1,7 @@
-"""100 MB of garbage through every receiver of Modbus: what they keep is a frame or two, and a request behind it is heard.
+"""100 MB of garbage through every Modbus receiver: it stores a frame or two, and receives a request after the garbage.
 
-Garbage that each gets rid of fast enough for a default run; slower kinds, a MB each, stand in test_slave_flood.py and in
-test_modbus_properties.py, where the master's framers have their 100 MB.
+This covers garbage that each receiver discards fast enough for a default run; slower kinds, one MB each, are in
+test_slave_flood.py and in test_modbus_properties.py, where the client's framers get their 100 MB.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from fieldtwin.gateway.protocols.modbus.server_mbap import MbapRequests
 CHUNK = 1 << 20
 CHUNKS = 100
 GROWTH_KB = 16 * 1024
-"""Of the process, at most: some chunks. 100 MB that were kept would be six times that."""
+"""Maximum growth of the process: some chunks. 100 MB of stored bytes would be six times that."""
 READ_ADU = bytes.fromhex("0001 0000 0006 01 03 0000 0001")
 READ_FRAME = bytes.fromhex("01 03 0000 0001 840A")
 FOREIGN_ADU = bytes.fromhex("0001 0001 00FE 01") + bytes(253)
@@ -43,7 +43,7 @@ def units() -> dict[int, ModbusUnit]:
 
 
 def flood(feed: Callable[[bytes, int], object], kept: Callable[[], int], kind: str, chunks: int = CHUNKS) -> int:
-    """Feed it; how long that took on the line, in ns."""
+    """Feed it; return the duration on the line, in ns."""
     before_kb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     now_ns = NS_PER_S
     for _ in range(chunks):
@@ -73,7 +73,7 @@ def test_an_ascii_slave(kind: str) -> None:
 @pytest.mark.parametrize("kind", sorted(GARBAGE))
 def test_a_tcp_slave(kind: str) -> None:
     slave = MbapSlave(units())
-    chunks = 4 if kind == "zeros" else CHUNKS  # ADUs of length 0, one in six bytes, each dropped for itself
+    chunks = 4 if kind == "zeros" else CHUNKS  # ADUs of length 0, one in six bytes, each dropped separately
     flood(slave.feed, lambda: slave.pending, kind, chunks)
     assert slave.requests == 0
     assert (slave.desync is None) == (kind in ("zeros", "another protocol"))
@@ -91,7 +91,7 @@ def test_the_gateways_own_tcp_server(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", ["zeros", "ones", "random"])
 def test_the_reverse_bridge_clears_a_flood_with_little_work_and_finds_the_request_after_it(kind: str) -> None:
-    """Observed before: each byte of a flood was tried as the beginning of a frame of any unit, at 0.9 MB a second."""
+    """Defect: each byte of a flood was tried as the start of a frame of any unit, at 0.9 MB a second."""
     line, calls = RtuRequests(86_000, units=[1]), 0
 
     def count(frame: object, event: str, argument: object) -> None:

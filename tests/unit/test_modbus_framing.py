@@ -1,4 +1,4 @@
-"""Rows of the catalogue of Modbus edge cases that need more than one vector, against the pure framings."""
+"""Rows of the list of Modbus edge cases that need more than one vector, against the pure framings."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def outcome(framer: RtuFramer, arrivals: Iterable[tuple[float, bytes]], request:
 
 
 def test_crc_of_the_check_string_and_of_a_whole_frame() -> None:
-    assert crc16(b"123456789") == 0x4B37  # CRC-16/MODBUS in the catalogue of parametrised CRC algorithms
+    assert crc16(b"123456789") == 0x4B37  # CRC-16/MODBUS in the list of parametrised CRC algorithms
     assert crc16(REPLY) == 0
 
 

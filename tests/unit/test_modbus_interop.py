@@ -61,7 +61,7 @@ def forward(loop: asyncio.AbstractEventLoop, source: int, sink: int) -> None:
 
 @asynccontextmanager
 async def over_rtu() -> AsyncIterator[ModbusClient]:
-    pairs = [os.openpty(), os.openpty()]  # the slave ends stay open here: no EIO when a user closes
+    pairs = [os.openpty(), os.openpty()]  # the slave ends remain open here: no EIO when a user closes
     loop = asyncio.get_running_loop()
     for _, slave in pairs:
         tty.setraw(slave)

@@ -1,4 +1,4 @@
-"""What the Modbus path keeps from one exchange to the next is forgotten when what it follows from changes."""
+"""Values cached by the Modbus path between exchanges are dropped when their source changes."""
 
 from __future__ import annotations
 

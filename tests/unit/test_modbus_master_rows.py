@@ -1,7 +1,7 @@
-"""The rows of the catalogue of Modbus edge cases that concern the master, each on the whole client.
+"""The rows of the list of Modbus edge cases that concern the client, each on the whole client.
 
-A row of tests/vectors/modbus_master_rows.toml is bytes and times in, bytes and times out, and the resulting state. It is
-played whole, byte by byte and with trailing garbage, on virtual time: the times are exact.
+A row of tests/vectors/modbus_master_rows.toml has bytes and times in, bytes and times out, and the resulting state. It runs
+whole, byte by byte and with trailing garbage, in virtual time, so times are exact.
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ class Play:
             assert abs(at_ns - wanted_ms * MS) <= TOLERANCE_NS, f"{what} at {at_ns / MS} ms"
 
     def schedule(self, sent_ns: int, ask: dict[str, Any]) -> None:
-        """Let arrive what the row says: the time is that of the last byte, counted from the request's being sent."""
+        """Deliver the bytes of the row; the time is that of the last byte, counted from the sending of the request."""
         arrivals = [(at_ms, wire_bytes(text, self.framing)) for at_ms, text in ask.get("arrives", [])]
         if self.how == "garbage" and arrivals and ask.get("tail", True):
             at_ms, data = arrivals[-1]

@@ -1,4 +1,4 @@
-"""Whatever arrives in whatever pieces: never a wrong value, never a foreign exception, and the next request is answered."""
+"""For any bytes in any pieces: never a wrong value, never a third-party exception, and the next request is answered."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ ALL_REQUESTS = st.one_of(
     ),
 )
 
-# Bytes that look like something: units, functions and counts in use, whole frames of ours and of others.
+# Bytes with a meaning: units, functions and counts in use, whole frames of ours and of third parties.
 CRUMBS = st.one_of(
     st.binary(max_size=12),
     st.sampled_from([b"\x01\x03", b"\x01\x83", b"\x01\x04\x04", b"\x01", b"\x00", b"\xff", b"\x02\x03\xfa"]),
@@ -176,7 +176,7 @@ def test_a_reply_is_read_whatever_its_pieces(
 @settings(max_examples=300, deadline=None)
 @given(st.lists(st.integers(0, 65535), min_size=1, max_size=20), st.data())
 def test_a_damaged_rtu_reply_is_never_a_value(values: list[int], data: st.DataObject) -> None:
-    """A burst of up to 16 bits is always found by the CRC; anything lost or cut is found by length."""
+    """A burst of up to 16 bits is always found by the CRC; a lost or cut part is found by the length."""
     frame = framed("rtu", 0, registers_pdu(3, values))
     at = data.draw(st.integers(0, len(frame) * 8 - 1))
     burst = data.draw(st.integers(1, 0xFFFF)) << at
@@ -250,8 +250,8 @@ FLOODS = [
 @pytest.mark.parametrize("kind", ["rtu", "mbap", "udp", "ascii"])
 @pytest.mark.parametrize("flood", FLOODS, ids=["every byte", "zeros", "ours", "colons", "headers", "line feeds"])
 def test_a_flood_of_garbage_is_bounded_in_memory_and_in_work(kind: str, flood: bytes) -> None:
-    """While a reply is awaited: 100 MB of every byte, 1 MB of what looks like something. The test's time limit is the
-    bound on work: at 2 us a byte, 100 MB would take minutes."""
+    """While a reply is awaited: 100 MB of every byte, 1 MB of meaningful bytes. The test's time limit bounds the work: at 2 us
+    a byte, 100 MB would take minutes."""
     framer = framer_of(kind)
     transaction = Transaction(framer, UNIT, ReadRegisters("holding", 0, 2), timeout_ns=TIMEOUT_NS)
     transaction.start(0)

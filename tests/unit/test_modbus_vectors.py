@@ -26,7 +26,7 @@ def ids(vector: dict[str, Any]) -> str:
 
 
 def make_request(spec: list[Any]) -> Any:
-    """The class that `spec` names, with its arguments; bytes stand as hexadecimal."""
+    """Return an object of the class that `spec` names, with its arguments; bytes are hexadecimal."""
     name, *args = spec
     module = next(m for m in (requests, diagnostics, files, identity, user) if hasattr(m, name))
     return getattr(module, name)(*[make_argument(name, a) for a in args])
@@ -43,7 +43,7 @@ def make_argument(name: str, value: Any) -> Any:
 
 
 def play(vector: dict[str, Any], chunks: list[bytes]) -> tuple[Reply | errors.FieldtwinError, bool]:
-    """Outcome of the exchange, and whether it took until the deadline."""
+    """Result of the exchange, and whether it took until the deadline."""
     framer: Framer = MbapFramer() if vector.get("framing") == "mbap" else RtuFramer()
     transaction = Transaction(framer, 0x11, make_request(vector["request"]), timeout_ns=TIMEOUT_NS)
     now_ns = 5_000_000_000

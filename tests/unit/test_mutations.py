@@ -1,4 +1,4 @@
-"""The mutations of tests/mutations fit the program and name tests that exist; that they are caught, scripts/mutate shows."""
+"""The mutations of tests/mutations fit the program and name existing tests; scripts/mutate proves that they are caught."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is said when a system, its prototype or a recording is not what somebody thought."""
+"""Messages if a system, its prototype or a recording is not what the user expected."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The network file: what it means, and what is wrong in it, at its spot."""
+"""The network file: its meaning, and errors in it, reported at their position."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_the_shipped_network() -> None:
 
 
 def test_no_system_of_it_mentions_another() -> None:
-    """A plant's files are those of one observatory."""
+    """The files of a plant describe one observatory."""
     for name in ("west", "middle", "east"):
         keys = [
             line

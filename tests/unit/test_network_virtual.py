@@ -1,4 +1,4 @@
-"""A network in virtual time: one seed, one run; each system judged as it is alone; and what is not well is said."""
+"""A network in virtual time: one seed gives one run; each system is checked as it is alone; problems are reported."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_the_same_seed_is_the_same_run_and_everything_is_judged(tmp_path: Path) 
     first = run(5, file).summary()
     assert first["ok"], first
     assert run(5).summary() == first
-    assert run(9).summary()["trace"] != first["trace"]  # the water loses another message
+    assert run(9).summary()["trace"] != first["trace"]  # the acoustic channel loses a different message
     assert list(first["systems"]) == ["west", "middle", "east"]
     for name, one in first["systems"].items():
         assert one["published"]["checked"] > 10, name
@@ -123,7 +123,7 @@ def test_many_seeds_are_run_and_the_ledger_leaves_out_what_it_has(tmp_path: Path
 def test_what_a_failing_seed_takes_is_left_and_is_a_scenario_of_the_network(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Wrong bits behind Modbus TCP, which has no check sum: nobody can notice, and the published values are wrong."""
+    """Wrong bits on Modbus TCP, which has no checksum: they cannot be detected, and the published values are wrong."""
     monkeypatch.chdir(tmp_path)
     bits = "  - {id: bits, name: corrupt-bits, device: west.modem, from: 0, until: 20}\n"
     (tmp_path / "x.yaml").write_text(FAULTS + bits)

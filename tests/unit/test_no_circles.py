@@ -1,4 +1,4 @@
-"""No two files import each other, not even for their types, and not by a detour."""
+"""No two files import each other, not even for their types, and not indirectly."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ FOLDERS = "gateway", "plc", "emulators", "twin", "fieldtwin"
 
 
 def imports(files: dict[str, str]) -> dict[str, set[str]]:
-    """By module, those of `files` (sources by module) that it imports anywhere. Imports are absolute."""
+    """Return, by module, the modules among `files` (sources by module) that it imports anywhere. Imports are absolute."""
     found: dict[str, set[str]] = {}
     for module, source in files.items():
         names = found[module] = set()

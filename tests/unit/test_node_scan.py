@@ -1,4 +1,4 @@
-"""The node scan: who beats, who answers, who is there and says nothing; one request at a time, with pauses."""
+"""The node scan: nodes with heartbeats, nodes that answer, and silent ones; one request at a time, with pauses."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def test_every_node_is_found_once_and_the_bus_hardly_feels_it() -> None:
             async with running(master):
                 for node in nodes:
                     node.power_on()
-                nodes[2].state = 0x04  # stopped: beats, and answers no SDO
+                nodes[2].state = 0x04  # stopped: sends heartbeats, and answers no SDO
                 asked: list[tuple[float, int]] = []
                 loop = asyncio.get_running_loop()
                 found = await scan_nodes(

@@ -1,4 +1,4 @@
-"""Processes that serve many devices raise the number of files that they may have open, as far as they may."""
+"""Processes that serve many devices raise their limit of open files as far as permitted."""
 
 from __future__ import annotations
 

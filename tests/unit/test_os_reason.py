@@ -1,4 +1,4 @@
-"""`os_reason`: what a system says of a connection that failed, told in one plain phrase."""
+"""`os_reason`: the operating system's reason for a failed connection in one plain phrase."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Outputs of one device that are declared a group are written whole or not at all.
+"""Outputs of one device that are declared as a group are written completely or not at all.
 
-Observed before: a program set a speed that was out of range and started the drive in the same scan; the speed was refused, and
-the drive was started with its old setpoint.
+Defect: a program set a speed that was out of range and started the drive in the same scan; the speed was refused, and the
+drive was started with its old setpoint.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def test_when_one_member_is_refused_nothing_of_the_group_is_written(
             r.writer.want(f"d.{refused[0]}", refused[1])
             await r.polls(8)
             assert r.writes == []
-            assert r.writer.settled  # what is held back holds no shutdown up
+            assert r.writer.settled  # a held write does not delay the shutdown
             told = {e.tag: e for e in r.writer.journal.since(0)}
             assert told[f"d.{refused[0]}"].cause.value == "limit"
             assert told[f"d.{other[0]}"].cause.value == "group"
@@ -113,7 +113,7 @@ def test_a_member_that_the_device_refuses_stops_those_after_it(tmp_path: Path) -
 
 
 def test_safe_values_do_not_ask_the_group(tmp_path: Path) -> None:
-    """The program wants an impossible speed when the PLC is lost: the drive is stopped all the same."""
+    """The program requests an impossible speed when the PLC is lost: the drive is still stopped."""
 
     async def main() -> None:
         async with rig(tmp_path / "a", "valve", "period", groups=APART, safe={"valve": -1}) as r:
@@ -178,7 +178,7 @@ def test_a_drive_is_not_started_with_its_old_speed(tmp_path: Path, *, by_rpdo: b
 
 
 def test_without_a_group_the_drive_is_started_with_its_old_speed(tmp_path: Path) -> None:
-    """What a group is for; and the refused speed is in the journal."""
+    """The purpose of a group; and the refused speed is in the journal."""
 
     async def main() -> None:
         async with canopen_rig(tmp_path) as r:

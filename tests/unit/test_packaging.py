@@ -1,4 +1,4 @@
-"""What is said of packages and services is so: extras, the systemd unit, the metrics that docs name."""
+"""Statements about packages and services are true: extras, the systemd unit, the metrics that docs name."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""A small packed file that holds a gigabyte ends with a typed error at a stated size, whatever reads it.
+"""A small packed file that expands to a gigabyte ends with a typed error at a stated size, in every reader.
 
-Before, memory was bounded but time was not: a capture of 2 MiB could keep `import` busy for hours.
+Defect: memory was bounded but time was not: a capture of 2 MiB could keep `import` busy for hours.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from fieldtwin.gateway.core.errors import FileInvalid
 
 PIECE = 16 << 20
 PIECES = 64
-"""1 GiB in all, made of one compressed piece that is repeated."""
+"""1 GiB in total, made of one compressed piece that is repeated."""
 PCAP = bytes.fromhex("d4c3b2a1 0200 0400 00000000 00000000 00000400 01000000")
 PCAPNG = bytes.fromhex("0a0d0d0a 1c000000 4d3c2b1a 01000000 ffffffffffffffff 1c000000")
 PACKET = struct.pack("<IIII", 0, 0, 65536 - 16, 65536 - 16) + bytes(65536 - 16)
@@ -70,7 +70,7 @@ def test_a_packed_file_of_a_gigabyte_ends_at_the_stated_size(tmp_path: Path, kin
 
 
 def test_a_can_log_whose_containers_hold_gigabytes_ends_at_the_stated_size(tmp_path: Path) -> None:
-    """A BLF file packs its frames in containers; each is small enough for itself."""
+    """A BLF file packs its frames in containers; each container is small enough by itself."""
     objects = struct.pack("<4sHHII", b"LOBJ", 32, 1, 1 << 15, 0) + bytes((1 << 15) - 16)
     body = zlib.compress(objects * (PIECE // 16 // len(objects)))
     container = struct.pack("<4sHHIIHHIII", b"LOBJ", 16, 1, 32 + len(body), 10, 2, 0, 0, PIECE // 16, 0) + body
@@ -90,7 +90,7 @@ def test_an_honest_file_may_hold_many_times_its_size(tmp_path: Path, monkeypatch
     with pytest.raises(FileInvalid, match="unpack it"):
         read(path)
     path.write_bytes(data)
-    read(path)  # unpacked it is a file like any other
+    read(path)  # unpacked it is an ordinary file
     monkeypatch.setattr(packed, "MOST_TIMES", 2000)
     path.write_bytes(gzip.compress(data))
     read(path)

@@ -1,7 +1,8 @@
-"""Peers that send one byte just before each timeout, or frames without an end: each read from a peer ends within a stated limit.
+"""Peers that send one byte just before each timeout, or frames without an end: each read from a peer ends within a stated
+limit.
 
-Before, an SDO upload of one byte a segment held the client for up to twelve days; a flood of foreign Modbus TCP frames could keep
-an exchange open as long as it lasted; and 64 silent clients of a control channel with a token locked its owner out.
+Defects: an SDO upload of one byte per segment blocked the client for up to twelve days; a flood of foreign Modbus TCP frames
+could keep an exchange open as long as it lasted; and 64 silent clients of a control channel with a token locked its owner out.
 """
 
 from __future__ import annotations
@@ -124,7 +125,7 @@ def test_a_unit_that_never_falls_silent_costs_the_other_units_of_its_line_nothin
 
 
 def test_a_line_that_is_never_silent_is_bad_and_good_again_when_it_ends() -> None:
-    """Frames without an end, every millisecond: nothing can be sent, which each poll reports within its limit."""
+    """Frames without an end, every millisecond: nothing can be sent, and each poll reports that within its limit."""
 
     async def main() -> None:
         field = Babbler(bytes.fromhex("09 03 02 0000 5985"), 0.001)
@@ -139,7 +140,7 @@ def test_a_line_that_is_never_silent_is_bad_and_good_again_when_it_ends() -> Non
 
 
 class Endless(ByteConnection):
-    """A connection on which there is always something to read."""
+    """A connection that always has data to read."""
 
     def __init__(self, endpoint: Endpoint, data: bytes) -> None:
         super().__init__(TCPConnection(), endpoint)
@@ -161,7 +162,7 @@ class Endless(ByteConnection):
 
 @pytest.mark.parametrize("framing", ["mbap", "rtu", "ascii"])
 def test_a_flood_of_other_frames_does_not_prolong_an_exchange(framing: str) -> None:
-    """The flood never pauses, so that time is only looked at when bytes arrive."""
+    """The flood never pauses, so time is only checked when bytes arrive."""
     frames = {
         "mbap": bytes.fromhex("7777 0000 0005 01 03 02 0001"),
         "rtu": bytes.fromhex("09 03 02 0000 5985"),
@@ -451,7 +452,7 @@ def test_an_sdo_transfer_that_drips_ends_within_its_limit(
 
 
 def test_a_block_upload_that_drips_ends_within_its_limit() -> None:
-    """A segment of 7 bytes each 490 ms: within a block, the client acknowledges what it has after half a timeout."""
+    """A segment of 7 bytes every 490 ms: within a block, the client acknowledges the received part after half a timeout."""
     made, now_ns, number, moved = SdoBlockUpload(5, 0x2000, 0, TIMEOUT), 0, 0, 0
     made.start(now_ns)
     step: object = made.feed(CanFrame(0x585, b"\xc4" + MUX + bytes(4)), now_ns)
@@ -468,7 +469,7 @@ def test_a_block_upload_that_drips_ends_within_its_limit() -> None:
 
 
 def test_an_object_of_known_length_is_not_read_beyond_it() -> None:
-    """A tag has a type, and so a length: a node that drips a byte each 50 ms for ever is stopped after a few seconds."""
+    """A tag has a type, and thus a length: a node that sends a byte every 50 ms for ever is stopped after a few seconds."""
     made, now_ns = SdoUpload(5, 0x2000, 0, TIMEOUT, length=4), 0
     made.start(now_ns)
     step = made.feed(CanFrame(0x585, b"\x40" + MUX + bytes(4)), now_ns)
@@ -480,7 +481,7 @@ def test_an_object_of_known_length_is_not_read_beyond_it() -> None:
 
 
 def test_a_long_object_of_an_ordinary_node_is_read_whole() -> None:
-    """A segment each 50 ms, with a timeout of 100 ms: 2000 segments take 1000 timeouts, and are no attack."""
+    """A segment every 50 ms, with a timeout of 100 ms: 2000 segments take 1000 timeouts, and are not an attack."""
     made, now_ns = SdoUpload(5, 0x2000, 0, NS // 10), 0
     made.start(now_ns)
     step = made.feed(CanFrame(0x585, b"\x40" + MUX + bytes(4)), now_ns)

@@ -12,7 +12,7 @@ from fieldtwin.plc.blocks import BLOCKS, CTD, CTU, CTUD, F_TRIG, MS, R_TRIG, RS,
 
 BITS = st.lists(st.booleans(), max_size=40)
 STEPS = st.lists(st.tuples(st.integers(1, 30), st.booleans()), max_size=40)
-"""Scans: ms since the one before, and the input."""
+"""Scans: ms since the previous one, and the input."""
 PRESETS = st.integers(0, 60)
 
 
@@ -26,14 +26,14 @@ def scans(steps: list[tuple[int, bool]]) -> list[tuple[int, bool]]:
 
 
 def since(history: list[tuple[int, bool]], level: bool) -> int | None:
-    """When the input took the `level` that it has now; None if it has another."""
+    """Return the time when the input took its present `level`; None if it has a different one."""
     start = None
     for t, value in history:
         start = (t if start is None else start) if value is level else None
     return start
 
 
-# -- the diagrams, as tables: (t in ms, IN) -> (Q, ET in ms), PT = 20 ms, a scan each 10 ms ---------------------------------
+# -- the diagrams, as tables: (t in ms, IN) -> (Q, ET in ms), PT = 20 ms, a scan every 10 ms --------------------------------
 
 TON_TABLE = [(0, 0, 0, 0), (10, 1, 0, 0), (20, 1, 0, 10), (30, 1, 1, 20), (40, 1, 1, 20), (50, 0, 0, 0),
              (60, 1, 0, 0), (70, 0, 0, 0), (80, 1, 0, 0), (100, 1, 1, 20)]  # fmt: skip
@@ -174,7 +174,7 @@ def test_ctud_reset_over_load_over_counting_and_rises_cancel() -> None:
 
 @given(st.lists(st.tuples(*[st.booleans()] * 4, st.integers(-3, 5)), max_size=40), st.sampled_from([0, 32766, -32767]))
 def test_ctud_is_what_the_standards_body_says(rows: list[tuple[bool, bool, bool, bool, int]], begin: int) -> None:
-    """IEC 61131-3, Table 45, CTUD, with its edges taken from the calls before."""
+    """IEC 61131-3, Table 45, CTUD, with its edges taken from the previous calls."""
     c = CTUD()
     c.CV = cv = begin
     up_before = down_before = False

@@ -1,4 +1,4 @@
-"""HYSTERESIS, RAMP, PID and ALARM: what they promise, on made-up plants."""
+"""HYSTERESIS, RAMP, PID and ALARM: their specified properties, on simulated plants."""
 
 from __future__ import annotations
 

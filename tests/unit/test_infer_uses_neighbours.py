@@ -185,7 +185,8 @@ def test_a_measurement_has_no_toggling_bits(noise: int) -> None:
 
 
 def test_claimed_percentages_are_not_overconfident_on_generated_maps() -> None:
-    """A smaller sample of what `benchmarks/infer_calibration.py` measures on 600 maps; the seed is neither of its two."""
+    """A smaller sample than the 600 maps that `benchmarks/infer_calibration.py` measures; the seed differs from both of its
+    seeds."""
     claims: list[tuple[float, bool]] = []
     for one in corpus(120, 3):
         truth = {f.address: f for f in one.fields}

@@ -1,4 +1,4 @@
-"""What emulated devices held: numbered, bounded, and bounded for all devices of a process together."""
+"""The journal of emulated devices' values: numbered, bounded, and bounded for all devices of a process together."""
 
 from __future__ import annotations
 

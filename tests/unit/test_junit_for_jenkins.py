@@ -1,8 +1,7 @@
 """``--junit-flavour jenkins`` writes JUnit XML that satisfies junit-10.xsd, the schema of Jenkins' xUnit plugin.
 
-Observed before: every file had properties inside its test cases. The schema does not know them, and the plugin refused the file.
-The rules below restate the schema: the attributes, required attributes and children of each element. Children may stand in any
-order.
+Defect: every file had properties inside its test cases. The schema does not allow them, and the plugin refused the file. The
+rules below restate the schema: the attributes, required attributes and children of each element. Children may be in any order.
 """
 
 from __future__ import annotations
@@ -44,12 +43,12 @@ RULES: dict[str, tuple[set[str], set[str], set[str], bool]] = {
     "system-out": _TEXT,
     "system-err": _TEXT,
 }
-"""For each element: the attributes it may have, those it must have, the children it may have, and whether it may hold text."""
+"""For each element: its permitted attributes, required attributes, permitted children, and whether it may contain text."""
 TIME = re.compile(r"(([0-9]{0,3},)*[0-9]{3}|[0-9]{0,3})*(\.[0-9]*)?")
 
 
 def violations(data: bytes) -> list[str]:
-    """Return what the file has that the schema forbids; nothing for a valid file."""
+    """Return the violations of the schema in the file; nothing for a valid file."""
     root = ET.fromstring(data)
     found = [] if root.tag in ("testsuites", "testsuite") else [f"root {root.tag}"]
     for element in root.iter():
@@ -140,7 +139,7 @@ while True:
     link.sendall(number.to_bytes(2, "big") + bytes((0, 0, 0, 6, 1, 3, 0, 0, 0, 1)))
     link.recv(100)
 """
-"""A careless master: it asks again after every reply, whatever the reply is."""
+"""A careless client: it sends the next request after every reply, whatever the reply is."""
 
 
 def test_a_check_of_a_master_writes_the_flavour_that_was_asked_for(tmp_path: Path) -> None:

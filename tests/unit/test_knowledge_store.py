@@ -1,4 +1,4 @@
-"""Knowledge stores, SQLite and PostgreSQL alike: what was kept stays, once, in order, as it was; a full disk is said."""
+"""Knowledge stores, SQLite and PostgreSQL alike: stored data persist, once, in order, unchanged; a full disk is reported."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _databases = iter(range(1000))
 
 @pytest.fixture(params=KINDS)
 def place(request: pytest.FixtureRequest, tmp_path: Path) -> str:
-    """Where an empty store is to be: a file, or a database of the test's own."""
+    """Where an empty store will be: a file, or a separate database of the test."""
     if request.param == "sqlite":
         return str(tmp_path / "knowledge.db")
     url: str = request.getfixturevalue("postgres")
@@ -331,7 +331,7 @@ def test_a_server_that_goes_away_is_unreachable_and_used_again_when_it_is_back(p
         await db.close()
         try:
             last = await store.append(origin, [value(1)])
-        except Unreachable:  # it noticed by this; else it had noticed before
+        except Unreachable:  # it detected the loss now, or it had detected it before
             last = await store.append(origin, [value(1)])
         assert last == 1
         await store.aclose()
@@ -380,7 +380,8 @@ def test_a_store_at_its_bound_says_so_keeps_what_it_has_and_goes_on_when_there_i
 
 
 def test_names_that_came_first_when_the_disk_was_full_are_there_when_it_is_not(tmp_path: Path) -> None:
-    """SQLite itself takes back what did not fit, the name of a tag or of an origin with it: nobody may think that it is there."""
+    """SQLite itself rolls back a transaction that did not fit, including the name of a new tag or origin; a cache must not
+    keep them."""
 
     async def main() -> None:
         store = await SqliteKnowledge.open(tmp_path / "k.db", max_bytes=64 * 4096, offload=in_place)
@@ -394,7 +395,7 @@ def test_names_that_came_first_when_the_disk_was_full_are_there_when_it_is_not(t
 
         with pytest.raises(StoreFull):
             await until_full()
-        for _ in range(3):  # each alone is too much
+        for _ in range(3):  # each one alone is too large
             with pytest.raises(StoreFull):
                 await store.append(origin, [*fresh, *known])
             with pytest.raises(StoreFull):
@@ -415,7 +416,7 @@ def test_names_that_came_first_when_the_disk_was_full_are_there_when_it_is_not(t
 
 
 def test_nothing_that_was_acknowledged_is_lost_when_the_process_is_killed(tmp_path: Path) -> None:
-    """It says each number when `append` has returned; killed at once, at least so many are there, whole and without holes."""
+    """It prints each number when `append` has returned; when killed, at least that many are stored, complete and without gaps."""
     program = (
         "import asyncio, sys; from pathlib import Path\n"
         "from fieldtwin.gateway.store.event import Event\n"

@@ -57,7 +57,7 @@ def test_pid_integral_does_not_wind_up() -> None:
     for n in range(1000):  # ten seconds at the limit
         pid(n * 10 * MS, AUTO=True, PV=0.0, SP=100.0, KP=5.0, TR=SECOND)
     assert pid.XOUT == 100.0
-    # an integral that had wound up would hold the output at its limit for long
+    # without anti-windup, the integral would hold the output at its limit for long
     assert pid(1001 * 10 * MS, AUTO=True, PV=110.0, SP=100.0, KP=5.0, TR=SECOND).XOUT < 100.0
 
 
@@ -95,7 +95,7 @@ def test_alarm_waits_its_delay_latches_and_is_acknowledged() -> None:
 
     assert at(0, 85) == (False, False, False, False, False)
     assert at(90, 85) == (False, False, False, False, False)
-    assert at(95, 70) == (False, False, False, False, False)  # shorter than the delay: nothing was
+    assert at(95, 70) == (False, False, False, False, False)  # shorter than the delay: no effect
     assert at(100, 95) == (False, False, False, False, False)
     assert at(200, 95) == (False, True, True, True, True)
     assert at(210, 89) == (False, True, True, True, True)  # inside the hysteresis

@@ -1,4 +1,4 @@
-"""A PLC as its own process on a mapped image: commands in, outputs out, a gateway that dies, logic that raises."""
+"""A PLC as a separate process on a mapped image: commands in, outputs out, a gateway that dies, logic that raises."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class Faulty(Program):
 
 
 class Gateway:
-    """The test as the gateway: feeds INPUTS, reads OUTPUTS."""
+    """The test as the gateway: writes INPUTS, reads OUTPUTS."""
 
     def __init__(self, path: Path, config: PlcConfig) -> None:
         layout = config.image_layout()
@@ -101,7 +101,7 @@ def config_in(folder: Path, *programs: ProgramConfig, **more: Any) -> PlcConfig:
         layout=image_for(bound, PLANT).describe(),
         control_path=str(folder / "plc.sock"),
         programs=programs,
-        stop_after=0,  # the machine that runs tests is busy
+        stop_after=0,  # the test machine is busy
         heartbeat_limit_ms=300,
         priority=0,
         python_path=(str(folder),),
@@ -140,7 +140,7 @@ async def _connect(path: Path, child: asyncio.subprocess.Process) -> ControlClie
 
 
 async def got(client: ControlClient, condition: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
-    """`get` until `condition` holds for what it answers."""
+    """Send `get` until `condition` holds for its answer."""
     last: dict[str, Any] = {}
 
     async def holds() -> bool:
@@ -159,7 +159,7 @@ def test_commands_become_outputs_and_samples_responses_until_told_to_stop(tmp_pa
             await got(client, lambda s: s["gateway_alive"] and s["variables"]["relay.state"] == 0)
             gateway.publish(modem_inbox=encode_period(2).data)
             await eventually(lambda: gateway.reader.snapshot().value("ctd.sample_period_s").value == 2)
-            for n in range(20):  # more than the ring is deep
+            for n in range(20):  # more than the depth of the ring
                 gateway.publish(ctd_sample=bytes([n, 0xFF]))
                 await eventually(lambda n=n: len(gateway.arrived) > n)
             assert gateway.arrived == [bytes([n, 0xFF]) for n in range(20)]
@@ -197,7 +197,7 @@ def test_a_gateway_that_dies_turns_inputs_bad_and_sigterm_ends_it_within_a_secon
             status = await got(client, lambda s: not s["gateway_alive"])
             assert {(v["quality"], v["reason"]) for v in status["inputs"].values()} == {("bad", "gateway dead")}
             scans = status["scans"]
-            await got(client, lambda s: s["scans"] > scans)  # and it goes on scanning
+            await got(client, lambda s: s["scans"] > scans)  # and it continues to scan
             gateway.publish()
             await got(client, lambda s: s["inputs"]["ctd.sample"]["quality"] == "good")
             child.send_signal(signal.SIGINT)
@@ -215,14 +215,14 @@ def test_a_killed_plc_leaves_a_whole_image_and_its_successor_goes_on(tmp_path: P
             child.kill()
             await child.wait()
             last = gateway.reader.snapshot()
-            assert not last.stopped  # nobody could say so: the heartbeat stands still
+            assert not last.stopped  # no process could report it: the heartbeat stands still
             again = await asyncio.create_subprocess_exec(
                 sys.executable, "-m", "fieldtwin.plc", str(tmp_path / "plc.json")
             )
             try:
                 await eventually(lambda: gateway.reader.snapshot().counter > last.counter)
                 out = gateway.reader.snapshot()
-                assert out.value("relay.commands").value == 0  # the old command is not obeyed again
+                assert out.value("relay.commands").value == 0  # the old command is not executed again
                 assert out.value("modem.inbox.consumed").value == 1
             finally:
                 again.terminate()

@@ -1,4 +1,4 @@
-"""The PLC on the wall clock: awake a little before its deadlines, never early, and open to be told things meanwhile."""
+"""The PLC on the wall clock: awake a little before its deadlines, never early, and responsive to commands meanwhile."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ MS = 1_000_000
 
 
 class Beat:
-    """A task that only notes when it was run, relative to when it was due."""
+    """A task that only records when it ran, relative to its due time."""
 
     def __init__(self, cycle_ns: int, count: int) -> None:
         self.cycle_ns, self.count = cycle_ns, count
@@ -48,7 +48,7 @@ def test_the_lead_is_a_twentieth_of_the_way_and_never_more_than_60_us() -> None:
 
 @pytest.mark.parametrize("cycle_ns", [700_000, 4 * MS])
 def test_no_scan_begins_before_its_deadline_though_signals_wake_the_process(cycle_ns: int) -> None:
-    """Shorter than the guard the channel is polled, longer it is served in between; both are interrupted all the time."""
+    """Below the guard the channel is polled, above it the channel is served in between; both are interrupted all the time."""
     beat = Beat(cycle_ns, 25)
     loop = asyncio.new_event_loop()
     served = []

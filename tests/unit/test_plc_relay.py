@@ -1,4 +1,4 @@
-"""ControlLogic against SPEC's row and rulings 1, 2, 5, 6, 17; Relay as a program behind full mailboxes."""
+"""ControlLogic against SPEC's row and rulings 1, 2, 5, 6, 17; Relay as a program with full mailboxes."""
 
 from __future__ import annotations
 
@@ -131,7 +131,7 @@ def test_a_full_mailbox_means_wait_counted_then_everything_in_order() -> None:
         if n == 1:
             assert (relay.waiting, relay.response.waits) == (3, 1)
             relay.response.outstanding, relay.response.pending = 2, []
-        else:  # the gateway took what was there
+        else:  # the gateway took the waiting messages
             relay.response.outstanding, relay.response.pending = 0, []
     assert arrived == samples
     assert (relay.waiting, relay.dropped, relay.responses) == (0, 0, 5)

@@ -1,4 +1,4 @@
-"""RETAIN: what a warm start finds after a kill at any instant, and what is put aside."""
+"""RETAIN: the values of a warm start after a kill at any instant, and files that are set aside."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def test_a_damaged_slot_gives_the_one_before(tmp_path_factory: pytest.TempPathFa
     again, kept, aside = RetainFile.open(path, b"h" * 32, 20)
     again.close()
     assert not aside
-    assert kept["n"] in (1, 2)  # 2 only where the bit is none of the record's
+    assert kept["n"] in (1, 2)  # 2 only if the bit is not part of the record
     assert kept["pad"] == "xy"[kept["n"] - 1] * 200
 
 
@@ -116,7 +116,7 @@ def test_what_grows_beyond_its_file_is_an_error_and_the_last_whole_save_stays(tm
 
 @pytest.mark.parametrize("kills", [KILLS, pytest.param(20 * KILLS, marks=[pytest.mark.long, pytest.mark.timeout(600)])])
 def test_nothing_is_lost_or_torn_by_a_kill_at_any_instant(tmp_path: Path, kills: int) -> None:
-    """Each round: a process scans, saves and tells how far it got; it is killed; the next one finds that or one more."""
+    """Each round: a process scans, saves and prints its progress; it is killed; the next one finds that state or one newer."""
     path, rng, reached = tmp_path / "retain", random.Random(1), 0
     for _ in range(kills):
         read, write = os.pipe()
@@ -125,7 +125,7 @@ def test_nothing_is_lost_or_torn_by_a_kill_at_any_instant(tmp_path: Path, kills:
             _scan_until_killed(path, write)
         os.close(write)
         first = _told(read)
-        assert reached <= first <= reached + 1  # a save that was made before it could be told
+        assert reached <= first <= reached + 1  # a save completed before it could be printed
         reached = first
         for _ in range(rng.randrange(60)):
             reached = _told(read)

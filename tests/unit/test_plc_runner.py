@@ -1,4 +1,4 @@
-"""All tasks of a PLC under a clock in the test's hand: priorities, triggers, restarts, pause and step."""
+"""All tasks of a PLC under a manual clock: priorities, triggers, restarts, pause and step."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ def test_tasks_run_on_their_intervals_and_the_more_urgent_goes_first(tmp_path: P
 def test_a_single_task_runs_once_at_each_rising_edge(tmp_path: Path) -> None:
     rig = Rig(tmp_path, (TaskSpec("fast", 10, 5), TaskSpec("event", 0, 1, "d.go")), ("Fast", "Event"))
     rig.runner.start()
-    rig.until(20, go=True)  # true from the start: no edge was seen
+    rig.until(20, go=True)  # true from the start: there was no edge
     rig.until(30, go=False)
     rig.until(50, go=True)
     rig.until(60, go=False)
@@ -266,5 +266,5 @@ def test_a_program_reads_another_programs_variable(tmp_path: Path) -> None:
         now[0] = runner.deadline_ns
         runner.run_once()
     second = runner.programs[1].program
-    assert runner.outputs.last()["second.doubled"] == 4.0  # what `first` was at the scan's start
+    assert runner.outputs.last()["second.doubled"] == 4.0  # the value of `first` at the scan's start
     assert second.quality == "good"  # type: ignore[attr-defined]

@@ -1,4 +1,4 @@
-"""The scan: one snapshot, frozen inputs, policies, a dead gateway, messages both ways, and programs that fail."""
+"""The scan: one snapshot, frozen inputs, policies, a dead gateway, messages in both directions, and failing programs."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ PLANT = {
 
 
 class Copy(Program):
-    """Copies its inputs to its outputs and does what a test hangs into `also`."""
+    """Copies its inputs to its outputs and calls the test's function `also`."""
 
     x: float | None = var_input(TagKind.REAL)
     n: int | None = var_input(TagKind.INT)
@@ -74,7 +74,7 @@ class Copy(Program):
 
 
 class Rig:
-    """A program, its image, and the gateway's side of it in the test's hands."""
+    """A program, its image, and the gateway's side of it, controlled by the test."""
 
     def __init__(self, **if_bad: str | float) -> None:
         self.program = Copy()
@@ -164,7 +164,7 @@ def test_the_policy_of_an_input_that_is_bad(policy: str | float, expected: TagVa
     assert rig.program.tag("x") == expected
     assert rig.program.x == expected.value
     assert rig.program.tag("n").good
-    assert rig.scan.inputs()["d.real"] == bad(5.0)  # watchers see the truth
+    assert rig.scan.inputs()["d.real"] == bad(5.0)  # watchers see the true value
     rig.feed(14, x=4.0)
     rig.execute(15)
     assert rig.program.tag("x") == TagValue(4.0, Quality.GOOD, t_ns=14 * MS)
@@ -394,7 +394,7 @@ def test_a_forced_output_is_published_simulated_and_the_logic_sees_it_before_it_
     seen: list[int] = []
     rig.program.also = lambda scan: seen.append(rig.program.count)
     out = rig.execute(11)
-    assert seen == [101]  # the logic added 1 to what was forced, not to what it had
+    assert seen == [101]  # the logic added 1 to the forced value, not to the real one
     assert out.value("d.out") == TagValue(-4.0, Quality.SIMULATED, t_ns=11 * MS)
     assert out.value("copy.count") == TagValue(100, Quality.SIMULATED, t_ns=11 * MS)
     assert out.value("copy.first").quality is Quality.GOOD

@@ -1,4 +1,5 @@
-"""Several tasks on one thread: whose fault a late scan is, how late each may be, steps, and inputs of a stopped PLC."""
+"""Several tasks on one thread: the cause of a late scan, the permitted lateness of each task, steps, and inputs of a stopped
+PLC."""
 
 from __future__ import annotations
 
@@ -19,7 +20,7 @@ FAST_AND_SLOW = (TaskSpec("fast", 10, 1), TaskSpec("slow", 100, 5))
 
 
 def takes(rig: Rig, name: str, ms: float) -> None:
-    """From now on each scan of this program takes so long."""
+    """From now on each scan of this program takes this long."""
 
     def spend(program: object, scan: object) -> None:
         rig.now_ns += round(ms * MS)
@@ -28,7 +29,7 @@ def takes(rig: Rig, name: str, ms: float) -> None:
 
 
 def test_the_watchdog_names_the_late_task_and_the_one_that_ran(tmp_path: Path) -> None:
-    """It blamed the slow task's own scans ("longest scan 0.126 ms") where a task of 10 ms took 10 ms."""
+    """Defect: it blamed the slow task's own scans ("longest scan 0.126 ms") although a task of 10 ms took 10 ms."""
     rig = Rig(tmp_path, FAST_AND_SLOW, ("Fast", "Slow"), max_restarts=0, stop_after=3)
     takes(rig, "Fast", 9.5)
     rig.runner.start()
@@ -122,12 +123,12 @@ def test_a_program_file_that_changed_is_known(tmp_path: Path) -> None:
     assert changed(rig.runner.sources) == []
     path.write_text(path.read_text() + "\n")
     assert [source.program for source in changed(rig.runner.sources)] == ["fast", "slow"]
-    rig.runner.restart()  # a module of Python is not imported again
+    rig.runner.restart()  # a Python module is not imported again
     assert [source.describe()["cure"] for source in changed(rig.runner.sources)] == [
         "stop the system and run it again"
     ] * 2
     path.unlink()
-    assert changed(sources(rig.runner.programs)) == []  # what could never be read cannot have changed
+    assert changed(sources(rig.runner.programs)) == []  # content that could never be read cannot have changed
 
 
 @click.command(cls=NegativeNumbers)

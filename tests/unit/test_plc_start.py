@@ -1,4 +1,5 @@
-"""When programs of a PLC start. One that ran before its inputs had been read computed with 0.0, and the result was written."""
+"""When programs of a PLC start. Defect: a program that ran before its inputs had been read computed with 0.0, and the result
+was written."""
 
 from __future__ import annotations
 
@@ -83,7 +84,7 @@ NEW = TaskSpec("main", 10)
 
 
 class Rig:
-    """A PLC over an image whose inputs the test publishes. `inputs` holds what the gateway says now."""
+    """A PLC over an image whose inputs the test publishes. `inputs` holds the gateway's current values."""
 
     def __init__(
         self, folder: Path, *programs: ProgramConfig, tasks: tuple[TaskSpec, ...] = (NEW,), **more: Any
@@ -289,7 +290,7 @@ def test_each_program_waits_for_its_own_inputs_only(tmp_path: Path) -> None:
 
 def test_a_program_waits_until_the_program_that_it_reads_has_run(tmp_path: Path) -> None:
     after = ProgramConfig("after", "python: MODULE:After", {"mode": InputBinding("fan.scans")})
-    rig = Rig(tmp_path, after, fan())  # the reader stands first in the task
+    rig = Rig(tmp_path, after, fan())  # the reader is first in the task
     rig.until(100)
     assert rig.status["waiting"]["after"]["programs"] == ["fan"]
     rig.good("sensor.temperature", 21.6)
@@ -318,7 +319,7 @@ def test_no_message_is_lost_while_a_program_waits(tmp_path: Path) -> None:
     )
     rig.messages = {"modem.inbox": [(1, b"a"), (1, b"b")]}
     rig.until(100)
-    assert rig.out("modem.inbox.consumed") == 0  # the gateway does not acknowledge what nobody took
+    assert rig.out("modem.inbox.consumed") == 0  # the gateway does not acknowledge an untaken message
     rig.good("sensor.temperature", 21.6)
     rig.until(200)
     assert (rig.out("mail.got"), rig.out("modem.inbox.consumed")) == (2, 2)
@@ -376,7 +377,7 @@ def test_after_a_restart_of_the_programs_they_wait_again(tmp_path: Path) -> None
 
 @pytest.mark.parametrize("source", ["fan.st", "python: MODULE:Fan"])
 def test_a_gateway_that_begins_again_does_not_make_a_known_input_unknown(tmp_path: Path, source: str) -> None:
-    """After a restart of the gateway alone its inputs have no value: the program saw 0.0 and switched the fan."""
+    """After a restart of the gateway alone its inputs have no value. Defect: the program saw 0.0 and switched the fan."""
     rig = Rig(tmp_path, fan(source))
     rig.good("sensor.temperature", 21.6)
     rig.until(100)

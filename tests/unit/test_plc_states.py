@@ -1,4 +1,4 @@
-"""State tables: what they do scan by scan, how they are drawn, and what can be proved of them."""
+"""State tables: their behaviour scan by scan, their diagrams, and their provable properties."""
 
 from __future__ import annotations
 
@@ -63,7 +63,9 @@ def test_a_machine_takes_the_first_transition_that_holds_one_a_scan() -> None:
     assert scan(pump, 6, start=True, stop=True) == "IDLE"
     assert pump.scans_filling == 3
     assert scan(pump, 7, start=True) == "FILLING"
-    assert scan(pump, 20, level=85.0) == "IDLE"  # full just when it takes too long: the first of the two, and no more
+    assert (
+        scan(pump, 20, level=85.0) == "IDLE"
+    )  # full just when it takes too long: only the first of the two transitions
 
 
 def test_time_in_a_state_counts_from_the_scan_that_entered_it() -> None:
@@ -109,7 +111,7 @@ def test_a_diagram_shows_every_state_and_every_way_out_of_it() -> None:
     assert "after 50 ms / close" in texts
     arrows = [e for e in root.iter("{http://www.w3.org/2000/svg}path") if e.get("class") == "arrow"]
     assert len(arrows) == 1 + 4  # the initial one, IDLE-FILLING and back, FILLING-FAULT, FAULT-IDLE
-    assert "http" not in drawn.replace("http://www.w3.org/2000/svg", "")  # nothing is fetched
+    assert "http" not in drawn.replace("http://www.w3.org/2000/svg", "")  # no external resource is loaded
 
 
 SEQUENCE = StateTable(
@@ -165,7 +167,7 @@ def test_what_holds_is_proved_over_states_inputs_quality_and_timer_phase() -> No
     result = prove(PUMP_PROOF)
     assert result.proved
     assert result.states >= 8
-    assert result.transitions == result.states * 24  # every state with everything that can come in, and the initial one
+    assert result.transitions == result.states * 24  # every state with every possible input, and the initial one
 
 
 def test_what_does_not_hold_comes_with_a_shortest_way_to_it() -> None:
@@ -179,7 +181,7 @@ def test_what_does_not_hold_comes_with_a_shortest_way_to_it() -> None:
 
 
 class Wary(Pump):
-    """Fills on no value but a good one."""
+    """Starts filling only on a good value."""
 
     trusts = (Quality.GOOD,)
 

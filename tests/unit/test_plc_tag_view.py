@@ -1,4 +1,4 @@
-"""The process image as people see it: value, quality, source time, age, unit, limits, force, and what programs see."""
+"""The process image as shown to users: value, quality, source time, age, unit, limits, force, and the programs' values."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def test_what_programs_see_of_a_bad_input_stands_beside_it(
 def test_a_forced_tag_is_simulated_and_says_by_whom_and_since_when(tmp_path: Path) -> None:
     rig = Rig(tmp_path, if_bad=2.5)
     rig.scan(TagValue(1.5, Quality.GOOD, t_ns=4 * MS))
-    rig.runner.force("tank.level", 9.0, "ada")  # beyond its limits: what does the logic do when the sensor says so?
+    rig.runner.force("tank.level", 9.0, "ada")  # beyond its limits, to see how the logic reacts to such a sensor value
     rig.runner.force("pump.speed", 1500, "ada")
     rig.scan(TagValue(1.5, Quality.BAD, t_ns=4 * MS))
     rows = rig.rows()

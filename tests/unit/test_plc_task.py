@@ -1,4 +1,4 @@
-"""The cyclic task under a clock in the test's hand: deadlines, skipped periods, watchdog, failing logic."""
+"""The cyclic task under a manual clock: deadlines, skipped periods, watchdog, failing logic."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MS = 1_000_000
 
 
 class HandClock:
-    """Time moves when somebody waits, or when the test says so. `delays_ms` makes wake-ups late."""
+    """Time advances when a task waits, or when the test advances it. `delays_ms` makes wake-ups late."""
 
     def __init__(self, delays_ms: list[float] | None = None) -> None:
         self.now_ns = 1_000 * MS
@@ -40,7 +40,7 @@ class HandClock:
 
 
 class Logic:
-    """Takes `takes_ms` of the clock's time a scan; raises when told."""
+    """Takes `takes_ms` of the clock's time per scan; raises on request."""
 
     waiting = False
 

@@ -1,5 +1,5 @@
-"""Another period for a poll group while it is read: no interval longer than the longer of both, none shorter than the shorter;
-and then all of a bus are on their way to an even spread, by an eighth of their period at a time."""
+"""A new period for a poll group while it is read: no interval is longer than the longer period, or shorter than the shorter
+one. Then all groups of the bus move to an even distribution, by an eighth of their period at a time."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ PERIODS = st.integers(50, 5000)
 
 
 def times(schedule: PollSchedule, group: str, begin_ns: int, end_ns: int) -> list[int]:
-    """When the group is read, by a bus that is never late."""
+    """Return when the group is read, by a bus that is never late."""
     found = []
     now_ns = begin_ns
     while (now_ns := max(now_ns, schedule.due_ns[group])) < end_ns:
@@ -43,14 +43,14 @@ def test_no_poll_is_lost_or_doubled(old: int, new: int, phase: int, now_ms: int)
     first = next(n for n, t in enumerate(read) if t >= now_ns)
     assert (
         min(gaps[1:first]) >= min(old, new) if first > 1 else True
-    )  # it is read when the device is there, then at its place
+    )  # it is read when the device is connected, then at its place
     assert max(gaps) <= max(old, new)
     on_its_way, there = gaps[first : first + SOONER + 1], gaps[first + SOONER + 1 :]
     assert all(new * 7 / 8 <= gap <= new for gap in on_its_way)
     assert all(gap == new for gap in there)
     assert not there or read[-1] % (new * NS_PER_MS) == 0
     others = [(b - a) / NS_PER_MS for a, b in pairwise(other[1:])]
-    assert all(old * 7 / 8 <= gap <= old for gap in others)  # nothing was said of it but that its place is another one
+    assert all(old * 7 / 8 <= gap <= old for gap in others)  # only its place differs
     assert len(others) < 300 or other[-1] % (old * NS_PER_MS) == 7 * NS_PER_MS
     assert not any(schedule.missed.values())
 
@@ -76,7 +76,7 @@ def test_a_stated_phase_is_gone_to_within_half_a_period(old: int, new: int, phas
 @settings(max_examples=40)
 @given(before=st.lists(PERIODS, min_size=2, max_size=6), after=PERIODS, now_ms=st.integers(1, 20_000))
 def test_a_bus_is_spread_as_if_it_had_begun_so(before: list[int], after: int, now_ms: int) -> None:
-    """Also those of which nothing changed: there are more, or fewer, to share a period with."""
+    """Also those that did not change, because the number of groups that share a period changed."""
     names = [f"g{n}" for n in range(len(before))]
     schedule = PollSchedule(spread(list(zip(names, before, strict=True))), ())
     schedule.anchor(0)
@@ -104,7 +104,7 @@ def test_who_is_late_goes_no_sooner() -> None:
     schedule.took("a", 1600 * NS_PER_MS)
     assert schedule.due_ns["a"] == 2300 * NS_PER_MS
     schedule.stop()
-    schedule.start(2350 * NS_PER_MS)  # it was away: where it was before is of no account
+    schedule.start(2350 * NS_PER_MS)  # it was disconnected: its earlier place does not count
     schedule.took("a", 2350 * NS_PER_MS)
     assert schedule.due_ns["a"] == 2800 * NS_PER_MS
 

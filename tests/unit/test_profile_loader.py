@@ -1,4 +1,4 @@
-"""Device profiles: addresses both ways, groups and commands, and every contradiction found when the file is read."""
+"""Device profiles: addresses in both directions, groups and commands, and every contradiction is found when the file is read."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def test_every_shipped_profile_loads_and_is_short(path: object) -> None:
     profile = load_profile(path)  # type: ignore[arg-type]
     assert profile.command_list
     assert len(PROFILES.joinpath(path.name).read_text(encoding="utf-8").splitlines()) <= 60  # type: ignore[attr-defined]
-    assert profile.form.source  # where its numbers come from
+    assert profile.form.source  # the source of its numbers
 
 
 @pytest.mark.parametrize(

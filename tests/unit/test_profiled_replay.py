@@ -1,5 +1,5 @@
-"""Emulators of the shipped real devices keep to their profiles where nothing was recorded: functions, counts, half values, what
-can be written and what cannot be read. What was recorded goes first."""
+"""Emulators of the shipped real devices follow their profiles for unrecorded requests: functions, counts, half values,
+writable and unreadable registers. Recorded answers take precedence."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ def device(name: str, **identity: str) -> RecordedDevice:
 @pytest.mark.parametrize(
     ("name", "request_hex", "reply_hex"),
     [
-        ("eastron-sdm630", "06 0002 0001", "86 01"),  # it has no function 06
+        ("eastron-sdm630", "06 0002 0001", "86 01"),  # function 06 does not exist
         ("eastron-sdm630", "04 0000 0003", "84 03"),  # MB-048: half a value
         ("eastron-sdm630", "04 0001 0002", "84 02"),
         ("eastron-sdm630", "04 0000 0052", "84 03"),  # at most 80 registers
         ("eastron-sdm630", "04 0000 007E", "84 03"),
         ("eastron-sdm630", "04 FFFE 0004", "84 02"),  # MB-037
         ("eastron-sdm630", "04 FFFE 0100", "84 03"),  # MB-038
-        ("eastron-sdm630", "03 000E 0002", "83 02"),  # the password is for writing
+        ("eastron-sdm630", "03 000E 0002", "83 02"),  # the password is write-only
         ("eastron-sdm630", "10 000E 0002 04 42700000", "10 000E 0002"),
-        ("eastron-sdm630", "10 000A 0002 04 42700000", "90 02"),  # the system type is for reading
+        ("eastron-sdm630", "10 000A 0002 04 42700000", "90 02"),  # the system type is read-only
         ("eastron-sdm630", "10 0002 0002 03 427000", "90 03"),  # MB-040
         ("delta-vfd-e", "06 2001 0DAC", "06 2001 0DAC"),
         ("delta-vfd-e", "06 2101 0001", "86 02"),

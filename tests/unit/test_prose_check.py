@@ -1,4 +1,4 @@
-"""`scripts/prose`: which sentences count, and what it refuses."""
+"""`scripts/prose`: sentences that it counts, and changes that it refuses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Buses of a prototype that are one wire: what cannot be there twice is an error of the file, with both places."""
+"""Buses of a prototype that share a wire: duplicate addresses are an error of the file, with both places."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""The prover on Structured Text: what it calls proved holds, and a counterexample happens again in a program of its own.
+"""The prover on Structured Text: a proved property holds, and a counterexample can be reproduced in a separate program.
 
-A copied program kept the clock of the original, so that no timer ever ran out: "motor never on" was proved for a start button
-and a TON of 50 ms. IS_GOOD raised an internal error.
+Defects: a copied program kept the clock of the original, so that no timer ever ran out: "motor never on" was proved for a
+start button and a TON of 50 ms. IS_GOOD raised an internal error.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ NEVER = Proof(
 
 
 def replayed(made: Program, way: Sequence[Given]) -> list[Any]:
-    """Run `way` with a new program, scan by scan, without anything of the prover; what the program showed after each."""
+    """Run `way` with a new program, scan by scan, without any code of the prover; return the program's values after each."""
     now_ns, shown = 0, []
     for number, each in enumerate(way, 1):
         now_ns += round(each.ms * MS)
@@ -61,7 +61,9 @@ def replayed(made: Program, way: Sequence[Given]) -> list[Any]:
 def test_a_timer_runs_out_in_the_search() -> None:
     result = prove(NEVER)
     assert result.broken == "motor never on"
-    assert [dict(each.inputs)["start"] for each in result.way] == [True] * 6  # the rise is seen in the first of them
+    assert [dict(each.inputs)["start"] for each in result.way] == [
+        True
+    ] * 6  # the rising edge is seen in the first of them
     shown = replayed(program(MOTOR), result.way)
     assert [each["motor"] for each in shown] == [False] * 5 + [True]
 
@@ -120,7 +122,7 @@ def test_what_cannot_be_decided_is_not_proved() -> None:
     assert (result.proved, result.broken, result.reason) == (False, "", "more than 200 states")
     asks = counting.replace("n := n + 1;", ";").replace("n = 100000", "SCAN_TIME() > LT#1h")
     result = prove(replace(proof, make=lambda: program(asks)), max_states=200)
-    assert not result.proved  # the time itself decides, and it has no end
+    assert not result.proved  # the time itself decides, and it is unbounded
 
 
 def test_a_key_that_leaves_out_what_decides_proves_nothing() -> None:
@@ -135,7 +137,7 @@ def test_a_key_that_leaves_out_what_decides_proves_nothing() -> None:
 
 
 class Delayed(Program):
-    """Logic in Python with a timer of its own."""
+    """Python logic with its own timer."""
 
     start: bool = var_input(TagKind.BOOL)
     motor: bool = var_output(TagKind.BOOL, initial=False)
@@ -171,7 +173,7 @@ BODIES = (
 @settings(deadline=None, max_examples=25)
 @given(st.lists(st.sampled_from(BODIES), min_size=1, max_size=3), st.lists(st.tuples(st.booleans(), st.booleans())))
 def test_what_a_random_run_shows_is_never_disproved(bodies: list[str], inputs: list[tuple[bool, bool]]) -> None:
-    """Every run of the program itself is one of the ways that the prover looks at."""
+    """Every run of the program itself is one of the paths that the prover examines."""
     text = f"""PROGRAM P VAR_INPUT a, b : BOOL; END_VAR VAR_OUTPUT q : BOOL; END_VAR
       VAR t : TON; f : TOF; p : TP; r : R_TRIG; c : CTU; s : SR; n : INT; any_ : BOOL; END_VAR
       q := FALSE; {" any_ := any_ OR q; ".join(bodies)} any_ := any_ OR q; END_PROGRAM"""

@@ -1,4 +1,4 @@
-"""The pytest plugin as users have it: runs of pytest in a folder of theirs."""
+"""The pytest plugin from the user's view: runs of pytest in a user's folder."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ print(json.dumps([{"name": "A scenario", "verdict": verdict, "reason": "because"
     "reproduce": f"fieldtwin test {sys.argv[2]} --seed {seed}"}]))
 sys.exit(verdict != "passed")
 """
-"""Stands in for `fieldtwin test`: the verdict is in the file's name."""
+"""A replacement for `fieldtwin test`: the file name contains the verdict."""
 
 
 @pytest.fixture
 def fake(pytester: pytest.Pytester) -> str:
-    """What to run instead of fieldtwin; the folder has a scenario for each verdict."""
+    """The command to run instead of fieldtwin; the folder has a scenario for each verdict."""
     script = pytester.makepyfile(fake_command=FAKE)
     for verdict in ("passed", "failed", "error", "inconclusive", "skipped", "invalid"):
         (pytester.path / f"a-{verdict}.scenario.yaml").write_text("scenario: x\n")
@@ -115,7 +115,7 @@ def pytest_collection_finish():
     ours = {name for name in sys.modules if name.startswith("fieldtwin")}
     assert ours == {"fieldtwin", "fieldtwin.__about__", "fieldtwin.pytest_plugin"}, ours
 """
-"""A user's environment that has pytest and fieldtwin without what that depends on; nothing is imported before a test runs."""
+"""A user's environment with pytest and fieldtwin without its dependencies; nothing is imported before a test runs."""
 
 
 def test_the_docs_run_where_nothing_but_pytest_is_installed(pytester: pytest.Pytester) -> None:

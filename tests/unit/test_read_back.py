@@ -1,6 +1,6 @@
-"""Tags that may be written and are never read back: `io.outputs_1: 0 bad, 15 s old` was shown, without a word on the reason.
+"""Tags that are writable and never read back. Defect: `io.outputs_1: 0 bad, 15 s old` was shown without the reason.
 
-The author of the system file is warned when the file is loaded, and a value that is bad always has its reason.
+The author of the system file is warned when the file is loaded, and a bad value always has its reason.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def test_the_warning_is_shown_where_the_file_is_loaded(tmp_path: Path) -> None:
 
 
 def test_a_value_that_was_read_before_a_write_and_never_after_it_is_not_good(tmp_path: Path) -> None:
-    """It was shown as good for ever, with the value from before the write."""
+    """Defect: it was shown as good for ever, with the value from before the write."""
     system = hall(tmp_path, mode=0)
     text = system.read_text().replace("    poll: {status: {every_ms: 500}}\n", "    expect: {speed: '3'}\n")
     system.write_text(text)

@@ -1,7 +1,7 @@
-"""`fieldtwin read` of several items prints what it could read and reports the rest.
+"""`fieldtwin read` of several items prints the items that it could read and reports the rest.
 
-Observed: one item that failed took the others with it. Items that were read in one request shared its failure, a device that
-closed the connection left nothing on the screen, and one write-only item stopped everything before a request was sent.
+Defects: one failing item failed the others. Items that were read in one request shared its failure, a device that closed the
+connection left no output, and one write-only item stopped everything before a request was sent.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from fieldtwin.gateway.wallclock import WallClock
 
 
 def read(url: str, *arguments: str) -> Result:
-    """Run `fieldtwin read`; errors come as the result's exception."""
+    """Run `fieldtwin read`; errors are in the result's exception."""
     return CliRunner().invoke(cli, ["read", url, *arguments], standalone_mode=False)
 
 
@@ -79,7 +79,7 @@ def test_a_silent_device_is_not_asked_for_every_item() -> None:
 
 @contextmanager
 def on_its_own_loop(main: Callable[[Callable[[str], None], asyncio.Event], object]) -> Iterator[str]:
-    """Run `main(tell_url, stop)` on a loop in another thread, and give the url."""
+    """Run `main(tell_url, stop)` on a loop in a separate thread, and yield the URL."""
     url: list[str] = []
     told, loop, stop = threading.Event(), asyncio.new_event_loop(), asyncio.Event()
 
@@ -99,7 +99,7 @@ def on_its_own_loop(main: Callable[[Callable[[str], None], asyncio.Event], objec
 
 
 async def _hangs_up_at_100(tell: Callable[[str], None], stop: asyncio.Event) -> None:
-    """A Modbus TCP device that answers register 0, and closes the connection when it is asked for register 100."""
+    """A Modbus TCP device that answers register 0, and closes the connection at a request for register 100."""
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         try:
@@ -150,7 +150,7 @@ def test_a_write_only_item_is_reported_and_the_others_are_read(tmp_path: Path) -
 
 
 async def _node_on_a_bus_that_closes(tell: Callable[[str], None], stop: asyncio.Event) -> None:
-    """A node on a software bus, which closes when the node is asked for 1018h:04."""
+    """A node on a software bus, which closes at a request for 1018h:04."""
     bus = await SoftBusServer.open(Endpoint.parse("can:fieldtwin/127.0.0.1:0"), 125_000, paced=False)
     closing: list[asyncio.Task[None]] = []
 

@@ -1,4 +1,4 @@
-"""How a poll group is read: every value once, none cut, limits kept; holes are learnt (MB-025)."""
+"""How a poll group is read: every value once, none split, limits observed; gaps are learned (MB-025)."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_every_value_is_read_once_and_whole_within_the_limits(
 
 
 def taught(plan: GroupPlan, refuses: Callable[[Read], int]) -> list[int]:
-    """Read the group until nothing more is learnt, as a driver does; how many requests each pass took."""
+    """Read the group until nothing more is learned, as a driver does; return the number of requests of each pass."""
     passes: list[int] = []
     changes = -1
     while changes != plan.learnt.changes:
@@ -83,7 +83,7 @@ def taught(plan: GroupPlan, refuses: Callable[[Read], int]) -> list[int]:
 
 
 def without(holes: set[int]) -> Callable[[Read], int]:
-    """A device that does not have these registers."""
+    """A device without these registers."""
     return lambda read: 2 if any(read.range.address <= h < read.range.end for h in holes) else 0
 
 
@@ -91,7 +91,7 @@ def without(holes: set[int]) -> Callable[[Read], int]:
 def test_a_device_with_holes_is_read_whole_with_the_fewest_requests(
     layout: list[tuple[int, str]], holes: set[int], gap: int
 ) -> None:
-    """Nothing that was halved on the way stays halved: what is learnt is what a profile could have said."""
+    """A temporary split is undone: the final plan is one that a profile could state."""
     profile = profile_of(layout, read_registers=60, max_gap=gap)
     plan = GroupPlan(profile, "values")
     refuses = without(holes)
@@ -100,7 +100,7 @@ def test_a_device_with_holes_is_read_whole_with_the_fewest_requests(
     if there:
         assert {t.name for r in plan.reads for t in r.tags} == there
     else:
-        assert len(plan.reads) == 1  # one is still asked for
+        assert len(plan.reads) == 1  # one is still requested
     assert set(plan.learnt.missing) == set(profile.tags) - there
     assert all(any(h in span(g) for h in holes) for g in plan.learnt.profile_gaps)
     assert plan.learnt.gaps == [g for g in plan.learnt.gaps if g.count]
@@ -144,7 +144,7 @@ def test_a_value_that_was_missing_and_comes_is_read_with_the_others_again() -> N
     taught(plan, without({1}))
     assert plan.learnt.missing == ["t1"]
     assert [r.range.address for r in plan.reads] == [0, 2]
-    plan.plan_again()  # the device was away
+    plan.plan_again()  # the device was disconnected
     assert [r.range.address for r in plan.reads] == [0, 1, 2]
     taught(plan, without(set()))
     assert plan.learnt.missing == []
@@ -152,10 +152,10 @@ def test_a_value_that_was_missing_and_comes_is_read_with_the_others_again() -> N
 
 
 def test_a_device_that_has_nothing_yet_is_asked_for_one_value_until_it_has_all() -> None:
-    """Some answer 02 to everything while they start."""
+    """Some devices answer 02 to everything while they start."""
     plan = GroupPlan(profile_of([(0, "uint16")] * 8), "values")
     assert taught(plan, lambda read: 2) == [15, 1]
-    assert taught(plan, lambda read: 0) == [1, 8, 1]  # one is there, each is, all at once
+    assert taught(plan, lambda read: 0) == [1, 8, 1]  # one exists, each exists, all at once
     assert plan.learnt.missing == []
     assert [(r.range.address, r.range.count) for r in plan.reads] == [(0, 8)]
 

@@ -1,5 +1,5 @@
-"""Every shipped profile of a real device: its file is short and says its source, and the driver made from it reads the
-device's recording, replayed on a real protocol stack, as the values that the recording was made from."""
+"""Every shipped profile of a real device is short and names its source, and its driver reads the device's recording, replayed
+on a real protocol stack, as the original values of the recording."""
 
 from __future__ import annotations
 
@@ -95,11 +95,11 @@ def test_the_driver_reads_what_the_device_was_recorded_with(name: str) -> None:
         value = tags.current(f"d.{tag.name}", 1)
         raw = made[0][tag.name]
         if tag.type == "int16" and isinstance(raw, int):
-            raw &= 0xFFFF  # as sentinels are stated
+            raw &= 0xFFFF  # as stated by sentinels
         if isinstance(raw, str):
             assert value.value == raw
         elif not tag.counter and isinstance(raw, int) and raw not in tag.sentinels:
-            # the first round's raw number, scaled; later rounds wander by a few counts
+            # the first round's raw number, scaled; later rounds vary by a few counts
             signed = raw - 0x10000 if tag.type == "int16" and raw & 0x8000 else raw
             assert value.value == pytest.approx(signed * tag.scale + tag.offset, abs=40 * tag.scale)
         assert value.quality is Quality.GOOD or raw in tag.sentinels

@@ -1,4 +1,4 @@
-"""Recordings: whole, cut off, broken, foreign; and what a killed or failing writer leaves behind."""
+"""Recordings: complete, truncated, broken, foreign; and the remains of a killed or failing writer."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The shipped recordings are what the script makes, and are what a buoy and a cast could look like."""
+"""The shipped recordings are the output of the script, and have plausible values for a buoy and a cast."""
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
-"""Every refused write is in the audit log, also a client's write to a device that is bad; and the log cannot be flooded.
+"""Every refused write is in the audit log, also a client's write to a bad device; and the log cannot be flooded.
 
-Observed before: a client of `serve` wrote to a tag of a device that did not answer and got an exception; the audit log had no
-line.
+Defect: a client of `serve` wrote to a tag of a device that did not answer and got an exception; the audit log had no line.
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ def test_a_clients_write_to_a_bad_device_is_on_record(tmp_path: Path) -> None:
 
 
 def test_a_clients_write_to_no_tag_or_with_no_leave_is_on_record(tmp_path: Path) -> None:
-    """The server itself refuses these: no device and no tag is concerned."""
+    """The server itself refuses these: they concern no device and no tag."""
 
     async def main() -> None:
         async with rig(tmp_path / "a") as r:
@@ -88,7 +87,7 @@ def test_a_program_that_asks_for_another_impossible_value_in_each_scan_floods_no
         == 6000
     )
     entries = kept.since(0)
-    assert 1 < len(entries) <= 7  # it goes on: whoever looks later sees that
+    assert 1 < len(entries) <= 7  # it continues, and later readers see that
     assert sum(entry.count for entry in entries) == kept.total == 6000
     assert [e.standing for e in entries] == [False] * (len(entries) - 1) + [True]
 

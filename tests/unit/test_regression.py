@@ -1,4 +1,4 @@
-"""Runs held against each other by what they mean, and a run as a scenario: from events made here, and from a virtual run."""
+"""Comparing runs by their meaning, and converting a run into a scenario: with constructed events, and with a virtual run."""
 
 from __future__ import annotations
 
@@ -183,7 +183,7 @@ def test_a_virtual_run_becomes_a_scenario_that_passes_and_sees_a_change(tmp_path
 
 
 def test_runs_without_anything_in_common_are_not_the_same() -> None:
-    """Observed before: an empty trace was "the same" as any older one, with all fields of that counted as compared."""
+    """Defect: an empty trace was "the same" as any older one, with all fields of that counted as compared."""
     old = story_of(SYSTEM, [*RELAY, *asked(5.0), tag(6.0, "ctd.pressure", 1.0)])
     for new in ([], [Event(0, Kind.NOTE, "start", {"text": "x"})]):
         verdict = compare(old, story_of(SYSTEM, new))

@@ -1,6 +1,6 @@
-"""Another configuration for a plant that runs: what is compared, what is refused whole, and what comes of it on the wires.
+"""A changed configuration for a running plant: the comparison, rejected reloads, and the effects on the wires.
 
-The whole gateway and PLC in virtual time, the files as a user has them.
+The whole gateway and PLC in virtual time, with files as a user writes them.
 """
 
 from __future__ import annotations
@@ -138,13 +138,13 @@ def test_what_needs_a_restart_is_named_with_its_place(
     changed = plant.with_name(f"{file}.yaml")
     edit(changed, (old, new))
     if file == "plant":
-        edit(plant, ("timeout_ms: 300", "timeout_ms: 400"))  # what could be taken over does not hide it
+        edit(plant, ("timeout_ms: 300", "timeout_ms: 400"))  # reloadable changes do not hide it
     stuck = [c for c in compare(before, load_system(str(plant))) if not c.live]
     assert (stuck[0].where, stuck[0].what) == (f"{changed}:{where}", what)
 
 
 def test_what_the_files_name_is_not_forgotten(plant: Path) -> None:
-    """Nothing that may change explains it: that a profile of the same text stands elsewhere is no change, another one is."""
+    """No reloadable key explains the change: the same profile text in a different file is no difference, a different text is."""
     before = load_system(str(plant))
     (plant.parent / "copy.yaml").write_text(TANK, encoding="utf-8")
     edit(plant, ("profile: tank.yaml", "profile: copy.yaml"))
@@ -178,7 +178,7 @@ class Running:
         self._system = run.system
 
     def asked(self, unit: int, address: int, since_s: float = 0.0) -> list[float]:
-        """When registers from `address` were read, in seconds of the run."""
+        """Return when registers from `address` were read, in seconds of the run."""
         head = bytes([unit, 3]) + address.to_bytes(2)
         return [
             (c.t_ns - self.run.started_ns) / 1e9
@@ -190,7 +190,7 @@ class Running:
         ]
 
     def written(self, address: int) -> list[int]:
-        """What unit 1 was told to hold there, in order."""
+        """Return the values written to unit 1, in order."""
         head = bytes([1, 16]) + address.to_bytes(2)
         sent = [c.item for c in self._tap.captured if c.direction is Direction.SENT and isinstance(c.item, bytes)]
         return [int.from_bytes(item[7:9]) for item in sent if item[:4] == head]
@@ -221,7 +221,7 @@ def running(plant: Path, loop: VirtualLoop, scenario: Any) -> None:
 
 
 def gaps(times: list[float]) -> list[float]:
-    """To 50 ms: one poll waits for the reply to another."""
+    """With a tolerance of 50 ms, because a poll waits for the reply to a different one."""
     return [round(20 * (b - a)) / 20 for a, b in pairwise(times)]
 
 
@@ -235,12 +235,12 @@ def test_no_poll_is_lost_or_doubled_on_the_line(plant: Path, loop: VirtualLoop) 
         before = [t for t in fast if t < reloaded_s]
         assert set(gaps(before)) == {1.0}
         behind = gaps(fast)[len(before) :]
-        assert min(behind[:9]) >= 0.2  # on its way to its place beside the others, an eighth sooner each time
+        assert min(behind[:9]) >= 0.2  # on its way to its place next to the others, an eighth earlier each time
         assert behind[9:] == [0.25] * len(behind[9:])
-        assert 0.25 <= gaps(fast)[len(before) - 1] <= 1.0  # the one interval that begins before and ends behind it
+        assert 0.25 <= gaps(fast)[len(before) - 1] <= 1.0  # the one interval that contains the change
         assert gaps(slow)[:2] == [4.0, 6.0]
         assert all(5.25 <= gap <= 6.0 for gap in gaps(slow)[1:])
-        assert set(gaps(others)[-20:]) == {0.5}  # nothing was said of it but that its place is another one
+        assert set(gaps(others)[-20:]) == {0.5}  # only its place differs
         assert min(gaps(others)) >= 0.4
         assert not any(d.schedule.missed[g] for d in p.run.gateway.buses["line"].devices for g in d.schedule.missed)
 
@@ -279,7 +279,7 @@ def test_scaling_counts_at_once_also_for_what_is_read_only_once(plant: Path, loo
         await p.reload()
         assert p.value("tank.level").value == pytest.approx(16)
         assert (p.value("tank.size").value, p.value("tank.size").t_ns) == (4, age_ns)
-        assert p.value("tank.size").quality is Quality.UNCERTAIN  # beyond its range, and no poll was needed to see it
+        assert p.value("tank.size").quality is Quality.UNCERTAIN  # beyond its range, which needed no poll to detect
         assert len(p.asked(1, 20)) == 1
         await asyncio.sleep(2)
         assert p.value("tank.level").value == pytest.approx(16)
@@ -298,7 +298,7 @@ def test_outputs_are_written_anew_as_the_new_scaling_has_them(plant: Path, loop:
         edit(plant, ("target: 1", "target: 3"))
         await p.reload()
         await asyncio.sleep(1)
-        assert (held(), p.written(35)) == (200, [30, 300])  # also what nobody can read back
+        assert (held(), p.written(35)) == (200, [30, 300])  # also an output that cannot be read back
         writer = p.run.gateway.outputs
         writes = writer.writes
         await asyncio.sleep(5)
@@ -312,7 +312,7 @@ def test_outputs_are_written_anew_as_the_new_scaling_has_them(plant: Path, loop:
 def test_a_value_that_the_new_limits_forbid_is_a_refused_output_and_the_gateway_goes_on(
     plant: Path, loop: VirtualLoop
 ) -> None:
-    """Observed: the comparison of the held value with the device raised `NotAllowed`, the gateway died, and the safe value was
+    """Defect: the comparison of the held value with the device raised `NotAllowed`, the gateway died, and the safe value was
     never written."""
 
     async def scenario(p: Running) -> None:

@@ -1,4 +1,4 @@
-"""A recorded CANopen node holds again what it held, object by object, however the next master asks."""
+"""A recorded CANopen node returns its recorded values, object by object, independent of the requests of the next client."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_what_the_recorded_master_wrote_is_a_setting() -> None:
 
 
 def answered(values: str, policy: WhenUsedUp = WhenUsedUp.HOLD) -> Rig:
-    """Of a log in which 2002h was uploaded once a second and gave these bytes, each time with another object in between."""
+    """A log in which 2002h was uploaded once a second with these bytes, each time with a different object in between."""
     lines = []
     for second, value in enumerate(values.split()):
         for at, frame in enumerate(("605#4002200000000000", f"585#4B022000{value}000000", "605#4006200000000000")):
@@ -140,7 +140,7 @@ devices: {winch: {recording: winch.log}}
 
 
 def test_a_prototype_whose_node_is_a_log(tmp_path: Path) -> None:
-    """The gateway of another day reads at its own pace, and gets what was recorded in its order."""
+    """A different gateway reads at its own rate, and gets the recorded values in order."""
     recorded_values = [-5, -6, -6, 7]
     lines = [f"({10 + at}.{half}) can0 {frame}" for at, value in enumerate(recorded_values) for half, frame in enumerate((
         "609#4009650000000000", f"589#43096500{value.to_bytes(4, 'little', signed=True).hex()}"

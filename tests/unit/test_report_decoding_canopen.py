@@ -1,4 +1,4 @@
-"""CANopen frames of a trace as words and exchanges: SDO transfers of every kind, learnt PDOs, and the small services."""
+"""CANopen frames of a trace as text and exchanges: SDO transfers of every kind, learned PDOs, and the small services."""
 
 from __future__ import annotations
 
@@ -72,12 +72,12 @@ def write(t_ms: float, index: int, sub: int, value: int) -> list[Event]:
 
 
 def test_a_mapping_is_learnt_from_what_is_written() -> None:
-    """TPDO1 is moved to another identifier with one object of the two, as a configuration tool would do it."""
+    """TPDO1 is moved to a different identifier with one of its two objects, as a configuration tool would do."""
     moved = [*write(0, 0x1800, 1, 0x8000_0185), *write(2, 0x1A00, 0, 0), *write(4, 0x1A00, 1, 0x6020_0010)]
     moved += [*write(6, 0x1A00, 0, 1), *write(8, 0x1800, 1, 0x0000_01A5)]
     found = exchanges(observatory(), [*moved, can(10, "1A5#3500"), can(11, "185#3500")])
     assert found[-2].tags == {"slope_lateral": 0.53}
-    assert found[-1].tags == {}  # that identifier is nobody's now, and what is in it is unknown
+    assert found[-1].tags == {}  # that identifier is unassigned now, so its content is unknown
     assert texts(moved)[0::2] == [
         "inclinometer: SDO download 1800h:01 COB-ID used by TPDO = 185h (off)",
         "inclinometer: SDO download 1A00h:00 Number of mapped objects = 0",
@@ -165,7 +165,7 @@ class Objects:
 
 
 def listened(transfer: SdoTransfer, server: SdoServer) -> Transfer:
-    """A transfer between our client and the emulator's server, and what a listener makes of it."""
+    """A transfer between our client and the emulator's server, and the decoding of a listener."""
     watch, seen = SdoWatch(), []
     waiting = deque([transfer.start(0).data])
     while waiting:
@@ -228,7 +228,7 @@ def test_what_is_no_frame_has_words_too() -> None:
 
 
 def test_a_segment_that_was_lost_comes_again() -> None:
-    """Block upload: the second of three segments is lost, one is acknowledged, the rest comes again from number 1."""
+    """Block upload: the second of three segments is lost, one is acknowledged, the rest is repeated from number 1."""
     watch = SdoWatch()
     watch.request(bytes.fromhex("A4 0020 00 7F 00 0000"), 0)
     watch.reply(bytes.fromhex("C6 0020 00 15000000"), 1)
@@ -269,7 +269,7 @@ def test_secrets_have_no_value_in_words_nor_in_json() -> None:
     shown = json.dumps([e.describe() for e in found])
     assert "1005" not in shown
     assert str(found[1].tags["slope_lateral"]) not in shown
-    assert found[0].value == 1005  # a check still knows
+    assert found[0].value == 1005  # a check still has it
     segment = [can(10, "605#4018100400000000"), can(11, "585#4118100408000000"), can(12, "605#6000000000000000")]
     assert [decoder.decode(e).text.endswith("(secret)") for e in (*segment, can(13, "585#0041424344454647"))][1:] == [
         True

@@ -1,4 +1,4 @@
-"""Modbus bytes of a trace as words and exchanges: every framing, however the medium cut them, whatever goes wrong."""
+"""Modbus bytes of a trace as text and exchanges: every framing, any division into chunks, any error."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_values_have_the_words_of_the_profile() -> None:
 def test_an_exception_has_its_name() -> None:
     found = only([ask(0, "03 0000 0001"), answer(5, "83 06")])
     assert (found.exception, found.problem, found.reply_text) == (6, "exception", "exception 06 server device busy")
-    assert found.tags == {"status": None}  # asked for, not told
+    assert found.tags == {"status": None}  # requested, not reported
 
 
 def test_no_answer_ends_with_the_next_request_or_the_trace() -> None:
@@ -214,7 +214,7 @@ CONVERSATION = [
 @given(st.data())
 @settings(max_examples=25)
 def test_chunk_borders_mean_nothing(data: st.DataObject) -> None:
-    """However replies are cut, the exchanges are the same but for the time of their last byte."""
+    """However replies are divided, the exchanges are the same except for the time of their last byte."""
     cut: list[Event] = []
     for event in CONVERSATION:
         raw = bytes.fromhex(event.data["bytes"])
@@ -245,7 +245,7 @@ def test_any_bytes_are_described_and_none_is_lost(framing: str, chunks: list[tup
 
 
 def test_on_tcp_an_answer_ends_what_was_asked_before() -> None:
-    """One request at a time: the next one's answer says that the first was given up, and its own comes too late."""
+    """One request at a time: the next answer shows that the first request was given up, and its own comes too late."""
     events = [chunk(0, True, adu(1, "03 0022 0001"), "lan"), chunk(50, True, adu(2, "03 0022 0001"), "lan")]
     decoder = Decoder(observatory())
     assert [decoder.feed(e) for e in events] == [[], []]
@@ -260,7 +260,7 @@ def test_on_tcp_an_answer_ends_what_was_asked_before() -> None:
 
 @pytest.mark.parametrize("cut", [3, 8, 10])
 def test_a_connection_that_is_lost_inside_an_answer(cut: int) -> None:
-    """The next connection begins with a frame of its own, whatever the last one still owed."""
+    """The next connection begins with a new frame, whatever the last one still had to send."""
     answer_1, answer_2 = adu(1, "03 02 0009"), adu(1, "03 02 0008")
     found = exchanges(
         observatory(),
@@ -271,7 +271,7 @@ def test_a_connection_that_is_lost_inside_an_answer(cut: int) -> None:
 
 
 def test_an_answer_in_pieces_over_the_next_request_is_whole() -> None:
-    """No connection was lost: the rest of the first answer comes when the second request is out."""
+    """No connection was lost: the rest of the first answer arrives after the second request."""
     raw = adu(1, "03 02 0009")
     found = exchanges(
         observatory(),

@@ -1,4 +1,4 @@
-"""What docs/reports.md shows is what runs."""
+"""The examples of docs/reports.md run."""
 
 from __future__ import annotations
 

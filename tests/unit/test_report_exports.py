@@ -1,4 +1,4 @@
-"""JUnit XML and value change dumps, read back by parsers that are not ours."""
+"""JUnit XML and value change dumps, read back by third-party parsers."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def test_a_text_without_end_is_cut_in_the_middle() -> None:
 
 
 def read_vcd(path: Path) -> dict[str, list[tuple[int, object]]]:
-    """Every variable by scope and name, with its changes; the reader refuses what is not of the standard."""
+    """Return every variable by scope and name, with its changes; the reader refuses anything outside the standard."""
     scopes: list[str] = []
     names: dict[str, tuple[str, str]] = {}
     changes: dict[str, list[tuple[int, object]]] = {}
@@ -207,8 +207,8 @@ KNOWN = {
     **{key: {"type", "message"} for key in ("failure", "error", "skipped")},
     "system-out": set(),
 }
-"""Elements and attributes of junit-10.xsd, the schema by which Jenkins' xUnit plugin refuses files; properties of test cases are
-every other reader's, and newer versions of it have them."""
+"""Elements and attributes of junit-10.xsd, the schema by which Jenkins' xUnit plugin refuses files. Properties of test cases
+are accepted by every other reader and by newer versions of it."""
 
 
 @pytest.mark.parametrize("verdict", Verdict)

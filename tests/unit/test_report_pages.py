@@ -1,4 +1,4 @@
-"""The HTML report: what it says, that names stay names, that it needs nothing from outside and stays small."""
+"""The HTML report: its content, escaped names, no external resources, and a bounded size."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def report(*scenarios: ScenarioResult, **changes: object) -> Report:
 
 
 class Page(HTMLParser):
-    """The page as a browser takes it: elements that were not closed, ids, links, and its words."""
+    """The page as a browser parses it: unclosed elements, ids, links, and its text."""
 
     VOID = frozenset({"meta", "br", "rect", "path", "line"})
 
@@ -90,7 +90,7 @@ def page(of: Report) -> Page:
     found = Page(render_html(of))
     assert not found.open
     assert len(found.ids) == len(set(found.ids))
-    assert {link.removeprefix("#") for link in found.links} <= set(found.ids)  # nothing but what is in the page
+    assert {link.removeprefix("#") for link in found.links} <= set(found.ids)  # only resources inside the page
     assert not found.tags & {"script", "link", "img", "iframe"}
     return found
 
@@ -183,7 +183,7 @@ def test_five_hundred_failures_are_listed_and_few_are_drawn() -> None:
 
 
 def test_many_events_give_a_small_file() -> None:
-    """A window full of everything: each lane, mark and row is bounded."""
+    """A window with the maximum content: each lane, mark and row is bounded."""
     crowd: list[Event] = []
     for n in range(6000):
         at = 12_200 + n / 4
@@ -203,7 +203,7 @@ def test_a_long_wait_is_drawn_at_its_end() -> None:
 
 
 def test_counts_of_a_listener_count_more_than_the_trace() -> None:
-    """A `Collector` sees what a full trace has dropped."""
+    """A `Collector` sees events that a full trace has dropped."""
     collector = Collector(observatory(), machines_of(observatory()))
     for event in TRACE:
         collector.feed(event)
@@ -260,7 +260,7 @@ def test_a_place_that_cannot_be_written(tmp_path: Path) -> None:
 
 
 def test_what_is_thinned_still_reaches_the_failure() -> None:
-    """However much happens in a window, its end is not left out: that is where the failure is."""
+    """However much happens in a window, its end is drawn, because the failure is there."""
     crowd: list[Event] = []
     for n in range(5000):
         at = 12_200 + n / 5
@@ -301,7 +301,7 @@ def test_what_was_refused_is_not_covered() -> None:
 
 
 def test_a_wire_of_no_system_is_decoded_as_what_is_spoken_there() -> None:
-    """Conformance: somebody else's master asks us."""
+    """Conformance: a third-party client sends requests."""
     events = [chunk(13_000, False, adu(1, "03 0000 0001"), "listen"), chunk(13_020, True, adu(1, "83 06"), "listen")]
     judged = scenario(trace=events, requirements=())
     of = Report("a master", [judged], framings={"listen": "mbap"}, served=("listen",))
@@ -312,7 +312,7 @@ def test_a_wire_of_no_system_is_decoded_as_what_is_spoken_there() -> None:
 
 
 def test_results_need_no_protocols() -> None:
-    """Who only makes results (a plugin in somebody's own environment) needs neither pymodbus nor canopen."""
+    """A program that only creates results (a plugin in a user's environment) needs neither pymodbus nor canopen."""
     needless = "pymodbus", "canopen", "fieldtwin.twin.site.system"
     code = f"import sys, fieldtwin.results.model; print([m for m in {needless} if m in sys.modules])"
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=30)

@@ -1,4 +1,4 @@
-"""`fieldtwin trace`: a run's trace or capture in words, as JSON, as waveforms; and files that are none."""
+"""`fieldtwin trace`: a run's trace or capture as text, as JSON, as waveforms; and files that are neither."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A recording that never began leaves no file, so that the next try under the same name is not refused."""
+"""A recording that never began leaves no file, so that the next attempt with the same name is not refused."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""An RTU request with a right check sum whose byte count contradicts its length is answered with exception 03 (AP 7), as on TCP.
+"""An RTU request with a correct CRC whose byte count contradicts its length is answered with exception 03 (AP 7), as on TCP.
 
-Defect: it was taken for noise and met with silence, so that libmodbus's unit-test-client stopped there. MB-040 did not catch it:
-its byte count contradicted the number of registers only, never the length of the frame.
+Defect: it was treated as noise and not answered, so that libmodbus's unit-test-client stopped there. MB-040 did not catch it:
+its byte count contradicted only the number of registers, never the length of the frame.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def test_a_good_request_after_it_is_answered(hexadecimal: str) -> None:
 
 @given(st.binary(max_size=300), st.integers(1, 64))
 def test_noise_is_answered_only_if_its_check_sum_is_right(data: bytes, piece: int) -> None:
-    """No answer to what is no frame, however it is cut."""
+    """An invalid frame is never answered, however it is divided."""
     slave = RtuSlave({7: make_unit()})
     heard = [e for at in range(0, len(data), piece) for e in slave.receive(data[at : at + piece], at)]
     heard += slave.receive(b"", 1000 + FRAME_GAP_NS)

@@ -1,4 +1,4 @@
-"""Which states a run shows: those of each program's own table, and which programs are judged by the far end's commands."""
+"""States shown by a run: those of each program's table; and the programs that are checked by the remote client's commands."""
 
 from __future__ import annotations
 
@@ -27,4 +27,4 @@ def test_states_are_named_by_the_programs_own_table() -> None:
     watch._words = state_words(layout, ["relay", "gate"])  # the observatory has no gate
     watch.note("relay", "STANDBY", 0)
     watch.note("gate", "OPEN", 0)
-    assert watch.relays == ["relay"]  # a gate goes its own way, whatever is commanded
+    assert watch.relays == ["relay"]  # a gate changes its state independent of commands

@@ -1,4 +1,4 @@
-"""The trace of a run: hashed and written a block at a time, and nobody can tell."""
+"""The trace of a run: hashed and written in blocks, with the same result as event by event."""
 
 import hashlib
 import io
@@ -25,7 +25,7 @@ def line(event: Event) -> bytes:
 
 
 class _Kept(io.BytesIO):
-    """What was in it when it was closed."""
+    """The content at its closing."""
 
     whole = b""
 
@@ -46,7 +46,7 @@ def test_hash_and_sink_have_every_event_in_order(count: int) -> None:
     lines = b"".join(map(line, events))
     digest = hashlib.sha256(lines).hexdigest()
     assert trace.hexdigest() == trace.hexdigest() == digest
-    assert sink.getvalue() == lines  # whoever knows the hash finds the events that it is of
+    assert sink.getvalue() == lines  # the hash identifies the events that it was computed from
     trace.close()
     trace.close()
     assert sink.whole == lines
@@ -71,7 +71,7 @@ def test_memory_is_bounded_whatever_an_event_holds() -> None:
         trace.note(*event)
     with pytest.raises(TypeError):
         trace.note(0, Kind.NOTE, "the end of its block", {})
-    for event in some(5000):  # said once, and no block grows for ever behind it
+    for event in some(5000):  # reported once, and no block grows without bound afterwards
         trace.note(*event)
     assert len(trace.events) == 5
     assert len(trace._pending) < 256

@@ -1,4 +1,4 @@
-"""`scan` of a CANopen bus in virtual time: who is found by listening, who by asking, and when nothing is asked at all."""
+"""`scan` of a CANopen bus in virtual time: nodes found by listening, nodes found by requests, and when it sends nothing."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def test_nodes_without_an_id_are_found_by_fastscan_and_left_waiting() -> None:
 
 
 class Adapter:
-    """An adapter whose bus speaks at `rate`: at another rate there is nothing to be heard."""
+    """An adapter whose bus runs at `rate`: at a different rate nothing is received."""
 
     def __init__(self, peers: PeerBus, rate: int) -> None:
         self.peers, self.rate = peers, rate

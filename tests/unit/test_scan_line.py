@@ -1,4 +1,4 @@
-"""`scan` of a serial line with hidden settings, modelled bit by bit: what it finds, what it says it is sure of, what it sends."""
+"""`scan` of a serial line with hidden settings, modelled bit by bit: its findings, its certainty, its requests."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def meter(value: int = 7) -> ModbusUnit:
 
 
 def exchange(number: int, value: int) -> tuple[bytes, bytes]:
-    """Another master reads two registers of a unit."""
+    """A second client reads two registers of a unit."""
     words = value.to_bytes(2, "big") + (65535 - value).to_bytes(2, "big")
     return with_crc(bytes([number, 3, 0, 0, 0, 2])), with_crc(bytes([number, 3, 4]) + words)
 

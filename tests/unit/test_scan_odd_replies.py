@@ -1,7 +1,7 @@
-"""A scan says what a reply that does not fit may come from on this kind of wire, and says it once for all units that gave it.
+"""A scan explains possible causes of a mismatched reply on this kind of wire, once for all units that gave it.
 
-Defect: against pymodbus 3.9.2, which answers for a unit id that it does not have as unit 0 with function 80h and code 0B, a scan
-of TCP printed 245 lines of "two devices with one id, or a bad line".
+Defect: with pymodbus 3.9.2, which answers for an absent unit ID as unit 0 with function 80h and code 0B, a scan of TCP printed
+245 lines of "two devices with one id, or a bad line".
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from fieldtwin.gateway.core.endpoint import Endpoint, SerialSettings
 
 
 class Server:
-    """A connector to a TCP server that has unit 1 only; `absent` is the body (unit and PDU) that it sends for any other unit."""
+    """A connector to a TCP server that has unit 1 only; `absent` is the body (unit and PDU) of its reply for any other unit."""
 
     def __init__(self, absent: bytes) -> None:
         self.absent = absent

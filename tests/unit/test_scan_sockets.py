@@ -1,4 +1,4 @@
-"""`scan` of hosts in virtual time: units behind a gateway, one device that answers as any, and far ends that hang up."""
+"""`scan` of hosts in virtual time: units behind a gateway, one device that answers as any unit, and hosts that disconnect."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import ConnectionLost
 
 Reply = Callable[[int], bytes | None]
-"""Unit -> the PDU that it answers with; None: silence; b"": it hangs up."""
+"""Map a unit to the PDU of its answer; None: silence; b"": it disconnects."""
 
 
 class Host:

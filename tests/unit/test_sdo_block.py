@@ -1,4 +1,4 @@
-"""SDO block transfers of the client, pure: frame by frame from the standard, and against losses of any kind."""
+"""SDO block transfers of the client, pure: frame by frame from the standard, and with losses of any kind."""
 
 from __future__ import annotations
 
@@ -156,7 +156,7 @@ def test_an_abort_ends_it_in_every_state_and_a_segment_never_passes_for_one() ->
 
 
 def test_late_segments_pass_for_no_reply_to_a_later_request() -> None:
-    """The reason for blocks of 63."""
+    """The reason for blocks of 63 segments."""
     for number in range(1, 64):
         for first in (number, 0x80 | number):
             later = upload()
@@ -167,9 +167,9 @@ Wire = deque[tuple[int, bytes]]
 
 
 def drive(transfer: SdoTransfer, server: BlockServer, fates: list[int], delays: list[int]) -> object:
-    """Client and server over a wire that loses (fate 0), doubles what the server says (1) or delays; order is kept.
+    """Run client and server over a wire that loses (fate 0), duplicates the server's frames (1) or delays; the order is kept.
 
-    One step a millisecond; returns `Done` or `Failed` of the transfer, or fails when it never ends.
+    One step per millisecond; returns `Done` or `Failed` of the transfer, or fails if it never ends.
     """
     fate, delay = iter(fates), iter(delays)
     to_server: Wire = deque()
@@ -244,7 +244,7 @@ def test_a_download_over_any_wire_is_right_or_none(
 
 @pytest.mark.parametrize("lost", range(40))
 def test_co016_co017_one_lost_segment_is_always_got_over(lost: int) -> None:
-    """Every single frame that is a segment may be lost, the last of a sub-block and the last of all too."""
+    """Every single segment frame may be lost, including the last of a sub-block and the last of all."""
     value = bytes(range(210))
     fates = [9] * lost + [0]
     server = BlockServer({MUX: value})

@@ -1,4 +1,4 @@
-"""The pure SDO transfers, row by row of the catalogue (CO-0xx), and against garbage."""
+"""The pure SDO transfers, row by row of the test-case list (CO-0xx), and with garbage."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def feed(transfer: SdoTransfer, data: str, now_ns: int = 0) -> Step:
 
 
 def refused(step: Step, code: int) -> None:
-    """We gave up, told the node why with `code`, and raise Desync."""
+    """The client gave up, sent the node an abort with `code`, and raises Desync."""
     assert isinstance(step, Failed)
     assert isinstance(step.error, Desync)
     assert step.abort is not None
@@ -45,7 +45,7 @@ def refused(step: Step, code: int) -> None:
     assert step.abort.data == bytes.fromhex("80081000") + code.to_bytes(4, "little")
 
 
-# -- the plain ways ------------------------------------------------------------------------------------------------
+# -- transfers without errors ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -118,7 +118,7 @@ def test_no_such_object_is_the_callers_fault(index: int, sub: int, node: int) ->
         SdoUpload(node, index, sub, TIMEOUT)
 
 
-# -- the catalogue -------------------------------------------------------------------------------------------------
+# -- the test-case list ------------------------------------------------------------------------------------------------
 
 
 def test_co001_repeated_toggle_aborts() -> None:
@@ -237,7 +237,7 @@ def test_co025_a_flood_of_garbage_ends_the_transfer() -> None:
 def test_co029_expedited_without_size_has_the_objects_own_length() -> None:
     assert feed(upload(length=2), "42 08 10 00 E8 03 AA AA") == Done(b"\xe8\x03")
     assert feed(upload(), "42 08 10 00 E8 03 AA AA") == Done(b"\xe8\x03\xaa\xaa")
-    assert feed(upload(length=4), "4B 08 10 00 E8 03 00 00") == Done(b"\xe8\x03")  # what is said, counts
+    assert feed(upload(length=4), "4B 08 10 00 E8 03 00 00") == Done(b"\xe8\x03")  # the content counts
 
 
 # -- any garbage ---------------------------------------------------------------------------------------------------
@@ -252,7 +252,7 @@ GARBAGE = st.one_of(
 
 @given(value=st.binary(max_size=40), sized=st.booleans(), data=st.data())
 def test_no_garbage_and_no_repetition_yields_a_wrong_object(value: bytes, sized: bool, data: st.DataObject) -> None:
-    """Between the right frames: what is no reply of ours, and frames of ours again. The value is right or there is none."""
+    """Between the correct frames: foreign frames, and repetitions of ours. The value is correct or there is an error."""
     parts = [value[i : i + 7] for i in range(0, len(value), 7)] or [b""]
     replies = [bytes([0x40 | sized, 0x08, 0x10, 0x00]) + (len(value) if sized else 0).to_bytes(4, "little")]
     for i, part in enumerate(parts):

@@ -1,7 +1,7 @@
-"""The SDO client in whatever order things happen: block and plain, read and written, cancelled, lost, late, aborted.
+"""The SDO client with operations in any order: block and plain, read and written, cancelled, lost, late, aborted.
 
-Every answer of the server carries the number of the request that it answers, all through: a value that is older than its request,
-or put together of two, shows.
+Every answer of the server is filled with the number of the request that it answers, so that a value older than its request, or
+combined from two answers, is detected.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ LENGTHS = {0: 4, 1: 12, 2: 84}
 
 
 class NumberedServer(BlockServer):
-    """Gives each read the number of its request, over and over; remembers what was written whole."""
+    """Answer each read with repetitions of its request number; remember complete writes."""
 
     def __init__(self) -> None:
         super().__init__({}, block=5, crc=True, early=True)
@@ -62,7 +62,7 @@ class NumberedServer(BlockServer):
 
 
 class Wire:
-    """Serves over a wire that loses frames and delays replies, in order."""
+    """Serve over a wire that loses frames and delays replies, in order."""
 
     def __init__(self, end: MemoryEnd, server: NumberedServer, seed: int, loss: float, delay_s: float) -> None:
         self.end, self.server, self.random = end, server, random.Random(seed)
@@ -81,7 +81,7 @@ class Wire:
 
 
 def operations(chance: random.Random) -> list[tuple[str, bool, int, float | None]]:
-    """What is asked: read or write, in blocks or not, subindex, and after how long it is left (s, None: never)."""
+    """An operation: read or write, in blocks or not, subindex, and the time until it is cancelled (s, None: never)."""
     return [
         (
             chance.choice(["read", "read", "write"]),
@@ -96,7 +96,7 @@ def operations(chance: random.Random) -> list[tuple[str, bool, int, float | None
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**64))
 def test_never_a_wrong_object_and_never_stuck(seed: int) -> None:
-    """Everything follows from the seed: hypothesis' own lists are too short and too much alike to meet a late reply."""
+    """Everything follows from the seed, because hypothesis' own lists are too short and too uniform to meet a late reply."""
     chance = random.Random(seed)
     loss, delay_s = chance.choice([0.0, 0.03, 0.2]), chance.choice([0.01, 0.2, 1.0])
 
@@ -127,7 +127,7 @@ def test_never_a_wrong_object_and_never_stuck(seed: int) -> None:
                 assert int.from_bytes(data[:4], "little") > before
         serving.cancel()
         await asyncio.gather(serving, return_exceptions=True)
-        for mux, written in server.written.items():  # what was written, was written whole
+        for mux, written in server.written.items():  # each stored value was written completely
             count = int.from_bytes(mux[:2], "little") - 0x2100
             assert written == count.to_bytes(4, "little") * 8
 

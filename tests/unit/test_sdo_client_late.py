@@ -1,4 +1,4 @@
-"""CO-023: replies that come late, against a server that is slow, loses requests and answers in order."""
+"""CO-023: late replies, with a server that is slow, loses requests and answers in order."""
 
 from __future__ import annotations
 
@@ -66,12 +66,12 @@ def test_probes_differ_from_what_is_outstanding_while_they_can_and_the_record_is
         asked.append(late.probe())
         late.unanswered(asked[-1])
     assert asked[:4] == list(PROBES)
-    assert asked[4:8] == list(PROBES)  # then the one asked longest ago
+    assert asked[4:8] == list(PROBES)  # then the oldest request
     assert len(late._outstanding) == MAX_OUTSTANDING
 
 
 class OrderlyServer:
-    """An SDO server that numbers the requests it gets, and answers each with its number, late, in order or never.
+    """An SDO server that numbers its requests, and answers each with its number, late, in order or never.
 
     Objects of subindex 0 are 4 bytes (the number), those of subindex 1 are 12 (the number three times), segmented.
     """
@@ -92,7 +92,7 @@ class OrderlyServer:
             reply = self.reply(request)
             if reply is None:
                 continue
-            # One frame behind the other: asyncio's timers of one instant go in no order.
+            # One frame after the other, because asyncio's timers of one instant have no order.
             self.last_s = max(self.last_s + 1e-6, loop.time() + self.random.random() ** 3 * self.delay_s)
             loop.call_at(self.last_s, self.end.peer.feed, CanFrame(0x585, reply))
 
@@ -126,7 +126,7 @@ OBJECTS = ((0x2000, 0), (0x2000, 1), (0x2001, 0), (0x2001, 1))
 def test_co023_a_value_is_never_older_than_its_request(
     seed: int, loss: float, delay_s: float, wanted: list[tuple[int, int]]
 ) -> None:
-    """Whatever the delays, an object comes with the number of a request made after it was asked for, whole."""
+    """Whatever the delays, an object has the number of a request sent after the call, complete."""
 
     async def main() -> int:
         ours, theirs = bus()
@@ -203,7 +203,7 @@ def test_co023_a_late_reply_that_comes_while_nothing_is_asked_makes_the_probe_ne
 
 
 def test_replies_that_come_all_at_once_after_a_stall_are_not_those_of_two_nodes() -> None:
-    """A node that stood still answers every request that it got meanwhile, also the one that is under way: CO-042 is not that."""
+    """A node that was blocked answers every request received meanwhile, also the current one: this is not CO-042."""
 
     async def main() -> None:
         ours, theirs = bus()

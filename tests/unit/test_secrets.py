@@ -1,4 +1,4 @@
-"""Secrets come from files and the environment: on a command line and in a URL they are refused, and nowhere repeated."""
+"""Secrets come from files and the environment: on a command line and in a URL they are refused, and no output repeats them."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ TEXT = st.text("abcdefghijklmnopqrstuvwxyz0123456789!$-_.", min_size=1, max_size
 def test_a_token_comes_from_a_file_or_the_environment(tmp_path: Path) -> None:
     secret = tmp_path / "token"
     secret.write_text("s3cret\nnot this\n")
-    for said in (f"@{secret}", WORD):  # what the environment says comes as it is
+    for said in (f"@{secret}", WORD):  # the environment's value is used unchanged
         assert Secret().convert(said, None, None) == WORD
     secret.write_text("")
     for missing in (f"@{secret}", f"@{tmp_path}/none"):
@@ -57,7 +57,7 @@ def test_the_environment_is_taken(name: str, monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_every_option_that_is_a_secret_is_one_of_these() -> None:
-    """A password option that takes its value as it is would be one more way in."""
+    """A password option that accepts its value directly would be a further exposure."""
     secret, plain = set(), set()
     for name in COMMANDS:
         found = cli.get_command(click.Context(cli), name)

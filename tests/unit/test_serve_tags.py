@@ -1,4 +1,4 @@
-"""The process image as Modbus TCP registers: what a client reads of good, bad and uncertain tags, and what it may write."""
+"""The process image as Modbus TCP registers: values of good, bad and uncertain tags, and permitted writes."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ TAGS = (
 
 
 class Writes:
-    """Takes writes and lets the test say how they end."""
+    """Accept writes and let the test decide how they end."""
 
     def __init__(self) -> None:
         self.asked: list[tuple[str, float, str]] = []
@@ -119,7 +119,7 @@ def test_a_bad_value_never_looks_good() -> None:
             assert word == Quality.BAD << 8 | Reason.TIMEOUT
             s.put("open", None, Quality.BAD, Reason.NEVER_READ)
             assert await s.code(lambda c: c.read_bits(1, "discrete", 9, 1)) == 4
-            assert (await s.client.read_registers(1, "input", 6, 1)).registers == (7,)  # the others live on
+            assert (await s.client.read_registers(1, "input", 6, 1)).registers == (7,)  # the others remain
             assert s.server.counters.bad == 3
 
     run(main())
@@ -132,7 +132,7 @@ def test_not_a_number_where_the_file_says_so() -> None:
             reply = await s.client.read_registers(1, "input", 0, 3)
             assert math.isnan(struct.unpack(">f", reply.raw[:4])[0])
             assert reply.registers[2] == Quality.BAD << 8 | Reason.STALE
-            s.put("count", 3, Quality.BAD, Reason.TIMEOUT)  # an integer has nothing that is no number
+            s.put("count", 3, Quality.BAD, Reason.TIMEOUT)  # an integer has no NaN
             assert await s.code(lambda c: c.read_registers(1, "input", 6, 1)) == 4
 
     run(main())

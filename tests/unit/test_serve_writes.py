@@ -1,4 +1,4 @@
-"""A client's write to a served tag, all the way: through the output writer's checks, onto the record, into the device."""
+"""A client's write to a served tag, from end to end: the output writer's checks, the audit log, the device."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def test_a_write_reaches_the_device_and_the_record_once(tmp_path: Path) -> None:
             asked, done = r.audit
             assert (asked["tag"], asked["new"], asked["result"], done["result"]) == ("d.level", 42, "asked", "done")
             assert asked["by"].startswith("127.0.0.1:")
-            r.cells.poke("holding", 0, 7)  # somebody at the device itself: a client's write is not written again
+            r.cells.poke("holding", 0, 7)  # a change at the device itself: a client's write is not repeated
 
             async def read_back() -> bool:
                 return (await r.client.read_registers(1, "holding", 0, 1)).registers == (7,)

@@ -1,4 +1,4 @@
-"""A run as a service: events from what changed, the journal's and JSON's form of them, and what systemd is told."""
+"""A run as a service: events from changes, their form in the journal and in JSON, and notifications to systemd."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def test_json_lines() -> None:
 
 
 def parsed(entry: bytes) -> dict[str, str]:
-    """A reader of the journal's native protocol, by its page."""
+    """A reader of the journal's native protocol, written from its specification."""
     fields = {}
     while entry:
         line, _, rest = entry.partition(b"\n")
@@ -142,7 +142,7 @@ def systemd(tmp_path: Path) -> Any:
 def test_systemd_is_told(systemd: socket.socket) -> None:
     environment = {"NOTIFY_SOCKET": systemd.getsockname(), "WATCHDOG_USEC": "3000000", "WATCHDOG_PID": str(os.getpid())}
     notifier = Notifier.from_environment(environment)
-    assert environment == {}  # no process that we start speaks in our name
+    assert environment == {}  # no child process sends notifications in our name
     assert notifier.watchdog_s == 3.0
     notifier.ready("up\nand running")
     notifier.alive("fine")

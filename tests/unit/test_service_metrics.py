@@ -1,4 +1,4 @@
-"""Metrics of a run: read back by Prometheus's own parser, from statuses as gateway and PLC give them, and over a real socket."""
+"""Metrics of a run: read back by Prometheus's own parser, from statuses of gateway and PLC, and over a real socket."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def seen(**changed: Any) -> Snapshot:
 
 
 def scraped(text: str) -> dict[tuple[str, frozenset[tuple[str, str]]], float]:
-    """Every sample by name and labels; that the parser takes it, and that none is there twice, is tested with it."""
+    """Return every sample by name and labels; this also tests that the parser accepts it, and that none occurs twice."""
     found: dict[tuple[str, frozenset[tuple[str, str]]], float] = {}
     for family in text_string_to_metric_families(text):
         for sample in family.samples:

@@ -1,4 +1,4 @@
-"""A shadow that comes again begins with what its store says of this plant: of no other, and of one log."""
+"""A restarted shadow begins with its store's data of this plant: of no other plant, and of one log."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ NOW_MS = 1_790_000_000_000
 
 
 def log(pressure: float, period_s: int, t_ms: int) -> list[Event]:
-    """What a plant told at that time: a value of before, one of then, and its state."""
+    """The plant's reports at that time: an older value, a current one, and its state."""
     return [
         Event(1, t_ms - 1000, Kind.VALUE, "ctd.pressure", -1.0),
         Event(2, t_ms, Kind.VALUE, "ctd.pressure", pressure),
@@ -28,7 +28,7 @@ def log(pressure: float, period_s: int, t_ms: int) -> list[Event]:
 
 
 def begins(folder: Path, logs: dict[str, tuple[str, list[Event]]]) -> tuple[int, object]:
-    """The period and the pressure that a shadow of the observatory begins with, whose store holds these logs of these systems."""
+    """Return the initial period and pressure of an observatory's shadow whose store holds these logs of these systems."""
 
     async def main() -> tuple[int, object]:
         store = await SqliteKnowledge.open(folder / "k.sqlite", offload=in_place)

@@ -1,4 +1,4 @@
-"""Signals over time: interpolation, gaps, ends, speed, memory; and the registers that they end up in."""
+"""Signals over time: interpolation, gaps, ends, speed, memory; and their register values."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Simulations: steps that fell due, inputs that hold from their own time on, and Python models that fail."""
+"""Simulations: due steps, inputs that take effect at their own time, and Python models that fail."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_a_tank_fills_by_what_flows_in() -> None:
     tank = simulation({"level": "level + inflow * dt", "twice": "2 * level"}, ("inflow",), level=1.0)
     assert tank.values(START)["level"] == 1.0
     tank.put("inflow", 2.0, at(1.05))
-    assert tank.values(at(1.05))["level"] == 1.0  # between two steps nothing moves
+    assert tank.values(at(1.05))["level"] == 1.0  # between two steps nothing changes
     assert tank.values(at(2.05))["level"] == pytest.approx(3.0)  # the step at 1.1 s was the first with it
     assert tank.values(at(2.05))["twice"] == pytest.approx(6.0)
 
@@ -50,7 +50,7 @@ def test_formulas_see_new_values_of_those_above_and_old_ones_of_those_below() ->
     st.lists(st.tuples(st.integers(0, 3_000), st.floats(-5, 5)), max_size=5),
 )
 def test_when_somebody_looks_changes_nothing(looks_ms: list[int], writes: list[tuple[int, float]]) -> None:
-    """The same writes at the same times: the same values, whoever asked in between."""
+    """The same writes at the same times give the same values, independent of other reads."""
 
     def run(looks: list[int]) -> float:
         made = simulation({"x": "x + (u - x) * dt + noise(0.1)"}, ("u",), x=1.0)

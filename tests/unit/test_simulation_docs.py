@@ -1,4 +1,4 @@
-"""What docs/simulation.md shows is what runs; and what a prototype file says of simulations is checked with its place."""
+"""The examples of docs/simulation.md run; and errors in the simulations of a prototype file are reported with their place."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Formulas of a simulation: what they mean, what they refuse, and that any text is one or the other."""
+"""Formulas of a simulation: their meaning, their errors, and that any text is either valid or refused."""
 
 from __future__ import annotations
 

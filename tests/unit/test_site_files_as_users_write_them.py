@@ -59,7 +59,7 @@ def site(tmp_path: Path) -> Path:
 
 
 def test_a_safe_value_may_be_the_name_that_the_profile_gives_it(site: Path) -> None:
-    """`safe: {mode: OFF}` was refused with "Input should be a valid integer", although the profile names 0 OFF."""
+    """Defect: `safe: {mode: OFF}` was refused with "Input should be a valid integer", although the profile names 0 OFF."""
     assert load_system(str(site)).devices["fan"].safe == {"mode": 0}
 
 
@@ -70,7 +70,7 @@ def test_an_unknown_name_of_a_safe_value_lists_the_names(site: Path) -> None:
 
 
 def test_a_safe_value_of_a_coil_may_be_false(site: Path) -> None:
-    """`safe: {run: false}` was refused with "Input should be a valid integer; got False"."""
+    """Defect: `safe: {run: false}` was refused with "Input should be a valid integer; got False"."""
     profile = site.parent / "fan.yaml"
     profile.write_text(profile.read_text().rstrip() + '\n  run: {at: "coil:0", type: bool, access: rw}\n')
     site.write_text(SYSTEM.replace("mode: OFF", "run: false").replace("writable: [", "writable: [run, "))
@@ -86,7 +86,7 @@ def test_true_is_no_safe_value_of_a_number(site: Path) -> None:
 
 
 def test_an_input_without_its_keys_names_the_keys(site: Path) -> None:
-    """`inputs: {level: fan.level}` was refused with "Input should be a valid dictionary or instance of InputForm"."""
+    """Defect: `inputs: {level: fan.level}` was refused with "Input should be a valid dictionary or instance of InputForm"."""
     text = SYSTEM.replace("inputs: {level: {tag: fan.level}}", "inputs: {level: fan.level}")
     assert text != SYSTEM
     site.write_text(text)
@@ -101,7 +101,7 @@ def test_a_value_that_fits_no_type_names_all_of_them(site: Path) -> None:
 
 
 def test_a_prototype_of_another_system_names_the_key(site: Path) -> None:
-    """`prototype_of: fan_system` was refused with "this is another system's prototype"."""
+    """Defect: `prototype_of: fan_system` was refused with "this is another system's prototype"."""
     prototype = site.with_name("fan_system.prototype.yaml")
     prototype.write_text(PROTOTYPE.replace("fan_system.yaml", "fan_system"))
     with pytest.raises(FileInvalid, match=r"`prototype_of` names a different system file; expected fan_system.yaml"):
@@ -114,7 +114,7 @@ def test_a_device_of_a_prototype_may_start_with_a_named_value(site: Path) -> Non
 
 
 def test_every_mistake_of_a_file_is_shown_with_its_line(site: Path) -> None:
-    """Only the first mistake was shown, with "1 more" after it."""
+    """Defect: only the first mistake was shown, with "1 more" after it."""
     text = (
         SYSTEM.replace("url:", "timeoutms: 3, url:")
         .replace("writable", "writeable")
@@ -145,7 +145,7 @@ def test_a_duration_has_a_unit(given: str, seconds: str) -> None:
 
 
 def test_a_duration_without_a_unit_is_refused() -> None:
-    """`--timeout 500` meant 500 seconds, without a word."""
+    """Defect: `--timeout 500` meant 500 seconds, without a message."""
     done = CliRunner().invoke(command, ["--timeout", "500"])
     assert done.exit_code == 2
     assert "'500' has no unit: write 500ms, 500s, 500m or 500h" in done.output

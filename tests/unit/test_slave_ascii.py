@@ -1,4 +1,4 @@
-"""ASCII lines and strictly timed RTU lines, character by character (rows 5, 7 and 70 of the edge case catalogue)."""
+"""ASCII lines and strictly timed RTU lines, character by character (rows 5, 7 and 70 of the list of edge cases)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from fieldtwin.gateway.core.endpoint import SerialSettings
 
 
 def framed(text: str) -> bytes:
-    """`text` (hex) as an ASCII frame: the LRC makes all bytes sum up to a multiple of 256."""
+    """Return `text` (hex) as an ASCII frame: the LRC makes the sum of all bytes a multiple of 256."""
     data = bytes.fromhex(text)
     return f":{data.hex()}{-sum(data) & 0xFF:02x}\r\n".upper().encode()
 

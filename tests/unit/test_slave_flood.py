@@ -1,4 +1,4 @@
-"""Floods of garbage through the servers' receivers: linear time, bounded memory, and a request behind it is answered.
+"""Floods of garbage through the servers' receivers: linear time, bounded memory, and a request after it is answered.
 
 1 MB of each kind; FIELDTWIN_FLOOD_MB=100 for more.
 """
@@ -26,14 +26,15 @@ from fieldtwin.gateway.core.endpoint import SerialSettings
 MEGABYTES = int(os.environ.get("FIELDTWIN_FLOOD_MB", "1"))
 CHUNK = 65536
 MEMORY = 1_000_000
-"""Bytes: some chunks' worth, whatever the flood's size."""
+"""Bytes: the size of some chunks, whatever the flood's size."""
 RTU_READ = bytes.fromhex("01 03 0000 0001 840A")
 LINE = SerialSettings()
 
 
 @contextlib.contextmanager
 def bounded_memory() -> Iterator[None]:
-    """To the byte for a small flood; for a big one, which would take too long so, by what the process grows."""
+    """Measure the memory to the byte for a small flood; for a large one, which would take too long, by the growth of the
+    process."""
     if MEGABYTES > 2:
         before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         yield
@@ -87,7 +88,7 @@ def test_a_line(kind: str, flood: str) -> None:
 
 
 def test_a_line_byte_by_byte() -> None:
-    """Trying every byte of a flood must not mean to try all of them again with each."""
+    """The receiver tries every byte of a flood, but must not try all of them again with each."""
     slave, request = make_line("rtu")
     data = next(garbage("random"))
     for i in range(len(data)):
@@ -107,7 +108,7 @@ def test_a_request_in_the_middle_of_a_flood_is_found() -> None:
 @pytest.mark.timeout(60 + MEGABYTES)
 @pytest.mark.parametrize("flood", ["random", "zeros", "ones", "protocol 1"])
 def test_a_stream(flood: str) -> None:
-    """Zeros are ADUs of length 0, each dropped for itself; the others make no sense at once."""
+    """Zeros are ADUs of length 0, each dropped separately; the others are invalid at once."""
     slave = MbapSlave(make_units())
     heard = bytes.fromhex("0001 0001 0006 01 03 0000 0001") * (CHUNK // 12)
     with bounded_memory():

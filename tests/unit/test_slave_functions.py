@@ -1,4 +1,4 @@
-"""The rarer functions of an emulated unit: 07, 0B, 0C, 14, 15, 18, 2B/0E, user-defined ones, hooks and being busy."""
+"""The rarer functions of an emulated unit: 07, 0B, 0C, 14, 15, 18, 2B/0E, device-specific ones, hooks and busy answers."""
 
 from __future__ import annotations
 
@@ -281,7 +281,7 @@ def test_identification_that_cannot_be() -> None:
             Identification({**BASIC, number: value})
 
 
-# -- a device's own ways ------------------------------------------------------------------------------------------
+# -- device-specific behaviour ------------------------------------------------------------------------------------------
 
 
 def test_functions_of_the_device_s_own() -> None:

@@ -1,4 +1,4 @@
-"""The emulated Modbus TCP server, ADU by ADU: rows 50 to 57 of the edge case catalogue."""
+"""The emulated Modbus TCP server, ADU by ADU: rows 50 to 57 of the list of edge cases."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The emulated line, byte by byte: rows of the edge case catalogue that are about RTU framing and several units."""
+"""The emulated line, byte by byte: rows of the list of edge cases about RTU framing and several units."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ BYTE_NS = 572_917  # 11 bits at 19200 baud
 
 
 def crc(frame: str) -> bytes:
-    """The check sum by its definition, bit by bit (SL 2.5.1.2): not the table that is tested."""
+    """The checksum by its definition, bit by bit (SL 2.5.1.2), and not by the table under test."""
     value = 0xFFFF
     data = bytes.fromhex(frame)
     for byte in data:
@@ -42,7 +42,7 @@ def make_slave(*unit_ids: int) -> RtuSlave:
 
 
 class Line:
-    """Feeds a slave as a line would: time passes with every byte."""
+    """Feed a server as a line would: time passes with every byte."""
 
     def __init__(self, slave: RtuSlave) -> None:
         self.slave = slave
@@ -66,7 +66,7 @@ class Line:
 
 
 def test_check_sums_of_others() -> None:
-    """Frames from elsewhere: the two examples that circulate in every Modbus manual."""
+    """Frames from other sources: the two examples in every Modbus manual."""
     assert crc("01 03 0000 000A") == bytes.fromhex("01 03 0000 000A C5CD")
     assert crc("11 03 006B 0003") == bytes.fromhex("11 03 006B 0003 7687")
     for frame in ("01 03 0000 000A C5CD", "11 03 006B 0003 7687"):
@@ -74,7 +74,7 @@ def test_check_sums_of_others() -> None:
         assert RtuReceiver(frozenset({1})).feed(data, 0) == [data]
 
 
-# What is on the line, and what has to be answered, by row.
+# Bytes on the line, and the required answers, by row.
 ROWS = [
     pytest.param(READ, [READ_REPLY], id="a request"),
     pytest.param(READ[:-1] + b"\x00", [], id="MB-001 bad CRC"),
@@ -149,14 +149,14 @@ def test_mb_004_half_a_request_a_pause_a_full_request(cut: int) -> None:
     long_request = crc("01 10 0000 0004 08 0001 0002 0003 0004")
     slave = make_slave()
     line = Line(slave).whole(long_request[:cut])
-    line.now_ns += PAUSE_NS  # nobody told of the pause: the next byte does
+    line.now_ns += PAUSE_NS  # the pause is only detected with the next byte
     line.whole(READ)
     assert line.replies == [READ_REPLY]
     assert slave.units[1].bank.read("holding", 0, 1, 0) == [0xAA]
 
 
 def test_mb_004_a_pause_too_short_to_be_seen_costs_no_more_than_the_gap() -> None:
-    """Half a long request and a full one in one breath: answered once the line pauses."""
+    """Half a long request and a complete one without a pause: answered after the line pauses."""
     line = Line(make_slave()).whole(crc("01 10 0000 0064 C8" + "00" * 200)[:40]).whole(READ)
     assert line.replies == []
     assert line.pause().replies == [READ_REPLY]
@@ -193,7 +193,7 @@ def test_mb_047_counters_are_true_to_the_wire() -> None:
     for data in (READ, crc("05 03 0000 0001"), crc("05 03 02 0000"), READ[:-1] + b"\x00", crc("00 06 0001 0001")):
         line.whole(data).pause()
     line.replies.clear()
-    # heard by 2 so far: a request to 1 and its reply, a request to 5 and its reply, a broadcast; now this one
+    # received by 2 so far: a request to 1 and its reply, a request to 5 and its reply, a broadcast; now this one
     assert line.whole(crc("02 08 000B 0000")).replies == [crc("02 08 000B 0006")]
     assert line.whole(crc("02 08 000C 0000")).replies[1:] == [crc("02 08 000C 0001")]
     assert line.whole(crc("02 08 000F 0000")).replies[2:] == [crc("02 08 000F 0001")]
@@ -257,7 +257,7 @@ def test_every_byte_is_accounted_for(chunks: list[tuple[bytes, int]], step: int)
     st.data(),
 )
 def test_the_cut_does_not_matter(frames: list[bytes], data: st.DataObject) -> None:
-    """Whatever chunks a run of frames comes in, the frames are the same."""
+    """The frames are the same for any division into chunks."""
     stream = b"".join(frames)
     receiver = RtuReceiver(frozenset({1}))
     found: list[bytes] = []
@@ -281,7 +281,7 @@ PIECES = st.one_of(
 
 @given(st.lists(PIECES, max_size=12), st.integers(1, 40))
 def test_the_cut_does_not_matter_in_noise_either(pieces: list[bytes], step: int) -> None:
-    """What is found in garbage, and what is counted as such, is the same in one piece and in many."""
+    """The frames found in garbage, and the bytes counted as such, are the same in one piece and in many."""
     data = b"".join(pieces)
     whole, cut = RtuReceiver(frozenset({1, 16})), RtuReceiver(frozenset({1, 16}))
     frames = whole.feed(data, 0) + whole.feed(b"", PAUSE_NS)

@@ -1,4 +1,4 @@
-"""The emulated unit, PDU by PDU: rows of the edge case catalogue that need no framing, and the examples of AP 6."""
+"""The emulated unit, PDU by PDU: rows of the list of edge cases that need no framing, and the examples of AP 6."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ def test_answer(request_hex: str, expected: str | None) -> None:
     assert ask(unit, request_hex) == expected
     if expected is None or int(expected[:2], 16) & 0x80:
         assert snapshot(bank) == before, "a refused request changed something"
-    # MB-034: whatever that was, the next request is answered
+    # MB-034: after any request, the next one is answered
     assert ask(unit, "03 00 6B 00 01") == "03 02 02 2B"
 
 
@@ -177,7 +177,7 @@ def test_limits_beyond_the_protocol_are_refused() -> None:
 
 
 def test_mb_041_a_veto_of_the_device_changes_nothing() -> None:
-    """A device that refuses a value in the middle of a write keeps all its registers."""
+    """A device that refuses a value in the middle of a write leaves all its registers unchanged."""
 
     def veto(table: Table, address: int, values: tuple[int, ...], now_ns: int) -> None:
         seen.append((table, address, values, now_ns))

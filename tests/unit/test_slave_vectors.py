@@ -52,7 +52,7 @@ def make_unit(even_only: bool) -> ModbusUnit:
 
 
 class Rig:
-    """Units on one wire, and the bytes that go over it."""
+    """Units on one wire, and the bytes on it."""
 
     def __init__(self, vector: dict[str, Any]) -> None:
         self.vector = vector
@@ -70,7 +70,7 @@ class Rig:
         return text.encode() if self.wire == "ascii" else bytes.fromhex(text)
 
     def feed(self, data: bytes, now_ns: int, piece: int) -> list[bytes]:
-        """Feed `data`, the last byte of which is there at `now_ns`, in pieces of `piece` bytes."""
+        """Feed `data`, whose last byte arrives at `now_ns`, in pieces of `piece` bytes."""
         if self.wire == "udp":
             assert isinstance(self.slave, MbapSlave)
             return [exchange.reply for exchange in self.slave.receive_datagram(data, now_ns) if exchange.reply]
@@ -83,7 +83,7 @@ class Rig:
         return said
 
     def play(self, piece: int, tail: bytes = b"") -> int:
-        """Play all steps; returns when the last one was over."""
+        """Run all steps; return the end of the last one."""
         now_ns = 0
         begin_ns = LONG_PAUSE_NS
         spoken = [step for step in self.vector["steps"] if step["hear"]]
@@ -110,7 +110,7 @@ class Rig:
             assert getattr(self.slave.counters, name) == value, name  # type: ignore[union-attr]
 
     def check_alive(self, now_ns: int) -> None:
-        """Whatever that was, a request after a pause is answered; on a closed connection nothing is."""
+        """After any input, a request after a pause is answered; on a closed connection nothing is."""
         requests = {
             "ascii": (b":010100000001FD\r\n", 13),
             "mbap": (bytes.fromhex("0042 0000 0006 01 01 0000 0001"), 10),
@@ -168,7 +168,7 @@ def test_with_trailing_garbage(vector: dict[str, Any], number: int) -> None:
 
 @pytest.mark.parametrize("vector", [v for v in VECTORS if v.get("wire") == "mbap" and not v.get("closed")], ids=ids)
 def test_with_half_an_adu_behind(vector: dict[str, Any]) -> None:
-    """A TCP stream has no garbage that can be told apart; what follows is the next request, whole later."""
+    """In a TCP stream garbage cannot be distinguished; the following bytes are the next request, delivered completely later."""
     following = bytes.fromhex("0099 0000 0006 01 01 0000 0001")
     for cut in range(1, len(following)):
         rig = Rig(vector)

@@ -1,4 +1,4 @@
-"""The adapter's side of slcan, byte for byte: commands as LAWICEL's manual has them, and whatever else may come."""
+"""The adapter's side of slcan, byte for byte: commands of LAWICEL's manual, and arbitrary other input."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ BEL = b"\a"
 
 
 class Adapter:
-    """A session on a bus of 125 kbit/s that takes what is sent, `room` frames of it."""
+    """A session on a bus of 125 kbit/s that accepts sent frames, up to `room` of them."""
 
     def __init__(self, opened: bool = True, room: int = 1000) -> None:
         self.session = SlcanSession(125_000)
@@ -50,9 +50,9 @@ class Adapter:
         (b"r6058\r", b"z\r", "605#R8"),
         (b"R000006050\r", b"Z\r", "00000605#R0"),
         (b"t1231AA1234\r", b"z\r", "123#AA"),  # a time stamp along with it
-        (b"t8000\r", BEL, None),  # no identifier of 11 bits
+        (b"t8000\r", BEL, None),  # not an 11-bit identifier
         (b"T200000000\r", BEL, None),
-        (b"t1239001122334455667788\r", BEL, None),  # a length code that is none here
+        (b"t1239001122334455667788\r", BEL, None),  # an invalid length code
         (b"t1232AA\r", BEL, None),
         (b"t1231AAA\r", BEL, None),
         (b"t12\r", BEL, None),
@@ -68,7 +68,7 @@ class Adapter:
         (b"X1\r", b"\r", None),
         (b"M00000000\r", b"\r", None),
         (b"mFFFFFFFF\r", b"\r", None),
-        (b"M00000001\r", BEL, None),  # a filter, which there is not
+        (b"M00000001\r", BEL, None),  # a filter, which is not supported
         (b"S4\r", BEL, None),  # while open
         (b"O\r", BEL, None),
         (b"?\r", BEL, None),
@@ -97,7 +97,7 @@ def test_commands_while_open(command: bytes, answer: bytes, frame: str | None) -
         (b"t1230\r", BEL),  # closed
         (b"F\r", BEL),
         (b"C\r", b"\r"),
-        (b"L\rt1230\r", b"\r" + BEL),  # listens only
+        (b"L\rt1230\r", b"\r" + BEL),  # listen-only
         (b"L\rC\rO\rt1230\r", b"\r\r\rz\r"),
         (b"Z1\r", b"\r"),
         (b"Z2\r", BEL),
@@ -122,7 +122,7 @@ def test_status_flags() -> None:
     adapter = Adapter()
     adapter.session.controller(overrun_frame())
     adapter.session.controller(violation_frame("bit", 8, 0))
-    assert adapter.say(b"F\rF\r") == b"F89\rF00\r"  # told once
+    assert adapter.say(b"F\rF\r") == b"F89\rF00\r"  # reported once
     for state, flags in zip(CanErrorState, (b"F00\r", b"F04\r", b"F24\r", b"FA4\r"), strict=True):
         adapter.session.controller(state_frame(state, 128, 0))
         assert adapter.say(b"F\rF\r") == 2 * flags  # a state lasts

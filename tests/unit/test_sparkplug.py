@@ -1,4 +1,4 @@
-"""Sparkplug B: our payloads and those of another implementation, and threads as messages of an edge node and a host."""
+"""Sparkplug B: our payloads and those of an independent implementation, and threads as messages of an edge node and a host."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_no_bytes_break_the_reader(data: bytes) -> None:
 @given(metrics=st.lists(METRICS, max_size=5), seq=st.integers(0, 255))
 @settings(max_examples=40)
 def test_another_implementation_reads_ours_and_we_read_its(metrics: list[Metric], seq: int) -> None:
-    """pysparkplug has the generated code of Eclipse Tahu's definition."""
+    """pysparkplug contains the generated code of Eclipse Tahu's definition."""
     theirs = pytest.importorskip("pysparkplug._protobuf", reason="no pysparkplug here").Payload()
     theirs.ParseFromString(encode_payload(Payload(7, tuple(metrics), seq)))
     assert (theirs.timestamp, theirs.seq, len(theirs.metrics)) == (7, seq, len(metrics))

@@ -1,7 +1,7 @@
-"""Operators, standard functions, conversions and blocks against a reference that was written from IEC 61131-3 by itself.
+"""Operators, standard functions, conversions and blocks against an independent reference written from IEC 61131-3.
 
-The reference knows nothing of the compiler: it computes on Python's integers, `decimal` and `struct`, by the clauses and tables
-that each test names. Where the standard leaves a result open, docs/plc.md says what it is here.
+The reference does not use the compiler: it computes with Python's integers, `decimal` and `struct`, by the clauses and tables
+that each test names. Where the standard leaves a result open, docs/plc.md defines it.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def limits(kind: str) -> tuple[int, int]:
 
 
 def kept(x: int, kind: str) -> int:
-    """`x` in the width of `kind`: two's complement."""
+    """Return `x` in the width of `kind`: two's complement."""
     low, high = limits(kind)
     return (x - low) % (high - low + 1) + low
 
@@ -52,7 +52,7 @@ def _program(result: str, expression: str, kinds: tuple[str, ...]) -> StProgram:
 
 
 def worked_out(result: str, expression: str, *given_values: tuple[str, Any]) -> Any:
-    """`expression` of x0, x1, ... with these kinds and values."""
+    """Evaluate `expression` of x0, x1, ... with these kinds and values."""
     made = _program(result, expression, tuple(kind for kind, _ in given_values))
     for n, (_, given_value) in enumerate(given_values):
         setattr(made.st_body, f"v_x{n}", given_value)
@@ -88,7 +88,7 @@ def test_integers(data: st.DataObject, kind: str, op: str) -> None:
 
 
 def _quotient(a: int, b: int) -> int:
-    """Truncated towards zero: the largest whole number of times that b fits into a, with the sign of the exact quotient."""
+    """Truncate towards zero: the largest whole number of times that b fits into a, with the sign of the exact quotient."""
     q = abs(a) // abs(b)
     return q if (a >= 0) == (b >= 0) else -q
 
@@ -348,8 +348,8 @@ def test_blocks_do_what_the_standard_draws(steps: list[tuple[bool, bool, bool, b
     body = made.st_body
     body.v_pt, body.v_pv = pt * 1_000_000, pv
     at = 0
-    on_since: int | None = None  # since when IN is true, as scans saw it
-    off_since: int | None = None  # since when it is false after having been true
+    on_since: int | None = None  # the time since IN is true, as seen by scans
+    off_since: int | None = None  # the time since it is false after having been true
     pulse_since: int | None = None
     before = before_d = shown = False
     before_i_for_fall = False

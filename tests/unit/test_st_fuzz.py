@@ -1,6 +1,6 @@
-"""Structured Text that nobody meant: random tokens, mutated programs, expressions of any types, what is huge.
+"""Unintended Structured Text: random tokens, mutated programs, expressions of any types, very large programs.
 
-Whatever it is, compiling gives a program or `FileInvalid` with line and column, in bounded time; running it, nothing but
+For any input, compiling gives a program or `FileInvalid` with line and column, in bounded time; running it raises only
 `LogicError`.
 """
 
@@ -55,7 +55,7 @@ quick = settings(max_examples=25, deadline=None, suppress_health_check=list(Heal
 
 
 def survives(text: str, scans: int = 2) -> str:
-    """Compile it and run its programs. Returns what became of it."""
+    """Compile it and run its programs. Return the result."""
     try:
         unit = compile_text(text, "fuzz.st")
         programs = [program_class(unit, p.name)() for p in unit.programs]
@@ -100,7 +100,7 @@ def test_mutated_programs(chance: random.Random, text: str) -> None:
         else:
             other = chance.randrange(len(words))
             words[at], words[other] = words[other], words[at]
-    survives(" ".join(words), scans=0)  # it may have become a loop without an end
+    survives(" ".join(words), scans=0)  # the mutation may have made an endless loop
 
 
 @given(st.text(max_size=60))
@@ -162,7 +162,7 @@ LIMITS = {
 @given(st.lists(st.tuples(st.sampled_from([*VARIABLES, "a[i]", "w.3", "i.15"]), expressions), min_size=1, max_size=4))
 @settings(quick, max_examples=60)
 def test_expressions_of_any_types(assigned: list[tuple[str, str]]) -> None:
-    """What runs leaves each variable a value of its type."""
+    """Each variable has a value of its type after the run."""
     good = [f"{name} := {code};" for name, code in assigned if _compiles(f"{name} := {code};")]
     made = program_class(compile_text(DECLARED + "\n".join(good) + "\nEND_PROGRAM", "fuzz.st"))()
     try:
@@ -187,7 +187,7 @@ def _compiles(statement: str) -> bool:
     return survives(DECLARED + statement + "\nEND_PROGRAM", scans=0) != "refused"
 
 
-# -- what is huge -----------------------------------------------------------------------------------------------------
+# -- very large programs -------------------------------------------------------------------------------------------------
 
 P = "PROGRAM p VAR i : INT; l : LREAL; b : BOOL; q : ARRAY[0..9] OF INT; END_VAR\n"
 BY_COUNT = "TYPE s0 : STRUCT a : INT; END_STRUCT; END_TYPE\n" + "\n".join(
@@ -239,7 +239,7 @@ def test_what_is_huge_is_refused_or_runs(what: str) -> None:
 
 
 def test_long_chains_go_the_right_way() -> None:
-    """ELSIF and CASE with more branches than Python nests: each is taken, and the ELSE."""
+    """ELSIF and CASE with more branches than Python can nest: each one is taken, and the ELSE."""
     cases = " ".join(f"{3 * n}, {3 * n + 1}: r := {n};" for n in range(200))
     branches = "".join(f"ELSIF n = {n} THEN e := {n}; " for n in range(200))
     text = f"IF FALSE THEN ; {branches}ELSE e := -1; END_IF; CASE n OF {cases} ELSE r := -1; END_CASE"

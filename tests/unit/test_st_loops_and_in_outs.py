@@ -1,7 +1,8 @@
-"""FOR and VAR_IN_OUT: what the control variable is after a loop, what may not alter it, and variables that are handed over.
+"""FOR and VAR_IN_OUT: the control variable after a loop, statements that must not change it, and variables passed by
+reference.
 
-An assignment to the control variable was ignored, two nested loops could share one, a loop that did not run left it untouched
-and after ``1 TO 10`` it was 10. A variable that was handed over twice was copied in and out, so that one result was lost.
+Defects: an assignment to the control variable was ignored, two nested loops could share one, a loop that did not run left it
+unchanged and after ``1 TO 10`` it was 10. A variable that was passed twice was copied in and out, so that one result was lost.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ def test_the_control_variable_after_the_loop() -> None:
     def after(loop: str) -> object:
         return run("i : INT := 77; k : INT;", loop)["i"]
 
-    assert after("FOR i := 1 TO 10 DO ; END_FOR") == 11  # so that IF i > 10 tells that nothing was found
+    assert after("FOR i := 1 TO 10 DO ; END_FOR") == 11  # so that IF i > 10 shows that nothing was found
     assert after("FOR i := 5 TO 1 DO ; END_FOR") == 5
     assert after("FOR i := 1 TO 10 DO IF i = 4 THEN EXIT; END_IF; END_FOR") == 4
     assert after("FOR i := 1 TO 10 DO IF i >= 10 THEN EXIT; END_IF; END_FOR") == 10

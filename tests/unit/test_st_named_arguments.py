@@ -1,8 +1,8 @@
 """Arguments of standard functions, functions and function blocks by their names (IEC 61131-3, 6.6.1.4 and 6.6.2.5).
 
-The named arguments of standard functions were taken by their position and their names were never looked at, so that
-``LIMIT(MX := 10, IN := 5, MN := 0)`` gave 0. Every function of the library needs a row in `SAMPLES`: its parameters as the
-standard names them, and a result that was worked out by hand.
+Defect: the named arguments of standard functions were used by their position and their names were ignored, so that ``LIMIT(MX
+:= 10, IN := 5, MN := 0)`` gave 0. Every function of the library needs a row in `SAMPLES`: its parameters as the standard names
+them, and a result that was computed by hand.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ WITH_A_VARIABLE = {
     "MSG_COUNT": ["BOX"], "MSG_AT": ["BOX", "I"], "MSG_TIME": ["BOX", "I"], "MSG_ROOM": ["BOX"], "MSG_MAX": ["BOX"],
     "MSG_SEND": ["BOX", "TEXT", "T"], "IS_GOOD": ["IN"],
 }  # fmt: skip
-"""Functions of this PLC that ask for an input or a mailbox of the program."""
+"""Functions of this PLC that refer to an input or a mailbox of the program."""
 ALL = {**SAMPLES, **CONVERSIONS}
 
 

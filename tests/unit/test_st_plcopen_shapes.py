@@ -1,4 +1,4 @@
-"""Exports in the shapes that CODESYS, OpenPLC Editor and Beremiz write run as they are (the samples are our own)."""
+"""Exports in the forms of CODESYS, OpenPLC Editor and Beremiz run unchanged (the samples are our own)."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_codesys_qualified_globals_and_enumerations_behind_the_vendors_additions
         scan(made, number)
         seen.append((made.valve, made.eMode))
     assert seen == [(True, 10)] * 2 + [(False, 0)] * 5  # in scan 3 the level has been above the ramp for 20 ms
-    assert made.st_body.v_stext == "GVL.x"  # a text stays as it is
+    assert made.st_body.v_stext == "GVL.x"  # a text is not changed
     assert made.variables["eMode"].words == ((0, "Idle"), (10, "Filling"))
 
 

@@ -1,4 +1,4 @@
-"""The relay in Structured Text does what the one in Python does: the same trace on the same seeds."""
+"""The relay in Structured Text behaves like the one in Python: the same trace with the same seeds."""
 
 from __future__ import annotations
 
@@ -43,13 +43,14 @@ def test_same_seed_same_trace(seed: int) -> None:
             if name in MAILBOXES:
                 ours, theirs = (ours.pending, ours.waits), (theirs.pending, theirs.waits)
             assert ours == theirs, (number, name)
-    assert python.logged > 1000  # so that the log went round, and entries were lost
+    assert python.logged > 1000  # so that the log wrapped, and entries were lost
     assert python.dropped > 100
     assert python.bad_commands > 10
 
 
 def hash_of(source: str, folder: Path, seed: int) -> tuple[str, int, list[str]]:
-    """The observatory in virtual time with this relay: the hash of all frames, values and states, how many, and the states."""
+    """Run the observatory in virtual time with this relay; return the hash of all frames, values and states, their number, and
+    the states."""
     folder.mkdir()
     for file in SYSTEMS.glob("observatory*.yaml"):
         text = file.read_text(encoding="utf-8")

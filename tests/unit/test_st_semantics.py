@@ -1,4 +1,4 @@
-"""What Structured Text means at its edges: copies and references, order and scope, names, conversions, strings, times."""
+"""Structured Text in edge cases: copies and references, order and scope, names, conversions, strings, times."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def test_a_whole_array_or_structure_assigned_through_an_in_out_reaches_the_calle
     got = run("p, q : Point; b, c : ARRAY[1..2] OF INT; clr : Clear; r : INT;", body, before)
     assert (got["r"], got["p"].m_x, got["q"].m_x) == (2, 2, 1)
     assert (got["p"].m_a, got["q"].m_a) == ([22, 0], [11, 0])
-    assert (got["b"], got["c"]) == ([22, 99], [0, 0])  # b is a copy of p.a: 99 stays its own
+    assert (got["b"], got["c"]) == ([22, 99], [0, 0])  # b is a copy of p.a: 99 remains in b
 
 
 def test_the_same_variable_as_two_in_outs() -> None:
@@ -122,7 +122,7 @@ def test_constants_may_size_arrays_and_be_initial_values() -> None:
       q := a[n]; END_FUNCTION_BLOCK
     PROGRAM p VAR CONSTANT n : INT := 2 * 2; top : INT := n + 1; END_VAR
     VAR a : ARRAY[0..top] OF INT; t : Table; x : INT := top; f1 : F; END_VAR a[n] := 7; f1(); t[rows, 2] := 3; END_PROGRAM"""
-    with pytest.raises(FileInvalid):  # how often a value is repeated is a number
+    with pytest.raises(FileInvalid):  # the repetition count of a value is a number
         program(text)
     made = program(text.replace("n(4)", "3(4)"))
     scan(made)
@@ -204,7 +204,7 @@ def test_refused_where_it_stands(text: str, line: int, column: int, told: str) -
         ("BYTE", "SHL(BYTE#16#81, 1)", 2), ("BYTE", "SHR(BYTE#16#81, 1)", 0x40), ("BYTE", "ROL(BYTE#16#81, 1)", 3),
         ("BYTE", "ROR(BYTE#16#81, 1)", 0xC0), ("BYTE", "SHL(BYTE#1, 8)", 0), ("BYTE", "ROL(BYTE#1, 9)", 2),
         ("WORD", "NOT WORD#16#00FF", 0xFF00), ("BYTE", "BYTE#16#F0 XOR BYTE#16#FF", 0x0F), ("WORD", "BYTE#16#FF", 0xFF),
-        # strings: positions from 1; what is outside is not there
+        # strings: positions from 1; positions outside do not exist
         ("STRING", "LEFT('ASTR', 3)", "AST"), ("STRING", "LEFT('ab', 9)", "ab"), ("STRING", "LEFT('ab', -1)", ""),
         ("STRING", "RIGHT('ASTR', 3)", "STR"), ("STRING", "RIGHT('ab', 0)", ""), ("STRING", "RIGHT('ab', 9)", "ab"),
         ("STRING", "MID('ASTR', 2, 2)", "ST"), ("STRING", "MID('ab', 5, 2)", "b"), ("STRING", "MID('ab', 1, 9)", ""),
@@ -228,7 +228,7 @@ def test_refused_where_it_stands(text: str, line: int, column: int, told: str) -
         ("DT", "DT#2024-02-28-23:59:59 + T#1s", 1_709_164_800 * 10**9),
         ("TIME", "D#2024-03-01 - D#2024-02-28", 2 * 86_400 * 10**9),
         ("TIME", "TOD#06:00 - TOD#05:30", 1800 * 10**9), ("DATE", "DT_TO_DATE(DT#2024-02-29-12:00:00)", 1_709_164_800 * 10**9),
-        # choice
+        # selection
         ("INT", "SEL(FALSE, 1, 2)", 1), ("INT", "MUX(2, 10, 20, 30)", 30), ("INT", "LIMIT(0, 7, 5)", 5),
         ("INT", "MAX(1, 9, 4)", 9),
         ("LREAL", "SEL(TRUE, 1.0, 2.0) * 2.0", 4.0), ("LREAL", "MAX(1.5, 2.5) + SQRT(4.0)", 4.5), ("LREAL", "-SQRT(4)", -2.0),

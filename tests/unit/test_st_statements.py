@@ -1,4 +1,4 @@
-"""Statements, POUs and types of Structured Text, and what is refused with line and column."""
+"""Statements, POUs and types of Structured Text, and errors with line and column."""
 
 from __future__ import annotations
 
@@ -207,7 +207,7 @@ def test_an_alarm_outlives_a_restart_and_its_delay_counts_anew() -> None:
         scan(made, number)
     again.restore(msgspec.msgpack.decode(msgspec.msgpack.encode(made.retained())))
     raised = []
-    for number in range(1, 6):  # the new process's clock began anew
+    for number in range(1, 6):  # the new process's clock started again
         scan(again, number)
         raised.append(again.st_body.v_a.QH)
     assert raised == [False, False, False, True, True]

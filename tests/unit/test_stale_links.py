@@ -1,7 +1,7 @@
-"""The link of a killed emulator leads to whichever terminal the kernel gives its number to next.
+"""The link of a killed emulator leads to whichever terminal gets its number from the kernel next.
 
-Observed: two tests in a hundred runs of the suite found their new virtual serial port locked. A gateway whose emulator had been
-killed had followed its link, and would have sent its requests to a stranger's terminal.
+Defect: two tests in a hundred runs of the suite found their new virtual serial port locked. A gateway whose emulator had been
+killed had followed its link, and would have sent its requests to a foreign terminal.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What is started whole or not at all."""
+"""Resources that are started completely or not at all."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from fieldtwin.gateway.core.errors import Unreachable
 
 
 class Parts(Started):
-    """Notes what it does. `fails` names the part that does not begin, or ``stop``."""
+    """Record its actions. `fails` names the part that does not start, or ``stop``."""
 
     def __init__(self, fails: str = "") -> None:
         super().__init__()

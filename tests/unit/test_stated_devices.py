@@ -1,5 +1,5 @@
-"""What a profile states about a slave: its cells, what reading and writing them does, functions without registers, and how busy
-it is. Of a device of which nothing is recorded, and of one that answers from a recording."""
+"""Server properties in a profile: its cells, side effects of reading and writing them, functions without registers, and busy
+times. Tested on a device without a recording, and on one that answers from a recording."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def ask(unit: ModbusUnit, request: str, now_ns: int = 0) -> str:
         ("10 0000 0002 04 00000001", "1000000002"),
         ("16 0002 00F2 0025", "16000200f20025"),
         ("17 000A 0001 0002 0001 02 0009", "17020003"),
-        ("0F 0007 0001 01 01", "8f01"),  # it has no such function
+        ("0F 0007 0001 01 01", "8f01"),  # the function does not exist
         ("11", "1103746bff"),
         ("14 07 06 0004 0000 0002", "140605060000" + "0000"),
         ("18 04DE", "180006000201b81284"),
@@ -154,7 +154,7 @@ def test_a_recorded_device_does_what_its_profile_states(tmp_path: Path) -> None:
     assert ask(unit, "65") == "e501"
     assert ask(unit, "08 000E 0000") == "08000e0008", "true to this wire, not to the recorded one"
     assert ask(unit, "08 000D 0000") == "08000d0001"
-    assert ask(unit, "0B") == "0b00000008"  # carried out: all but the exception
+    assert ask(unit, "0B") == "0b00000008"  # executed, except the exception
     assert ask(unit, "08 0004 0000") == ""
     assert ask(unit, "03 000A 0001") == "", "listen-only"
     assert ask(unit, "08 0001 0000") == ""

@@ -1,5 +1,5 @@
-"""The silence before a request on an RTU line can be stated: above 19200 baud, the recommended 1.75 ms limits a bridge to 571
-requests/s, while a device that counts 3.5 characters needs 0.3 ms at 115200 baud. Nothing could shorten it before."""
+"""The silence before a request on an RTU line can be configured: above 19200 baud, the recommended 1.75 ms limits a bridge to
+571 requests/s, while a device that counts 3.5 characters needs 0.3 ms at 115200 baud. Before, it could not be shortened."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""A run directory that another user created first is refused, by whoever runs an instance and by whoever asks one.
+"""A run directory that a different user created first is refused, both when an instance runs and when one is queried.
 
-Before, only the owner of the instance's own directory was checked: another user who had created /tmp/fieldtwin-UID could replace
-the directories in it, and the control channels with them.
+Defect: only the owner of the instance's own directory was checked. Another user who had created /tmp/fieldtwin-UID could
+replace the directories in it, and the control channels with them.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Systems, prototypes and instances: what the shipped ones hold, how they are found, and one name that runs once."""
+"""Systems, prototypes and instances: the shipped ones, how they are found, and unique instance names."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_the_prototype_maps_every_bus_and_the_plant_never_needs_it(tmp_path: Pat
     assert set(prototype.devices) == set(system.devices)
     alone = tmp_path / "observatory.yaml"
     alone.write_bytes(system.path.read_bytes())
-    assert load_system(str(alone)).hash == system.hash  # without a prototype file beside it
+    assert load_system(str(alone)).hash == system.hash  # without a prototype file next to it
     with pytest.raises(FileInvalid, match=r"observatory\.prototype\.yaml"):
         load_prototype(load_system(str(alone)))
 
@@ -92,7 +92,7 @@ def test_an_instance_runs_once_and_leaves_its_name_free(tmp_path: Path) -> None:
         assert first.dir.stat().st_mode & 0o777 == 0o700
         with pytest.raises(EndpointBusy, match="running already"), Instance("one", tmp_path):
             pass
-        with Instance("two", tmp_path):  # another one beside it
+        with Instance("two", tmp_path):  # a second one next to it
             pass
     with Instance("one", tmp_path):
         pass

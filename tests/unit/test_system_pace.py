@@ -1,4 +1,4 @@
-"""The pace that a system file states, what it takes from profiles, and what is refused."""
+"""The timing keys of a system file, defaults from profiles, and refused values."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def test_everything_that_a_bus_may_state(tmp_path: Path) -> None:
     assert gateway_config(s, allow_writes=False).buses["line1"].strict
     prototype = gateway_config(s, allow_writes=False, free_ports=True).buses["line1"]
     assert prototype.echo  # its emulators echo too
-    assert not prototype.strict  # a virtual port's silences say nothing
+    assert not prototype.strict  # silences on a virtual port have no meaning
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""A gateway that dies between taking a command and acknowledging it: its successor acknowledges, and hands nothing on twice."""
+"""A gateway that dies between taking a command and acknowledging it: its successor acknowledges, and passes nothing on twice."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ POLL = {"inbox": 20}
 
 
 class Life:
-    """One life of a gateway's side of a modem. `taken`: what the control logic was handed and consumed."""
+    """One life of a gateway's side of a modem. `taken`: the messages that the control logic received and consumed."""
 
     def __init__(self, pump: MailboxPump, field: FieldBus) -> None:
         self.pump = pump
@@ -41,7 +41,7 @@ class Life:
         self.taken += [item.data for item in self.pump.inbox.drain()]
 
     async def offered(self) -> None:
-        """Something came, for the control logic."""
+        """A message for the control logic arrived."""
         await eventually(lambda: bool(self.pump.inbox.queue))
 
     async def acknowledged(self) -> None:
@@ -78,7 +78,7 @@ async def life(modems: ModemPair, folder: Path, *, writes: bool, file: TakenFile
 
 
 async def command(modems: ModemPair, payload: bytes) -> None:
-    """The far end sends it."""
+    """The remote client sends it."""
     drivers: list[TransmitterDriver] = []
 
     def make(tags: TagTable) -> list[TransmitterDriver]:
@@ -110,14 +110,14 @@ def test_a_command_that_was_consumed_is_not_handed_on_again(tmp_path: Path, kept
         if not kept:
             (tmp_path / "taken.json").unlink()
         async with life(modems, tmp_path, writes=True) as second:
-            if not kept:  # at least once is what there is without it
+            if not kept:  # without it, at-least-once is the only guarantee
                 await second.offered()
                 second.consume()
                 assert second.taken == [b"\0\7"]
             await second.acknowledged()
             second.consume()
             assert second.taken == ([] if kept else [b"\0\7"])
-            await command(modems, b"\0\7")  # the same again is another one
+            await command(modems, b"\0\7")  # the same bytes again are a new message
             await second.offered()
         assert TakenFile(tmp_path / "taken.json").of("modem") == b"", "what is acknowledged is forgotten"
 
@@ -132,7 +132,7 @@ def test_a_command_that_nobody_consumed_is_handed_on(tmp_path: Path) -> None:
             await first.offered()
             first.tick()
             first.consume()
-            first.tick(consumed=False)  # it was handed to the process image, and no program looked there yet
+            first.tick(consumed=False)  # it is in the process image, and no program has read it yet
             await asyncio.sleep(0)
         async with life(modems, tmp_path, writes=True) as second:
             await second.offered()
@@ -141,7 +141,7 @@ def test_a_command_that_nobody_consumed_is_handed_on(tmp_path: Path) -> None:
 
 
 def test_what_was_taken_from_a_modem_that_began_anew_is_of_no_account(tmp_path: Path) -> None:
-    """Its first message has the number and the words of the first one before: it is another command."""
+    """Its first message has the number and the content of the first one before: it is a new command."""
 
     async def main() -> None:
         before, after = modem_pair(), modem_pair()
@@ -153,7 +153,7 @@ def test_what_was_taken_from_a_modem_that_began_anew_is_of_no_account(tmp_path: 
         assert TakenFile(tmp_path / "taken.json").of("modem")
         async with life(after, tmp_path, writes=True) as second:
             second.tick()
-            second.field.unplug()  # it comes while nobody looks
+            second.field.unplug()  # it comes while no gateway polls
             await command(after, b"\0\7")
             second.field.plugged = True
             await second.offered()

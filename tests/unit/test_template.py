@@ -1,4 +1,4 @@
-"""Digital templates: what is packed, that the same is packed the same, and how two are compared."""
+"""Digital templates: their content, reproducible packing, and comparison."""
 
 from __future__ import annotations
 
@@ -170,7 +170,8 @@ def contents(path: Path) -> dict[str, Content]:
 
 @pytest.mark.long
 def test_diff_compares_an_edited_folder_with_the_template_that_it_was_unpacked_from(good: Path, tmp_path: Path) -> None:
-    """`template diff` refused a folder as soon as one of its files was edited, which is what a user wants to compare."""
+    """Defect: `template diff` refused a folder as soon as one of its files was edited, although users want to compare edited
+    folders."""
     folder = tmp_path / "work"
     unpack_zip(good, folder)
     assert fieldtwin(tmp_path, "template", "diff", str(good), str(folder)).returncode == 0
@@ -217,7 +218,7 @@ def test_the_zip_says_what_it_is_made_of(good: Path) -> None:
 
 @pytest.mark.parametrize("first", [True, False])
 def test_a_damaged_template_is_not_equal_to_a_whole_one(dam: Path, tmp_path: Path, first: bool) -> None:
-    """Its manifest is the same: only its bytes say so."""
+    """Its manifest is the same: only its bytes differ."""
     packed(dam, tmp_path / "T.zip")
 
     def change(files: dict[str, bytes]) -> None:
@@ -234,7 +235,7 @@ def test_a_damaged_template_is_not_equal_to_a_whole_one(dam: Path, tmp_path: Pat
     "place", ["fieldtwin/plc/backdoor.py", "backdoor.py", "backdoor.pth", "fieldtwin/plc/scan.pyc"]
 )
 def test_the_wheel_in_a_template_is_the_software_that_its_manifest_names(dam: Path, tmp_path: Path, place: str) -> None:
-    """Of a stranger's: the hash of the file says that it is the file that was packed, and no more."""
+    """In an untrusted template: the hash of the file only proves that it is the file that was packed."""
     wheel = tmp_path / "fieldtwin-9.9-py3-none-any.whl"
     with zipfile.ZipFile(wheel, "w") as archive:
         for parent, _, files in os.walk(CHECKOUT / "fieldtwin", followlinks=True):

@@ -1,4 +1,5 @@
-"""Every verb that would run something of a stranger's template, or open what its prototype says, asks before; in one place."""
+"""Every command that would run code of an untrusted template, or open a resource named by its prototype, asks first; in one
+place."""
 
 from __future__ import annotations
 
@@ -25,7 +26,7 @@ SCENARIO = "scenario: the tilt\nsystem: SYSTEM\nsteps:\n  - pause: 1s\n"
 
 
 class Site:
-    """An unpacked template of a stranger's: its control logic leaves a mark, and its prototype would open the plant's bus."""
+    """An unpacked untrusted template: its control logic leaves a mark, and its prototype would open the plant's bus."""
 
     def __init__(self, folder: Path) -> None:
         own = own_system(folder / "site")
@@ -57,7 +58,7 @@ def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
 
 
 def fieldtwin(*words: object) -> Result:
-    """Our command line, with nobody at a terminal."""
+    """Our command line, without a user at a terminal."""
     return CliRunner().invoke(cli, [str(word) for word in words], standalone_mode=False)
 
 
@@ -189,7 +190,7 @@ def test_what_lies_deeper_or_is_found_by_name_or_is_only_the_prototype_is_a_stra
 
 
 def test_code_from_elsewhere_that_an_unpacked_template_names_is_asked_about(site: Site, tmp_path: Path) -> None:
-    """Nothing that was packed does so; what was changed since may."""
+    """No packed file does so; a file changed since then may."""
     for name in CODE:
         (site.folder / name).unlink()
     told: list[Stranger] = []

@@ -1,4 +1,4 @@
-"""What of a template is somebody's program or opens something here: named, and asked about before it runs."""
+"""Parts of a template that are programs or open local resources are named, and the user is asked before they run."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_without_a_terminal_the_answer_is_no_and_trust_says_yes(dam: Path, tmp_p
 
 
 def test_a_simulation_in_python_is_packed_and_asked_about_as_well(dam: Path, tmp_path: Path) -> None:
-    """What emulates a device is the stranger's program, too."""
+    """The code that emulates a device also belongs to the template's author."""
     (dam.parent / "hill.py").write_text(
         "import slope\n\nclass Hill:\n    def step(self, t_s, dt_s, inputs):\n        return {}\n"
     )

@@ -1,4 +1,4 @@
-"""A stranger's template harms nobody: wrong hashes, paths outside, links, bombs, damage."""
+"""An untrusted template causes no harm: wrong hashes, paths outside, links, bombs, damage."""
 
 from __future__ import annotations
 
@@ -229,7 +229,7 @@ def test_another_model_than_the_systems_is_found(dam: Path, tmp_path: Path) -> N
 def test_a_template_means_its_own_files_whatever_else_there_is(
     dam: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A bare name in a template is not looked up in FIELDTWIN_PROFILES, here, or among what is shipped."""
+    """A bare name in a template is not looked up in FIELDTWIN_PROFILES, in the working directory, or among the shipped files."""
     dam.write_text(dam.read_text().replace("../devices/tilt.yaml", "inclinometer-cia410"))
     packed(dam, tmp_path / "T")
     other = tmp_path / "other" / "devices"

@@ -56,7 +56,7 @@ async def until_equal(one: Twin, other: Twin, within_s: float, loop: VirtualLoop
 
 
 class LateListening(Carrier):
-    """`TcpListening.start`, when the first link is wanted."""
+    """Call `TcpListening.start` when the first link is requested."""
 
     name = "listening"
 
@@ -115,7 +115,7 @@ SYSTEM = Path(__file__).resolve().parents[2] / "profiles" / "systems" / "observa
 
 @asynccontextmanager
 async def modems(net: MemoryNet, clock: VirtualClock, seed: int, **worse: float) -> Any:
-    """The observatory's modems and their link in memory; carriers for both ends. `worse`: as of `far_link`."""
+    """The observatory's modems and their link in memory; carriers for both ends. `worse`: changes to `far_link`."""
     system = load_system(str(SYSTEM))
     prototype = replace(load_prototype(system), seed=seed)
     modem = prototype.devices["modem"]
@@ -137,7 +137,7 @@ async def modems(net: MemoryNet, clock: VirtualClock, seed: int, **worse: float)
 
 @pytest.mark.parametrize("worse", [{}, {"lost": 0.2, "repeated": 0.1, "overtakes": 0.1}])
 def test_over_the_modems_of_the_reference_system_both_logs_are_equal(tmp_path: Path, worse: dict[str, float]) -> None:
-    """64 bytes a message, 400 bytes a second, 200 ms on the way; and modems that do not send again what they lose."""
+    """64 bytes per message, 400 bytes a second, a delay of 200 ms; and modems that do not repeat lost messages."""
 
     async def main(loop: VirtualLoop, clock: VirtualClock, net: MemoryNet) -> None:
         async with modems(net, clock, 3, **worse) as (near, far):
@@ -166,7 +166,7 @@ def test_over_the_modems_of_the_reference_system_both_logs_are_equal(tmp_path: P
 
 @pytest.mark.parametrize("over", ["tcp", "modems"])
 def test_another_twin_with_an_empty_store_is_given_what_the_first_one_had(tmp_path: Path, over: str) -> None:
-    """Over TCP there is a new link; the plant's modem does not know that somebody else listens at the other end."""
+    """Over TCP there is a new link; the plant's modem does not know that a different program listens at the other end."""
 
     async def main(loop: VirtualLoop, clock: VirtualClock, net: MemoryNet) -> None:
         async def served(near: Callable[[], Carrier], far: Callable[[], Carrier]) -> None:
@@ -195,7 +195,7 @@ def test_another_twin_with_an_empty_store_is_given_what_the_first_one_had(tmp_pa
 def test_towards_the_plant_a_shadow_puts_acknowledgements_and_questions_and_nothing_else(
     tmp_path: Path, over: str
 ) -> None:
-    """SPEC ruling 16: a capture holds no COMMAND and nothing of DTtoPT; with loss, deaths and all."""
+    """SPEC ruling 16: a capture holds no COMMAND and nothing of DTtoPT, despite losses and deaths."""
 
     async def main(loop: VirtualLoop, clock: VirtualClock, net: MemoryNet) -> None:
         sent: list[Frame] = []
@@ -329,7 +329,7 @@ def test_over_a_real_socket(tmp_path: Path) -> None:
         await eventually(lambda: equal(plant, shore))
         assert plant.arrived[0].value == b"\0\1"
         await shore.kill()
-        await eventually(lambda: plant.end.trouble.startswith(f"{listening.bound}: "))  # the port that was taken
+        await eventually(lambda: plant.end.trouble.startswith(f"{listening.bound}: "))  # the port in use
         await plant.log(value(5000))
         await shore.start()
         await eventually(lambda: equal(plant, shore))

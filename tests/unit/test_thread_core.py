@@ -1,4 +1,4 @@
-"""Threads, sans-IO: whatever a network loses, repeats and turns round, and whoever dies when, both logs are equal in the end."""
+"""Threads, sans-IO: for any losses, repetitions, reorderings and deaths, both logs are equal in the end."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from fieldtwin.twin.thread.frames import (
 
 @dataclass
 class Store:
-    """What survives: logs by origin."""
+    """The data that survive: logs by origin."""
 
     logs: dict[str, dict[int, Event]] = field(default_factory=dict)
     lost: dict[str, list[tuple[int, int]]] = field(default_factory=dict)
@@ -45,7 +45,7 @@ class Store:
 
 
 class Side:
-    """A twin's end of a thread over a store; `die` forgets everything but the store."""
+    """A twin's end of a thread over a store; `die` discards everything except the store."""
 
     def __init__(self, name: str, store: Store, mtu: int, ack_delay_ms: int, now_ns: int) -> None:
         self.name, self.store, self.mtu, self.ack_delay_ms = name, store, mtu, ack_delay_ms
@@ -60,7 +60,7 @@ class Side:
         self.into = Incoming(self.codec.knows, self.ack_delay_ms * NS_PER_MS)
         self.out.connected(now_ns)
         self.pending: list[Effect] = []
-        """What the store was asked to do and has not done: gone when the side dies."""
+        """Requested but unfinished operations of the store: lost when the side dies."""
 
     def log(self, event: Event) -> None:
         self.out.appended(self.store.append(self.origin, event))
@@ -75,7 +75,7 @@ class Side:
             self.out.on_refused(now_ns)
         elif isinstance(frame, Hello | Data | Lost):
             effects = self.into.receive(frame, now_ns)
-            if dies:  # between what came and what is kept
+            if dies:  # between receiving and storing
                 self.restart(now_ns)
                 return
             self.pending += effects
@@ -97,7 +97,7 @@ class Side:
                 self.into.noted(effect.origin, effect.first, effect.last, now_ns)
 
     def frames(self, now_ns: int, slow: bool) -> list[bytes]:
-        """Everything that is to be sent now. A slow store has not done yet what it was asked to."""
+        """Return everything to be sent now. A slow store has not yet done the requested operations."""
         out: list[bytes] = []
         if not slow:
             self.do(self.pending, now_ns)
@@ -120,7 +120,7 @@ class Side:
 
 @dataclass
 class Net:
-    """Virtual time between two sides: loss, duplicates and delays by a seed, and whatever else happens at its time."""
+    """Virtual time between two sides: loss, duplicates and delays by a seed, and other events at their times."""
 
     seed: int
     loss: float = 0.0
@@ -128,7 +128,7 @@ class Net:
     delay_ms: int = 40
     mtu: int = 64
     slow: float = 0.0
-    """How often a store has not done yet what it was asked to."""
+    """How often a store has not yet done a requested operation."""
     ack_delay_ms: int = 20
     now_ns: int = 1
     sent: int = 0
@@ -158,7 +158,7 @@ class Net:
                     heapq.heappush(self.queue, (at, self.random.getrandbits(60), 1 - number, datagram))
 
     def step(self, until_ns: int, deaths: float = 0.0) -> None:
-        """To the next thing that happens, `until_ns` at most."""
+        """Advance to the next event, `until_ns` at most."""
         self._post()
         times = [side.wake_ns(self.now_ns) for side in self.sides] + [until_ns]
         if self.queue:
@@ -207,7 +207,7 @@ def test_whatever_happens_on_the_way_both_logs_are_equal_in_the_end(
 
 @pytest.mark.parametrize("seed", range(40))
 def test_long_logs_through_loss_reordering_repeats_and_deaths_are_equal_in_the_end(seed: int) -> None:
-    """20 % loss and more; either side dies between what came and what is kept, and at any other instant."""
+    """20 % loss and more; either side dies between receiving and storing, and at any other instant."""
     chosen = random.Random(seed)
     net = Net(
         seed,
@@ -228,7 +228,7 @@ def test_long_logs_through_loss_reordering_repeats_and_deaths_are_equal_in_the_e
 
 
 def test_one_lost_frame_is_sent_again_as_soon_as_it_is_missed() -> None:
-    """An ACK that tells of a gap is enough; nobody waits for a timeout."""
+    """An ACK that reports a gap is sufficient; neither side waits for a timeout."""
     net = Net(1, delay_ms=2)
     plant, shore = net.sides
     plant.log(value(0))
@@ -329,7 +329,7 @@ def test_an_unknown_schema_is_told_on_both_sides_and_nothing_is_lost_until_it_is
 
 
 def test_a_store_that_went_back_in_time_is_noticed() -> None:
-    """Numbers that were told may never be given to other events; whoever restored an old backup has to hear of it."""
+    """Numbers that were sent must never be assigned to other events; an operator who restored an old backup must be informed."""
     net = Net(6)
     plant, shore = net.sides
     for n in range(10):
@@ -345,7 +345,7 @@ def test_a_store_that_went_back_in_time_is_noticed() -> None:
 
 @pytest.mark.parametrize("seed", range(8))
 def test_who_comes_with_an_empty_store_is_given_everything_from_the_first(seed: int) -> None:
-    """Another twin on the same thread, or one that lost its disk; late ACKs of the one before it notwithstanding."""
+    """A different twin on the same thread, or one that lost its disk, despite late ACKs of the earlier one."""
     net = Net(seed, loss=0.2, repeat=0.2, delay_ms=3000 if seed % 2 else 20)
     plant, shore = net.sides
     for n in range(300):
@@ -360,7 +360,7 @@ def test_who_comes_with_an_empty_store_is_given_everything_from_the_first(seed: 
     shore.origin = "shore:2"
     shore.restart(net.now_ns)
     shore.log(value(1))
-    if seed % 3 == 0:  # over TCP this is noticed at once, with brokers and modems between it is not
+    if seed % 3 == 0:  # over TCP this is detected at once, with brokers and modems between it is not
         plant.out.connected(net.now_ns)
     plant.log(value(400))
     net.until_equal(within_s=3600)

@@ -1,4 +1,4 @@
-"""Two who want to follow one thread over TCP: the first has it as long as it answers, and the second is told."""
+"""Two clients that follow one thread over TCP: the first keeps it as long as it answers, and the second gets a message."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def test_the_second_is_refused_while_the_first_answers_and_let_in_when_it_went(t
 
 
 def test_one_whose_link_was_lost_has_its_place_at_once(tmp_path: Path) -> None:
-    """Its old connection is still there, half open: nobody answers on it, and nobody is asked."""
+    """Its old connection still exists, half open: it does not answer, and no request is sent on it."""
 
     async def main(place: Place) -> None:
         dialler = TcpDialler(place.at, place.net, [SCHEMA])
@@ -104,7 +104,7 @@ def test_one_whose_link_was_lost_has_its_place_at_once(tmp_path: Path) -> None:
 
 def test_one_that_does_not_answer_any_more_gives_its_place_up(tmp_path: Path) -> None:
     async def main(place: Place) -> None:
-        dead = await TcpDialler(place.at, place.net, [SCHEMA]).open()  # nobody reads what comes for it
+        dead = await TcpDialler(place.at, place.net, [SCHEMA]).open()  # no client reads the received data
         await asyncio.sleep(1)
         began = asyncio.get_running_loop().time()
         second = place.follower("second")
@@ -146,7 +146,7 @@ def test_a_follower_that_need_not_wait_ends_with_the_reason(tmp_path: Path) -> N
 
 
 def test_a_listener_that_says_nothing_is_taken_for_one_all_the_same(tmp_path: Path) -> None:
-    """Words may be lost on a bad link, as frames may."""
+    """Messages may be lost on a bad link, like frames."""
 
     async def main(place: Place) -> None:
         async def silent(client: Any) -> None:

@@ -1,4 +1,4 @@
-"""What two ends of a thread tell each other, as bytes: nothing is rounded, nothing breaks the reader, and little is said."""
+"""Messages between the two ends of a thread as bytes: no rounding, no crash of the reader, and little overhead."""
 
 from __future__ import annotations
 

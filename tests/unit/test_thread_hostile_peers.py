@@ -1,7 +1,7 @@
-"""Old commands that are sent again, and acknowledgements of what never arrived: each command is obeyed once, no event is lost.
+"""Replayed old commands, and acknowledgements of events that never arrived: each command is obeyed once, no event is lost.
 
-Recorded frames are sent again to a plant over TCP, in one session and after its restart. What a forged acknowledgement
-confirmed is sent to the next follower that does not have it.
+Recorded frames are sent again to a plant over TCP, in one session and after its restart. An event confirmed by a forged
+acknowledgement is sent to the next follower that does not have it.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def command(n: int) -> Event:
 
 
 class Place:
-    """Where the plant listens: a port that is the same after its restart."""
+    """The plant's endpoint: a port that is the same after its restart."""
 
     def __init__(self) -> None:
         self.listening: TcpListening | None = None
@@ -108,7 +108,7 @@ def test_commands_that_are_sent_again_are_obeyed_once_also_after_a_restart(tmp_p
         assert plant.end.into.duplicates > 0
         assert [event.value for event in await plant.all_of(shore.origin)] == wanted
         await plant.kill()
-        plant = await started(place, tmp_path)  # it knows nothing but what its store holds
+        plant = await started(place, tmp_path)  # it knows only the content of its store
         await again()
         assert plant.arrived == []
         await plant.kill()
@@ -117,7 +117,7 @@ def test_commands_that_are_sent_again_are_obeyed_once_also_after_a_restart(tmp_p
 
 
 class Repeating(WatchedCarrier):
-    """A carrier that sends all that it ever sent three times again whenever a link is opened."""
+    """A carrier that sends everything it ever sent three times again whenever a link is opened."""
 
     def __init__(self, carrier: Carrier, sent: list[Frame]) -> None:
         super().__init__(carrier, sent)
@@ -205,7 +205,7 @@ def test_a_forged_acknowledgement_takes_nothing_from_the_next_one_who_follows(tm
 def test_a_follower_that_drips_gives_its_place_up_to_an_honest_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One byte of a frame at a time, and never a whole one."""
+    """One byte of a frame at a time, and never a complete frame."""
     monkeypatch.setattr(thread_tcp, "SAYS_WITHIN_S", 0.2)
     monkeypatch.setattr(thread_tcp, "ANSWERS_WITHIN_S", 0.3)
 
@@ -222,7 +222,7 @@ def test_a_follower_that_drips_gives_its_place_up_to_an_honest_one(
                     await asyncio.sleep(0.05)
 
         dripping = asyncio.ensure_future(drip())
-        await eventually(lambda: plant.end.connected)  # a stranger that says nothing is taken for a follower
+        await eventually(lambda: plant.end.connected)  # a silent unknown client is treated as a follower
         shore = Twin("shore", tmp_path, CLOCK, place.dialler)
         await shore.start()
         await plant.log(*(value(n) for n in range(10)))
@@ -237,7 +237,7 @@ def test_a_follower_that_drips_gives_its_place_up_to_an_honest_one(
 
 
 def test_a_command_with_a_time_far_ahead_is_refused_so_that_it_does_not_stay_young_for_ever() -> None:
-    """The plant's age limit protects a plant whose store was lost; a forged time would undo it."""
+    """The plant's age limit protects a plant whose store was lost; a forged time would defeat it."""
     now_ms = CLOCK.utc_ns() // 1_000_000
     gate = CommandGate(remote=True, bounds=Bounds(), clock=CLOCK)
     ahead = Event(1, now_ms + OLD_MS + 60_000, Kind.COMMAND, "shore", bytes(2))

@@ -1,4 +1,4 @@
-"""Threads over a real mosquitto: loss, deaths of either side and of the broker, refusals, and what a host of others sees."""
+"""Threads over a real mosquitto: loss, deaths of either side and of the broker, refusals, and the view of a third-party host."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def test_a_broker_that_refuses_or_is_not_there_is_said(tmp_path: Path) -> None:
 
 
 def test_a_host_of_others_sees_births_data_and_deaths(tmp_path: Path) -> None:
-    """What goes over the broker, as a client sees it that knows Sparkplug and no thread."""
+    """The traffic on the broker, for a client that knows Sparkplug but no thread."""
     import aiomqtt
 
     async def main() -> None:

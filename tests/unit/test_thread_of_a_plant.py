@@ -1,4 +1,5 @@
-"""The plant's side of a thread: what of its process image it shares and how often, and when it may have the plant's modem."""
+"""The plant's side of a thread: which data of its process image it shares and how often, and when it may use the plant's
+modem."""
 
 from __future__ import annotations
 
@@ -25,7 +26,7 @@ MS = 1_000_000
 
 
 class Hands:
-    """A clock whose hands the test moves."""
+    """A clock that the test sets."""
 
     now_ms = 1_790_000_000_000
 
@@ -39,7 +40,7 @@ class Hands:
 
 
 class Watched:
-    """The observatory's image, and what a process that looks at it shares."""
+    """The observatory's image, and the data shared by a process that watches it."""
 
     def __init__(self, every_ms: int = 0) -> None:
         layout = image_layout(OBSERVATORY)
@@ -53,7 +54,7 @@ class Watched:
         self._names = sorted(index, key=index.__getitem__)
 
     def look(self, pressure: float | None, after_ms: int, message: bytes = b"") -> list[Event]:
-        """What is shared when the pressure is that, so long after the last look: of the pressure and of messages."""
+        """Return the shared pressure and messages, so long after the last poll, with this pressure."""
         self.clock.now_ms += after_ms
         quality, reason = (Quality.GOOD, Reason.NONE) if pressure is not None else (Quality.BAD, Reason.TIMEOUT)
         values = {"ctd.pressure": TagValue(pressure, quality, reason, t_ns=self.clock.monotonic_ns())}
@@ -63,7 +64,7 @@ class Watched:
         return self.watch(0)
 
     def watch(self, after_ms: int) -> list[Event]:
-        """What is shared so long after the last look although nobody published anything."""
+        """Return the shared data so long after the last poll, without a new publication."""
         self.clock.now_ms += after_ms
         self._process.look(*(reader.snapshot() for reader in self._readers))
         shared = self._process.collect()
@@ -94,7 +95,7 @@ def test_a_thread_that_is_thinned_out_has_a_value_a_second_and_whatever_matters_
 
 
 def test_a_state_is_told_when_it_changes_and_again_to_whom_was_refused() -> None:
-    """A twin's model is ahead of the plant with every command that it sends; one that was refused takes it back."""
+    """A twin's model is ahead of the plant with every command that it sends; a refusal takes it back."""
     layout = image_layout(OBSERVATORY)
     memory = memoryview(bytearray(layout.size))
     layout.format(memory)
@@ -116,7 +117,7 @@ def test_a_state_is_told_when_it_changes_and_again_to_whom_was_refused() -> None
 
 
 def test_what_a_dead_gateway_read_last_is_not_told_as_good() -> None:
-    """It may be dead for as long as it likes: the image still holds what it published."""
+    """It may be dead for any time: the image still holds its publications."""
     watched = Watched()
     (told,) = watched.look(1.0, 0)
     assert told.quality == Quality.GOOD

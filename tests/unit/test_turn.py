@@ -1,4 +1,4 @@
-"""The turn of those who share something, and the wait with an end: in order, and safe to cancel."""
+"""The fair lock of a shared resource, and the wait with a timeout: in order, and safe to cancel."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from fieldtwin.gateway.core.concurrency.timeout import alarm, ring
 @given(st.lists(st.tuples(st.integers(0, 5), st.integers(0, 4), st.booleans()), max_size=12))
 @settings(max_examples=60)
 def test_one_at_a_time_in_the_order_of_asking_whoever_is_cancelled(users: list[tuple[int, int, bool]]) -> None:
-    """Each comes at a time, works for a while, and may be cancelled half a unit behind its coming."""
+    """Each arrives at a time, works for a while, and may be cancelled half a unit after its arrival."""
     turn, began, spans = Turn(), [], []
 
     async def user(number: int, works: int, loop: VirtualLoop) -> None:
@@ -88,7 +88,7 @@ def test_an_alarm_ends_by_itself_or_is_rung_on_either_loop() -> None:
         waiter, end = alarm(loop, 3600.0)
         loop.call_soon(ring, waiter)
         await waiter
-        ring(waiter)  # once more does nothing
+        ring(waiter)  # a second call has no effect
         if end is not None:
             end()
         return alone, loop.time() - began

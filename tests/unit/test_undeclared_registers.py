@@ -1,7 +1,7 @@
-"""What an emulated device answers for registers that its profile does not name: exception 02, zero, or what was written.
+"""Answers of an emulated device for registers that its profile does not name: exception 02, zero, or the written value.
 
-Observed before: the shipped eastron-sdm630 refused every read across a register without a tag, so that drivers that read its
-first 80 registers at once failed. Its manual allows such reads, and says that a parameter that the meter does not have is zero.
+Defect: the shipped eastron-sdm630 refused every read across a register without a tag, so drivers that read its first 80
+registers at once failed. Its manual allows such reads, and states that a parameter that the meter lacks is zero.
 """
 
 from __future__ import annotations
@@ -68,9 +68,7 @@ def test_only_a_device_that_holds_takes_writes_of_undeclared_registers() -> None
     unit = stated("hold")
     assert asked(unit, "06 0002 1234") == "06 00 02 12 34"
     assert asked(unit, "03 0001 0003") == "03 06 00 00 12 34 00 00"
-    assert (
-        asked(unit, "10 0003 0003 06 0001 0002 0003") == "10 00 03 00 03"
-    )  # across a declared one that may be written
+    assert asked(unit, "10 0003 0003 06 0001 0002 0003") == "10 00 03 00 03"  # across a declared one that is writable
     assert asked(unit, "03 0003 0003") == "03 06 00 01 00 02 00 03"
     assert asked(unit, "06 0000 1234") == "86 02"  # declared, and read-only
 

@@ -1,4 +1,4 @@
-"""Who stops reading: talk ends nothing, a verdict stays what it is, and a listing is over."""
+"""A reader that closes its pipe: diagnostics do not end the run, a verdict remains the same, and a listing ends."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ steps:
 
 
 def ended(folder: Path, *args: str, unread: str) -> subprocess.CompletedProcess[str]:
-    """`fieldtwin ARGS`, of whose stdout or stderr the reader is gone before anything is said."""
+    """Run `fieldtwin ARGS`, whose reader of stdout or stderr has closed the pipe before any output."""
     (folder / "x.scenario.yaml").write_text(SCENARIO)
     reading, writing = os.pipe()
     os.close(reading)

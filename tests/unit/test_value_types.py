@@ -1,4 +1,4 @@
-"""Value types of device profiles, each against bytes worked out by hand: what stands in registers, what a person reads."""
+"""Value types of device profiles, each against bytes computed by hand: register contents, and displayed values."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from fieldtwin.gateway.devices.codec import apply_scale, decode, encode
 
 
 def tag(form: str) -> Tag:
-    """The tag `t` of a profile whose line for it is `form`."""
+    """The tag `t` of a profile with the line `form`."""
     head = 'device: test/types\nsource: "a test"\nprotocol: modbus\ntags:\n  sf: {at: 40002, type: int16}\n'
     text = f"{head}  t: {{at: 40010, {form}}}\n"
     return resolve(parse(text, "types.yaml")).tags["t"]

@@ -1,7 +1,7 @@
 """A value that a test sets is the one that the device holds, or it is refused.
 
-Seen once: a value beyond an object's range was set without a word and the device held another one, and `held` gave the old value
-right after `set`. A failed ``assert scenario(...)`` printed one line with the characters backslash and n in it.
+Defects: a value beyond an object's range was set without a message and the device held a different one, and `held` gave the
+old value right after `set`. A failed ``assert scenario(...)`` printed one line with the characters backslash and n in it.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""SIGINT and SIGTERM of a run in virtual time: between two callbacks, so that everything can be ended in order."""
+"""SIGINT and SIGTERM of a run in virtual time take effect between two callbacks, so that everything ends in order."""
 
 from __future__ import annotations
 
@@ -54,7 +54,8 @@ def test_the_callback_that_runs_is_finished_first(loop: VirtualLoop, handler: ob
 
 
 def test_a_task_that_is_woken_at_that_moment_can_be_ended(loop: VirtualLoop, handler: object) -> None:
-    """`set_result` calls the loop in the midst of asyncio's own code: an exception there, and the task never hears of it."""
+    """`set_result` calls the loop in the middle of asyncio's own code: with an exception there, the task would never be
+    informed."""
     ended: list[str] = []
     call_soon, came = loop.call_soon, []
 

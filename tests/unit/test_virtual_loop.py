@@ -1,4 +1,4 @@
-"""The virtual loop: time is a number, order is fixed, nobody gets out."""
+"""The virtual loop: time is a number, the order is fixed, access to the outside is blocked."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def test_cancelled_timers_never_run_and_take_no_room() -> None:
             timer = loop.call_later(1 + n / 1000, ran.append, n)
             if n % 1_000:
                 timer.cancel()
-            loop.alarm(100).set_result(None)  # one that is over before its time is as good as cancelled
+            loop.alarm(100).set_result(None)  # one that ends before its time counts as cancelled
             most = max(most, len(loop._timers))
         await asyncio.sleep(30)
         return most
@@ -108,7 +108,7 @@ def test_timeouts_and_waits_of_asyncio_work() -> None:
 
 
 def test_a_deadlock_says_who_waits_for_what() -> None:
-    """Each task by its name, with the line of its author's and what is waited for there, not with asyncio's innermost line."""
+    """Each task by its name, with the line in its author's code and the awaited object, not with asyncio's innermost line."""
 
     async def takes(first: asyncio.Lock, second: asyncio.Lock) -> None:
         async with first:
@@ -265,7 +265,7 @@ def test_every_way_out_names_the_culprit(way: Callable[[VirtualLoop], Coroutine[
 
 
 def test_dates_are_what_they_were() -> None:
-    """Only what time it is remains untold: the rest of `datetime` works, and makes objects of the real types."""
+    """Only the current time is unavailable: the rest of `datetime` works, and creates objects of the real types."""
     real, before = datetime.datetime, datetime.datetime(2026, 11, 21, tzinfo=UTC)
 
     async def main(loop: VirtualLoop) -> None:
@@ -341,7 +341,7 @@ def test_it_is_closed_once_and_runs_alone() -> None:
 
 
 def test_an_interrupt_lets_every_task_end_before_the_loop_is_closed() -> None:
-    """Else Python ends their coroutines when it collects them, without a loop, and prints a traceback for each."""
+    """Otherwise Python ends their coroutines when it collects them, without a loop, and prints a traceback for each."""
     loop = VirtualLoop()
     ended: list[str] = []
 
@@ -350,7 +350,7 @@ def test_an_interrupt_lets_every_task_end_before_the_loop_is_closed() -> None:
             await asyncio.sleep(3600)
         finally:
             asyncio.current_task()
-            await asyncio.sleep(1)  # to tidy up takes time, and virtual time passes
+            await asyncio.sleep(1)  # clean-up takes time, and virtual time passes
             ended.append(name)
 
     async def main() -> None:

@@ -1,4 +1,4 @@
-"""What a file or a device says cannot play tricks on the terminal of whoever reads our errors."""
+"""Text from a file or a device cannot control the terminal on which our errors are shown."""
 
 from __future__ import annotations
 

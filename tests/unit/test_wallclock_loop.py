@@ -1,4 +1,5 @@
-"""The event loop whose waits are ended by a timerfd: never early, nobody hears of the timer, nothing stays open."""
+"""The event loop whose waits are ended by a timerfd: never early, the timer is not visible outside, no descriptor remains
+open."""
 
 from __future__ import annotations
 
@@ -42,7 +43,7 @@ def test_a_wait_is_ended_by_the_timer_and_never_early(wait_s: float) -> None:
 
 
 def test_the_timer_ends_a_wait_that_epoll_would_have_slept_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Only the timer can end it: the time given to epoll itself is far off."""
+    """Only the timer can end it: the timeout given to epoll itself is far off."""
     monkeypatch.setattr(
         selectors.EpollSelector, "select", lambda self, timeout: self._selector.poll(30.0 * bool(timeout), 1)
     )
@@ -66,7 +67,7 @@ def test_what_comes_while_the_end_of_a_wait_is_looked_away_is_told(monkeypatch: 
 
 
 def test_nothing_spins_before_the_end_of_a_wait(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A timer that ran out while something else ended its wait is told in the next one: that one goes on all the same."""
+    """A timer that expired while a different event ended its wait is reported in the next wait, which continues nevertheless."""
     asked: list[float | None] = []
     select = selectors.EpollSelector.select
 
@@ -101,7 +102,7 @@ def test_what_is_ready_is_told_beside_a_timer_that_ran_out() -> None:
 
 
 def test_a_timer_that_ran_out_wakes_one_wait_only() -> None:
-    """Or a loop that has nothing to do would spin."""
+    """Otherwise an idle loop would spin."""
     with selector() as subject:
         subject.select(0.001)
         time.sleep(0.002)  # the wait may have been ended by epoll's own millisecond

@@ -1,4 +1,4 @@
-"""The plans that docs/what-if.md shows can be read, and the rules and the planner of docs/twin.md."""
+"""The plans in docs/what-if.md are valid, and so are the rules and the planner of docs/twin.md."""
 
 from __future__ import annotations
 

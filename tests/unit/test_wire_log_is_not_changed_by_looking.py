@@ -1,7 +1,7 @@
-"""What a test sees on the wire does not depend on when it looks.
+"""The wire log of a test does not depend on when the test reads it.
 
-Once, a look 150 ms into a reply that was delayed by 300 ms turned one good exchange into "no reply" and a stray frame, for ever,
-because the log gave every request up after 50 ms. Stray frames were counted as requests.
+Defect: a read of the log 150 ms into a reply that was delayed by 300 ms turned one correct exchange into "no reply" and a
+stray frame, permanently, because the log gave every request up after 50 ms. Stray frames were counted as requests.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def device(runner: Runner) -> Iterator[Device]:
 
 
 class Client:
-    """A Modbus TCP client that sends and receives when it is told to."""
+    """A Modbus TCP client that sends and receives on request."""
 
     def __init__(self, device: Device) -> None:
         self.unit = device.unit
@@ -67,7 +67,7 @@ class Client:
 
 
 def seen(device: Device, **like: object) -> list[Exchange]:
-    """What is on the wire once there is anything."""
+    """Return the traffic once there is any."""
     until = time.monotonic() + PATIENCE_S
     while not (found := device.wire.exchanges(**like)) and time.monotonic() < until:
         pass

@@ -1,7 +1,7 @@
-"""The wire log of a test shows every frame that the driver received, and refuses a question that it can never answer.
+"""The wire log of a test shows every frame that the driver received, and refuses an expectation that can never be met.
 
-Seen with pymodbus, minimalmodbus, modbus_tk and canopen as drivers under test: a reply with a wrong unit ID was not in the log at
-all, nor was an SDO reply that answers no request. An expectation that counts zero times passed where the field, the problem or
+Defects, with pymodbus, minimalmodbus, modbus_tk and canopen as drivers under test: a reply with a wrong unit ID was not in the
+log at all, nor was an SDO reply without a request. An expectation that counts zero times passed if the field, the problem or
 the access that it named did not exist.
 """
 
@@ -86,7 +86,7 @@ def test_bounds_that_no_number_meets_are_refused(device: Device) -> None:
 
 
 def _answers(*replies: str) -> list[tuple[str, str]]:
-    """Problem and reply of each exchange where one RTU request for two registers is answered by `replies`, in hex."""
+    """Return problem and reply of each exchange if one RTU request for two registers is answered by `replies`, in hex."""
     wire = ModbusWire("line1", "rtu", {})
     wire.feed(True, with_crc(bytes((1,)) + READ), 0)
     done = [e for n, reply in enumerate(replies) for e in wire.feed(False, bytes.fromhex(reply), n)[1]]
@@ -94,7 +94,7 @@ def _answers(*replies: str) -> list[tuple[str, str]]:
 
 
 def test_an_rtu_reply_with_another_byte_count_and_a_right_check_sum_is_malformed_at_once() -> None:
-    """pymodbus took the short reply, and the log said that none came; of the long one it said that its check sum is wrong."""
+    """Defect: pymodbus accepted the short reply, and the log reported no reply; for the long one it reported a wrong checksum."""
     short = with_crc(bytes.fromhex("010402 4366")).hex()
     long = with_crc(bytes.fromhex("010406 436680000000")).hex()
     assert _answers(short) == _answers(short[:4], short[4:]) == [("malformed", "4 bytes that answer something else")]

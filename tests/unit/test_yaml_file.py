@@ -1,4 +1,4 @@
-"""YAML as users mean it: scalars, duplicates, positions, and nothing but `FileInvalid` for whatever is in a file."""
+"""YAML as users mean it: scalars, duplicates, positions, and only `FileInvalid` for any content of a file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Events and frames of a thread for tests: any that can be, and over a link that holds no more than it may."""
+"""Events and frames of a thread for tests: any valid ones, and over a link with its size limit."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Two twins on a thread for tests: each with a store that stays and an end that can die, over carriers that can be shaken."""
+"""Two twins on a thread for tests: each with a store that persists and an end that can die, over carriers that can be
+disturbed."""
 
 from __future__ import annotations
 
@@ -24,7 +25,7 @@ def value(n: int) -> Event:
 
 
 class ShakyLink(Link):
-    """Loses, repeats and turns round what goes over a link."""
+    """Lose, repeat and reorder the frames on a link."""
 
     def __init__(self, link: Link, chance: random.Random, loss: float) -> None:
         self._link = link
@@ -60,7 +61,7 @@ class ShakyLink(Link):
 
 
 class ShakyCarrier(Carrier):
-    """`cut` ends the link that there is, and no other is opened while it holds."""
+    """`cut` ends the present link, and no new one opens while it is in effect."""
 
     def __init__(self, carrier: Carrier, seed: int, loss: float = 0.2) -> None:
         self.name = carrier.name
@@ -79,7 +80,7 @@ class ShakyCarrier(Carrier):
 
 
 class WatchedCarrier(Carrier):
-    """Keeps what is sent: what a capture towards the other side holds."""
+    """Record the sent frames: the content of a capture towards the other side."""
 
     def __init__(self, carrier: Carrier, sent: list[Frame]) -> None:
         self.name = carrier.name
@@ -102,7 +103,7 @@ class WatchedCarrier(Carrier):
 
 
 class Twin:
-    """One side. `start` and `kill` as often as a test likes; the store is on disk."""
+    """One side. A test may `start` and `kill` it any number of times; the store is on disk."""
 
     def __init__(
         self,
@@ -156,7 +157,7 @@ class Twin:
 
 
 async def equal(one: Twin, other: Twin) -> bool:
-    """Whether both logs are the same on both sides, and both sides know."""
+    """Return whether both logs are the same on both sides, and both sides know it."""
     if one.end.waiting or other.end.waiting or one.end.out is None or other.end.out is None:
         return False
     return await one.all_of(one.origin) == await other.all_of(one.origin) and await one.all_of(

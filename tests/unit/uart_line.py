@@ -1,7 +1,7 @@
-"""A serial line bit by bit, in virtual time: what a UART makes of what another one sends at other settings.
+"""A serial line bit by bit, in virtual time: the bytes that a UART receives from one with different settings.
 
-A connector for the tests of `line` and `scan`: devices with hidden settings, other masters, a port that counts errors or
-does not. Bytes leave as levels over time and are sampled in the middle of the receiver's bits, as hardware does.
+A connector for the tests of `line` and `scan`: devices with hidden settings, other clients, a port that counts errors or does
+not. Bytes are sent as levels over time and are sampled in the middle of the receiver's bits, as hardware does.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ OVERSAMPLING = 16
 
 @dataclass(frozen=True)
 class Received:
-    """What a UART delivered of a waveform: each byte, and whether it came with an error."""
+    """The bytes that a UART received from a waveform, each with its error flag."""
 
     data: bytes
     clean: bytes
@@ -48,8 +48,8 @@ def levels(data: bytes, settings: SerialSettings) -> list[int]:
 
 
 def sampled(sent: list[int], sender: SerialSettings, receiver: SerialSettings) -> Received:
-    """What a receiver with its own settings makes of these levels; the line idles high behind them."""
-    ratio = sender.baudrate / receiver.baudrate  # the sender's bits in one of the receiver's
+    """Return the bytes that a receiver with its own settings decodes from these levels; the line idles high afterwards."""
+    ratio = sender.baudrate / receiver.baudrate  # the sender's bits per bit of the receiver
     end = len(sent)
 
     def level(at: float) -> int:
@@ -85,8 +85,8 @@ def sampled(sent: list[int], sender: SerialSettings, receiver: SerialSettings) -
 
 @dataclass
 class UartLine:
-    """A connector to one line. `devices` listen and answer at `settings`; `chatter` is another master's exchange every
-    `period_s`: request and reply, the latter None where nobody answers. `counts`: our port counts errors."""
+    """A connector to one line. `devices` listen and answer at `settings`; `chatter` is a foreign exchange every `period_s`:
+    request and reply, the latter None if there is no reply. `counts`: our port counts errors."""
 
     devices: Mapping[int, ModbusUnit]
     settings: SerialSettings = SerialSettings(9600, "8N1")  # noqa: RUF009  frozen
@@ -123,7 +123,7 @@ class UartLine:
         self._port = None
 
     def written(self, data: bytes, settings: SerialSettings) -> None:
-        """We sent: the devices hear it at their settings, and answer at them."""
+        """Our transmission: the devices receive it with their settings, and answer with them."""
         self.sent.append(data)
         arrives_s = len(data) * settings.char_time_s
         loop().call_later(arrives_s, self._hear, data, settings)

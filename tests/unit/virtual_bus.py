@@ -1,4 +1,4 @@
-"""A gateway's Modbus bus in virtual time: emulated units behind a line of 19200 baud, each with a latency of its own."""
+"""A gateway's Modbus bus in virtual time: emulated units on a line of 19200 baud, each with its own latency."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ CHAR_S = LINE.serial.char_time_s
 
 
 class Heard(NamedTuple):
-    """A request as the line carried it: when its first character came, for which unit, and its PDU."""
+    """A request on the line: the time of its first character, its unit, and its PDU."""
 
     t_s: float
     unit: int
@@ -32,7 +32,7 @@ class Heard(NamedTuple):
 
 
 class VirtualLine:
-    """A Connector to one line, or to one TCP server with all units behind it, as the endpoint says.
+    """A Connector to one line, or to one TCP server for all units, according to the endpoint.
 
     `units` may change while it runs; a unit answers `latency_s` after its request.
     """
@@ -41,11 +41,11 @@ class VirtualLine:
         self.units = units
         self.latency_s = latency_s
         self.slow: dict[int, float] = {}
-        """Units that take longer, in seconds."""
+        """Latencies of slower units, in seconds."""
         self.no_answer: dict[int, float] = {}
         """On TCP: units for which the server, a gateway, replies with exception 0B after so many seconds."""
         self.silent: Callable[[bytes], bool] = lambda frame: False
-        """Requests to which nobody answers."""
+        """Requests that are not answered."""
         self.heard: list[Heard] = []
         self.opened_s = 0.0
         self._loop = loop
@@ -89,7 +89,7 @@ class VirtualLine:
         self._wire.feed(reply)
 
     def times(self, unit: int, since_s: float = 0.0, address: int | None = None) -> list[float]:
-        """When requests for `unit` came, of those for a register `address` where one is named."""
+        """Return the times of requests for `unit`, restricted to those for a register `address` if it is given."""
         return [
             h.t_s
             for h in self.heard

@@ -1,8 +1,8 @@
 """JUnit XML in pytest's dialect (``xunit2`` with properties), as Jenkins and GitLab read it.
 
 A scenario with a seed is a test case; its class is the system and the target. A failure's message is the first check
-that failed, and its text contains all of them and the command that runs it again. INCONCLUSIVE is ``skipped`` with its
-own type: JUnit has no word for a result that neither passed nor failed.
+that failed, and its text contains all of them and the command that runs it again. INCONCLUSIVE is an ``error`` with its
+own type: JUnit has no word for a result that neither passed nor failed, and a build must not take it for one that passed.
 
 `Flavour.JENKINS` writes only what junit-10.xsd allows, the schema by which Jenkins' xUnit plugin accepts or refuses a
 file. That schema has no properties of test cases: they become lines at the beginning of ``system-out``.
@@ -41,8 +41,8 @@ def render_junit(report: Report, flavour: Flavour = Flavour.COMMON) -> bytes:
     counts, total = report.counts, sum(s.took_s for s in report.scenarios)
     suites = ET.Element("testsuites", name=clean(report.title))
     suite = ET.SubElement(
-        suites, "testsuite", name=clean(report.title), errors=str(counts[Verdict.ERROR]),
-        failures=str(counts[Verdict.FAILED]), skipped=str(counts[Verdict.SKIPPED] + counts[Verdict.INCONCLUSIVE]),
+        suites, "testsuite", name=clean(report.title), errors=str(counts[Verdict.ERROR] + counts[Verdict.INCONCLUSIVE]),
+        failures=str(counts[Verdict.FAILED]), skipped=str(counts[Verdict.SKIPPED]),
         tests=str(len(report.scenarios)), time=f"{total:.3f}",
     )  # fmt: skip
     if report.started:
@@ -96,11 +96,12 @@ def _case(suite: ET.Element, report: Report, scenario: ScenarioResult, flavour: 
     verdict, message = scenario.verdict, clean(_message(scenario))
     if verdict is Verdict.FAILED:
         ET.SubElement(case, "failure", message=message, type="fieldtwin.failed").text = _text(scenario)
-    elif verdict is Verdict.ERROR:
-        ET.SubElement(case, "error", message=message, type="fieldtwin.error").text = _text(scenario)
-    elif verdict in (Verdict.SKIPPED, Verdict.INCONCLUSIVE):
+    elif verdict in (Verdict.ERROR, Verdict.INCONCLUSIVE):
         said = message or verdict.value
-        ET.SubElement(case, "skipped", message=said, type=f"fieldtwin.{verdict.value}").text = _text(scenario)
+        ET.SubElement(case, "error", message=said, type=f"fieldtwin.{verdict.value}").text = _text(scenario)
+    elif verdict is Verdict.SKIPPED:
+        said = message or verdict.value
+        ET.SubElement(case, "skipped", message=said, type="fieldtwin.skipped").text = _text(scenario)
     if lines:
         ET.SubElement(case, "system-out").text = clean(_bounded("\n".join(lines)))
 

@@ -96,7 +96,7 @@ def test_only_a_required_case_of_a_master_is_red_and_gives_exit_code_1() -> None
     junit = render_junit(as_report([good, robust, deviation], "x", ["check"], "2027-01-01T00:00:00+00:00"))
     assert b'failures="1"' in junit
     assert b"robustness finding: waits out its timeout" in junit
-    assert [case["basis"] for case in as_json([good, robust, field], ["check"])] == [
+    assert [case["basis"] for case in as_json({}, [good, robust, field], ["check"])["cases"]] == [
         "standard", "robustness", "field problem",
     ]  # fmt: skip
 
@@ -184,7 +184,7 @@ def test_fail_on_decides_whether_a_robustness_failure_of_a_client_gives_exit_cod
     assert "robustness    MB-015a" in done.stdout
     assert "! MB-015a a reply from an unexpected unit (robustness): published 3333" in done.stderr
     assert ("The exit code does not count them: see --fail-on." in done.stderr) == (code == 0)
-    results: dict[str, Any] = {case["id"]: case for case in json.loads((tmp_path / "r.json").read_text())}
+    results: dict[str, Any] = {case["id"]: case for case in json.loads((tmp_path / "r.json").read_text())["cases"]}
     assert {id: (case["verdict"], case["basis"]) for id, case in results.items()} == {
         "MB-015a": ("failed", "robustness"), "MB-056a": ("passed", "standard"),
     }  # fmt: skip

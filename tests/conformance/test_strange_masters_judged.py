@@ -96,7 +96,7 @@ def run_check(
         cwd=tmp_path,
         check=False,
     )
-    results: list[dict[str, Any]] = json.loads(done.stdout) if done.stdout else []
+    results: list[dict[str, Any]] = json.loads(done.stdout)["cases"] if done.stdout else []
     return done.returncode, {r["id"]: (r["verdict"], r["reason"]) for r in results}, done.stderr
 
 

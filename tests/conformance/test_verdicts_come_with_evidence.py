@@ -10,6 +10,7 @@ import json
 import shlex
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -58,8 +59,14 @@ def test_frames_are_in_every_file_and_the_reproduce_line_works(tmp_path: Path) -
     words += ["--junit", "j.xml", "--html", "r.html", "-o", "r.json", "--log", "w.jsonl", "--json"]
     done = _run([*words, "--", sys.executable, "master.py", "--only", "mine"], tmp_path)
     assert done.returncode == 1, done.stderr
-    results = {case["id"]: case for case in json.loads(done.stdout)}
-    assert json.loads((tmp_path / "r.json").read_text()) == list(results.values())
+    document = json.loads(done.stdout)
+    assert json.loads((tmp_path / "r.json").read_text()) == document
+    assert (document["kind"], document["version"]) == ("fieldtwin check-master", 1)
+    about = document["about"]
+    assert (about["protocol"], about["endpoint"], about["at_most"]) == ("modbus", "tcp://127.0.0.1:0", "disrupt")
+    assert about["command"].startswith("fieldtwin check modbus-master")
+    results = {case["id"]: case for case in document["cases"]}
+    assert document["counts"] == dict(Counter(case["verdict"] for case in results.values()))
     case = results["MB-056a"]
     assert case["verdict"] == "failed", case
     device = [line["data"] for line in case["wire"] if line["by"] == "device"]
@@ -83,7 +90,7 @@ def test_frames_are_in_every_file_and_the_reproduce_line_works(tmp_path: Path) -
     assert f"reproduce: {case['reproduce']}" in str(failure.text)
     once_more = _run(again, tmp_path)
     assert once_more.returncode == 1, once_more.stderr
-    assert [(c["id"], c["verdict"]) for c in json.loads(once_more.stdout)] == [("MB-056a", "failed")]
+    assert [(c["id"], c["verdict"]) for c in json.loads(once_more.stdout)["cases"]] == [("MB-056a", "failed")]
 
 
 @pytest.mark.parametrize(
@@ -117,7 +124,7 @@ def test_canopens_aborts_are_decoded_in_the_evidence(tmp_path: Path) -> None:
         "output",
     ]
     done = _run([*words, "--only", "1", "--json", "--", sys.executable, "master.py"], tmp_path)
-    (case,) = json.loads(done.stdout)
+    (case,) = json.loads(done.stdout)["cases"]
     texts = [line["text"] for line in case["wire"] if line["data"].startswith("605#80")]
     assert texts, case
     assert any("SDO abort 05030000h" in text and "multiplexer 0" in text for text in texts), texts
@@ -161,7 +168,7 @@ def test_a_port_that_the_case_gives_back_is_no_connection_of_the_master(tmp_path
     (tmp_path / "master.py").write_text(GIVES_UP_ITS_PORT)
     words = ["check", "modbus-master", "--listen", f"pty:{tmp_path}/line", "--timeout", "150ms", "--only", "66"]
     words += ["--probe", "output", "--patience", "3s", "--json", "--", sys.executable, "master.py"]
-    (result,) = json.loads(_run(words, tmp_path).stdout)
+    (result,) = json.loads(_run(words, tmp_path).stdout)["cases"]
     assert (result["verdict"], "wedged" in result["reason"]) == ("failed", True), result
     assert [(line["by"], line["text"]) for line in result["wire"] if line["text"]] == [
         ("device", "closes connection 1"),

@@ -76,7 +76,7 @@ def test_a_bad_file_is_told_with_its_place(old: str, new: str, says: str) -> Non
 
 def test_results_as_json_and_junit(tmp_path: Path) -> None:
     results = [CaseResult(CASE, failed("published 3333"), 1.5), CaseResult(CASE, skipped("no probe"))]
-    first, second = as_json(results, ["check", "modbus-master"])
+    first, second = as_json({}, results, ["check", "modbus-master"])["cases"]
     assert json.loads(json.dumps(first))["danger"] == "read"
     assert (first["verdict"], second["verdict"]) == ("failed", "skipped")
     write_junit(

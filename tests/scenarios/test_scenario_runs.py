@@ -150,6 +150,8 @@ def test_what_a_target_cannot_do_is_skipped_and_has_not_passed(tmp_path: Path) -
         ("  - expect: {tag: ctd.pressure, value: 1, tolerance: -1}\n", "tolerance", 4),
         ("  - expect: {wire: ctd, requests_per_s: {max: 2}, during: 0s}\n", "for no time", 4),
         ("  - expect: {wire: ctd, requests_per_s: {}, during: 5s}\n", "hold whatever comes", 4),
+        ("  - expect: {wire: ctd, times: {min: 0}}\n", "hold whatever comes", 4),
+        ("  - expect: {wire: ctd, times: {max: -1}}\n", "never negative", 4),
         ("  - expect: {wire: ctd, times: {min: 3, max: 1}}\n", "nothing is within these bounds", 4),
         ("  - expect: {tag: ctd.pressure, updates_per_s: [11, 9], during: 5s}\n", "from one number to another", 4),
         ("  - expect: {tag: ctd.pressure, updates_per_s: [9], during: 5s}\n", "from one number to another", 4),

@@ -106,6 +106,8 @@ def test_probes_see_what_is_served_under_their_names(tmp_path: Path) -> None:
         ("cycle: [{changes_of: ctd.pressure}]\n", "bounds", 3),
         ("cycle: [{changes_of: ctd.pressure, min: 2s, max: 1s}]\n", "nothing is within these bounds", 3),
         ("rate: [{tag: ctd.pressure, updates_per_s: {}}]\n", "hold whatever comes", 3),
+        ("rate: [{tag: ctd.pressure, updates_per_s: {min: 0}}]\n", "hold whatever comes", 3),
+        ("cycle: [{changes_of: ctd.pressure, min: 0}]\n", "holds whatever comes", 3),
         ("always: ['1 == 1']\n", "looks at nothing", 3),
         ("never: [{wire: ctd, value: 7}]\n", "of which register", 3),
         (

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import platform
 import re
 import shlex
 import sys
@@ -15,14 +16,17 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from fieldtwin.__about__ import __version__
 from fieldtwin.cli.options import Duration, json_option, junit_flavour_option
 from fieldtwin.cli.test.check_cases import only_of
 from fieldtwin.cli.test.check_device_command import canopen, modbus
 from fieldtwin.cli.test.fail_on import bases_of, fail_on_option, print_not_counted
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.results.subject import who
 
 if TYPE_CHECKING:
+    from fieldtwin.conformance.clients.run import Plan
     from fieldtwin.conformance.core.case import Basis, Case
     from fieldtwin.conformance.core.results import CaseResult
     from fieldtwin.emulators.modbus.bank import Table
@@ -181,8 +185,9 @@ def modbus_master(
         Files(junit, junit_flavour, html, out, log_path),
         as_json,
         listen,
-        plan.only,
+        plan,
         bases_of(fail_on),
+        "modbus",
     )
 
 
@@ -268,8 +273,9 @@ def canopen_master(
         Files(junit, junit_flavour, html, out, log_path),
         as_json,
         listen,
-        plan.only,
+        plan,
         bases_of(fail_on),
+        "canopen",
     )
 
 
@@ -302,8 +308,9 @@ def _judged(
     files: Files,
     as_json: bool,
     title: str,
-    only: frozenset[str],
+    plan: Plan,
     fail_on: frozenset[Basis],
+    protocol: str,
 ) -> int:
     """Run the test, show the results, write the files, and return the exit code."""
     from fieldtwin.cli.test.check_view import Progress, print_results
@@ -319,16 +326,27 @@ def _judged(
     started = datetime.now(UTC)
     with ExitStack() as stack:
         log = stack.enter_context(MasterLog(files.log, title, shlex.join(["fieldtwin", *argv]))) if files.log else None
-        progress = stack.enter_context(Progress(sum(case.chosen(only) for case in cases)))
+        progress = stack.enter_context(Progress(sum(case.chosen(plan.only) for case in cases)))
         listener = listener_type(progress.say, progress.tell, *([log.on_event] if log is not None else []))
         found: list[CaseResult] = run(judge(listener))
     results = [waive(result, waivers, started.date()) for result in found]
-    document = json.dumps(data_of(results, argv), indent=2) + "\n"
+    about = {
+        "protocol": protocol,
+        "endpoint": title,
+        "started": started.isoformat(timespec="seconds"),
+        "took_s": round((datetime.now(UTC) - started).total_seconds(), 3),
+        "by": who(),
+        "host": platform.node(),
+        "command": shlex.join(["fieldtwin", *argv]),
+        "at_most": plan.at_most.value,
+        "fieldtwin": __version__,
+    }
+    document = json.dumps(data_of(about, results, argv), indent=2) + "\n"
     _write(files, results, document, f"master on {title}", started, fail_on)
     if as_json:
         sys.stdout.write(document)
     else:
-        print_results(results, all_wires=bool(only))
+        print_results(results, all_wires=bool(plan.only))
         print_not_counted(results, fail_on)
     return exit_code(results, fail_on)
 

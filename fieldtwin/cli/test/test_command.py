@@ -6,6 +6,8 @@ import json
 import shlex
 import shutil
 import sys
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -25,7 +27,7 @@ from fieldtwin.console import data, show_warnings
 from fieldtwin.gateway.core.errors import UsageError
 
 if TYPE_CHECKING:
-    from fieldtwin.results.model import Machine, SystemKey
+    from fieldtwin.results.model import Machine, ScenarioResult, SystemKey
     from fieldtwin.twin.site.system import System
 
 SUFFIX = ".scenario.yaml"
@@ -142,7 +144,7 @@ def command(
     --seeds 1..200 --faults random    a campaign: what always holds is judged while random faults strike
     """
     from fieldtwin.conformance.core.waivers import Waivers, load_waivers
-    from fieldtwin.results.model import Report, ScenarioResult, key_of
+    from fieldtwin.results.model import Report, key_of
     from fieldtwin.run.targets.scenario_targets import Target, run_scenario
     from fieldtwin.run.targets.template_scenarios import agree_to_scenario
     from fieldtwin.scenarios.judging.waiving import all_well, ids_of, waive
@@ -179,13 +181,17 @@ def command(
         controller,
     )
     results: list[ScenarioResult] = []
+    seeds: list[ScenarioResult] = []
     for scenario in scenarios:
         if campaign.seeds:
+            from fieldtwin.cli.run.virtual_view import parse_seeds
             from fieldtwin.cli.test.campaign_view import run_scenario_campaign
 
             found = run_scenario_campaign(scenario.path, folders, campaign, None if as_json else _show)
             found = [replace(result, system=scenario.system) for result in found]
-            results += [waive(result, waived, datetime.now(UTC).date()) for result in found]
+            waived_ones = [waive(result, waived, datetime.now(UTC).date()) for result in found]
+            results += waived_ones
+            seeds += waived_ones[1 : 1 + len(parse_seeds(campaign.seeds))]
             continue
         result = run_scenario(scenario, where, Path(trace) if trace else None, retries)
         result = replace(result, system=scenario.system)
@@ -217,9 +223,14 @@ def command(
         json.dump([_plain(result) for result in results], sys.stdout, indent=2)
         sys.stdout.write("\n")
     else:
-        counts = ", ".join(f"{n} {verdict.value}" for verdict, n in report.counts.items() if n)
-        data.print(f"[bold]{counts}[/bold]")
+        data.print(f"[bold]{_counts(seeds or results, 'seeds: ' if seeds else '')}[/bold]")
     return 0 if all_well(results) else 1
+
+
+def _counts(results: Sequence[ScenarioResult], of: str) -> str:
+    """Return the last line, such as ``3 passed, 1 failed``. The results of a campaign and of its shrunk scenario are no seeds."""
+    counts = Counter(result.verdict.value for result in results)
+    return of + ", ".join(f"{n} {verdict}" for verdict, n in counts.items())
 
 
 def _check_campaign(campaign: CampaignRequest, target: str, of_one_run: tuple[object, ...]) -> None:

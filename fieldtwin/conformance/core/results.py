@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import date
 from typing import Any
@@ -85,8 +85,23 @@ def summary(results: Sequence[CaseResult]) -> str:
     return ", ".join(f"{counts[word]} {word}" for word in order if counts[word]) or "no case was chosen"
 
 
-def as_json(results: Sequence[CaseResult], argv: Sequence[str]) -> list[dict[str, Any]]:
-    """Return one object per case. `argv` is the command line, for `reproduce`."""
+KIND = "fieldtwin check-master"
+VERSION = 1
+
+
+def as_json(about: Mapping[str, Any], results: Sequence[CaseResult], argv: Sequence[str]) -> dict[str, Any]:
+    """Return the whole test of a master. `about` names the test, `argv` is the command line, for `reproduce`."""
+    return {
+        "kind": KIND,
+        "version": VERSION,
+        "about": dict(about),
+        "counts": dict(Counter(r.verdict.value for r in results)),
+        "findings": {basis.value: sum(r.verdict.bad and r.case.basis is basis for r in results) for basis in Basis},
+        "cases": _cases(results, argv),
+    }
+
+
+def _cases(results: Sequence[CaseResult], argv: Sequence[str]) -> list[dict[str, Any]]:
     return [
         {
             "id": r.case.id,
@@ -112,8 +127,10 @@ def for_build(result: CaseResult, fail_on: frozenset[Basis]) -> tuple[Verdict, s
     """Return the verdict and the reason that a build's test report shows.
 
     A failure that does not decide the exit code is SKIPPED there, with its kind in front of the reason. So a build and its test
-    report agree.
+    report agree. INCONCLUSIVE does not decide it either, and is SKIPPED as well.
     """
+    if result.verdict is Verdict.INCONCLUSIVE:
+        return Verdict.SKIPPED, f"inconclusive: {result.reason}"
     if not result.verdict.bad or counts_as_failed(result, fail_on):
         return result.verdict, result.reason
     return Verdict.SKIPPED, f"{called(result)} finding: {result.reason}"

@@ -350,6 +350,13 @@ def _check_bounds(file: YamlFile, loc: tuple[Key, ...], bounds: Bounds | None) -
         return
     if bounds.min is None and bounds.max is None:
         raise file.error(loc, "these bounds hold whatever comes", expected="min or max")
+    if bounds.max is None and bounds.min is not None and bounds.min <= 0:
+        got = f"min {bounds.min:g}"
+        raise file.error(loc, "these bounds hold whatever comes", expected="min above 0, or max", got=got)
+    if bounds.max is not None and bounds.max < 0:
+        raise file.error(
+            loc, "a count or a rate is never negative", expected="max of 0 or more", got=f"max {bounds.max:g}"
+        )
     if bounds.min is not None and bounds.max is not None and bounds.min > bounds.max:
         raise file.error(loc, "nothing is within these bounds", got=f"min {bounds.min:g}, max {bounds.max:g}")
 
@@ -391,6 +398,10 @@ def _check_whole_run(scenario: Scenario) -> None:
             for key in ("min", "max", "late")
             if (said := getattr(cycle, key)) is not None
         }
+        if times == {"min": 0}:
+            raise file.error(
+                (*loc, "min"), "this bound holds whatever comes", expected="min above 0, or max", got="min 0"
+            )
         if times.get("min", 0) > times.get("max", times.get("min", 0)):
             raise file.error(loc, "nothing is within these bounds", got=f"min {cycle.min}, max {cycle.max}")
         if cycle.while_ is not None:

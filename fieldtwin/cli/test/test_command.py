@@ -228,7 +228,10 @@ def command(
 
 
 def _counts(results: Sequence[ScenarioResult], of: str) -> str:
-    """Return the last line, such as ``3 passed, 1 failed``. The results of a campaign and of its shrunk scenario are no seeds."""
+    """Return the last line, such as ``3 passed, 1 failed``.
+
+    It leaves out the results of a campaign and of its shrunk scenario.
+    """
     counts = Counter(result.verdict.value for result in results)
     return of + ", ".join(f"{n} {verdict}" for verdict, n in counts.items())
 

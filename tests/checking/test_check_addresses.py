@@ -34,7 +34,7 @@ def test_addresses_are_decimal_or_hexadecimal(text: str, cell: tuple[str, int, i
 @pytest.mark.parametrize(
     "text", ["holding:0x", "holding:0x10000", "holding:0xFFFF+2", "holding:163h", "holding:65536", "coil:1+0"]
 )
-def test_what_is_no_address_is_refused_with_an_example(text: str) -> None:
+def test_an_invalid_address_is_refused_with_an_example(text: str) -> None:
     with pytest.raises(UsageError, match="0x163"):
         _cell(text)
 

@@ -52,7 +52,7 @@ def check(unit: ModbusUnit, plan: Plan, url: str = URL, **options: Any) -> list[
 @pytest.mark.parametrize(
     "url", ["rtu:/virtual/line?baudrate=19200&frame=8E1", "ascii:/virtual/line?baudrate=9600&frame=7E1", URL]
 )
-def test_without_leave_nothing_but_reads_is_sent(url: str) -> None:
+def test_without_permission_only_reads_are_sent(url: str) -> None:
     unit = Listening()
     before = bytes(unit.bank.peek("holding", at) & 0xFF for at in range(200))  # type: ignore[attr-defined]
     results = check(unit, Plan(), url)
@@ -62,7 +62,7 @@ def test_without_leave_nothing_but_reads_is_sent(url: str) -> None:
     assert all(not r.spoken for r in results if r.case.danger.rank > Danger.READ.rank)
 
 
-def test_with_leave_to_write_only_the_lent_cells_change_and_get_back_what_was_there() -> None:
+def test_with_write_permission_only_the_given_cells_change_and_are_restored() -> None:
     unit = Listening()
     unit.bank.poke("holding", 199, 4711)  # type: ignore[attr-defined]
     unit.bank.poke("coil", 3, 1)  # type: ignore[attr-defined]
@@ -77,7 +77,7 @@ def test_with_leave_to_write_only_the_lent_cells_change_and_get_back_what_was_th
     assert all(r.verdict is Verdict.PASSED for r in results if r.case.danger is Danger.WRITE)
 
 
-def test_a_wire_refuses_what_the_danger_does_not_allow() -> None:
+def test_a_wire_refuses_requests_above_the_impact_level() -> None:
     async def never() -> Any:
         raise AssertionError
 
@@ -93,7 +93,7 @@ def test_a_wire_refuses_what_the_danger_does_not_allow() -> None:
     on_modbus(URL, use)
 
 
-def test_nobody_there_is_unreachable() -> None:
+def test_a_missing_device_is_unreachable() -> None:
     async def use(net: MemoryNet, url: str, clock: VirtualClock) -> None:
         with pytest.raises(Unreachable, match="unit 7"):
             await check_modbus(ModbusOptions(url, 7, Plan(), connector=net, clock=clock))
@@ -101,7 +101,7 @@ def test_nobody_there_is_unreachable() -> None:
     on_modbus("rtu:/virtual/line?baudrate=19200&frame=8E1", use)
 
 
-def test_nothing_is_sent_on_a_line_on_which_somebody_talks() -> None:
+def test_nothing_is_sent_on_a_line_with_foreign_traffic() -> None:
     asked: list[bytes] = []
 
     async def chatter(end: ByteConnection) -> None:
@@ -137,7 +137,7 @@ def fieldtwin(*words: str) -> Result:
     return CliRunner().invoke(command, list(words), standalone_mode=False)
 
 
-def test_what_writes_or_disrupts_is_confirmed() -> None:
+def test_writes_and_disruptions_need_confirmation() -> None:
     for words in (["--write", "holding:1"], ["--allow", "disrupt"]):
         result = fieldtwin("modbus", "tcp://127.0.0.1:1", *words)
         assert isinstance(result.exception, NotAllowed), words

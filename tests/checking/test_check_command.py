@@ -100,13 +100,13 @@ def test_a_waived_failure_is_skipped_and_all_is_well(device: str, tmp_path: Path
     assert "replaced in May" in case["reason"]
 
 
-def test_a_wrong_waiver_is_said_before_anything_is_sent(tmp_path: Path) -> None:
+def test_a_wrong_waiver_is_reported_before_anything_is_sent(tmp_path: Path) -> None:
     waivers = tmp_path / "waivers.yaml"
     waivers.write_text("waivers:\n  - {id: MB-999, reason: replaced in May, expires: 2999-05-31}\n")
     assert isinstance(check("tcp://127.0.0.1:1", "--waivers", waivers).exception, FileInvalid)
 
 
-def test_what_is_allowed_and_confirmed_is_played(device: str) -> None:
+def test_allowed_and_confirmed_cases_run(device: str) -> None:
     result = check(device, "--write", "holding:190", "--yes", "--json")
     played = {case["id"]: case["verdict"] for case in json.loads(result.stdout)["cases"]}
     assert played["MB-036d"] == "passed"

@@ -19,7 +19,7 @@ pdus = st.one_of(
 @pytest.mark.parametrize("framing", FRAMINGS)
 @given(said=st.lists(st.tuples(units, pdus), max_size=4))
 @settings(max_examples=40, deadline=None)
-def test_frames_one_behind_the_other_are_all_found(framing: str, said: list[tuple[int, bytes]]) -> None:
+def test_consecutive_frames_are_all_found(framing: str, said: list[tuple[int, bytes]]) -> None:
     data = b"".join(framed(framing, unit, pdu, n) for n, (unit, pdu) in enumerate(said))
     answers, rest = replies(framing, data)
     assert [(a.unit, a.pdu) for a in answers] == said
@@ -46,7 +46,7 @@ def test_an_exception_is_five_bytes_although_its_first_four_fit() -> None:
     assert replies("rtu", bytes.fromhex("01 80 01 80"))[0] == []
 
 
-def test_wrong_headers_are_no_frames() -> None:
+def test_wrong_headers_are_not_frames() -> None:
     body = b"\x01\x03\x02\x00\xaa"
     for adu in (mbap(body, 7, protocol=1), mbap(body, 7, length=0), mbap(body, 7, length=0xFFFF)):
         assert replies("mbap", adu) == ([], adu)

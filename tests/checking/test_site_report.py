@@ -83,7 +83,7 @@ def words_of(html: str) -> str:
     return " ".join(unescape(re.sub(r"<[^>]*>", " ", body)).split())
 
 
-def test_all_that_the_files_say_stands_in_it(check: Path, dump: Path, tmp_path: Path) -> None:
+def test_the_document_contains_everything_in_the_files(check: Path, dump: Path, tmp_path: Path) -> None:
     out = tmp_path / "site.html"
     result = report(
         check, dump, "-o", out, "--site", "Pump house 3", "--by", "A. Fitter", "--for", "Water board", "--label",
@@ -163,7 +163,7 @@ def test_serial_numbers_from_name_plates_go_before(check: Path, dump: Path, tmp_
     assert isinstance(report(check, "-o", out, "--serial", "unit 3=Z9").exception, UsageError)
 
 
-def test_a_folder_is_searched_and_what_does_not_belong_is_left_out(check: Path, dump: Path, tmp_path: Path) -> None:
+def test_a_folder_is_searched_and_unrelated_files_are_omitted(check: Path, dump: Path, tmp_path: Path) -> None:
     (tmp_path / "other.json").write_text("{}")
     (tmp_path / "node5.sent.jsonl").write_text('{"started": "x"}\n')
     result = report(tmp_path, "-o", tmp_path / "site.html")
@@ -209,23 +209,23 @@ def test_a_dump_that_left_out_addresses_between_others_is_called_sampled(tmp_pat
         '{"kind": "fieldtwin check", "about": {}, "cases": [1], "counts": 2}',
     ],
 )
-def test_what_is_no_such_file_is_refused(text: str, tmp_path: Path) -> None:
+def test_a_file_of_a_different_kind_is_refused(text: str, tmp_path: Path) -> None:
     path = tmp_path / "x.json"
     path.write_text(text)
     assert isinstance(report(path, "-o", tmp_path / "site.html").exception, FileInvalid)
     assert not (tmp_path / "site.html").exists()
 
 
-def test_a_damaged_file_of_a_folder_is_no_secret(check: Path, dump: Path, tmp_path: Path) -> None:
+def test_a_damaged_file_of_a_folder_is_reported(check: Path, dump: Path, tmp_path: Path) -> None:
     dump.write_text(dump.read_text().replace("1018h:04", "1018h:zz"))
     assert isinstance(report(tmp_path, "-o", tmp_path / "site.html").exception, FileInvalid)
 
 
-def test_nothing_is_no_document(tmp_path: Path) -> None:
+def test_an_empty_input_gives_no_document(tmp_path: Path) -> None:
     assert isinstance(report(tmp_path, "-o", tmp_path / "site.html").exception, UsageError)
 
 
-def test_the_report_of_a_check_shows_bytes_and_escapes_what_devices_say() -> None:
+def test_the_report_of_a_check_shows_bytes_and_escapes_text_of_devices() -> None:
     page = render_check(SUBJECT, RESULTS, "fieldtwin check modbus tcp://192.0.2.7:502 --unit 17")
     seen = words_of(page)
     assert "<script" not in page
@@ -283,7 +283,7 @@ JSON = st.recursive(
     ),
 )
 @settings(max_examples=80, deadline=None)
-def test_whatever_a_file_says_is_a_document_or_a_clear_refusal(
+def test_any_file_gives_a_document_or_a_clear_refusal(
     kind: str, keys: dict[str, object], tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     path = tmp_path_factory.getbasetemp() / "fuzzed.json"

@@ -69,14 +69,14 @@ def _good() -> list[Event]:
         ([Came(_at(1 + i / 10), i) for i in range(40)], "40 connections in 5.0 s"),
     ],
 )
-def test_what_no_master_may_do(more: list[Event], says: str) -> None:
+def test_forbidden_actions_of_a_client_fail(more: list[Event], says: str) -> None:
     events = sorted([*_good(), *more], key=lambda e: e.t_ns)
     finding = judges.rejects(_seen(*events))
     assert finding.verdict is Verdict.FAILED
     assert says.replace("41", str(42)) in finding.reason or says in finding.reason
 
 
-def test_a_good_master_passes_and_what_came_before_counts_for_nothing() -> None:
+def test_a_good_client_passes_and_earlier_traffic_does_not_count() -> None:
     before = Shown(_at(-1), Word.POISON, "3333")
     assert judges.rejects(_seen(before, *_good())).verdict is Verdict.PASSED
 
@@ -108,7 +108,7 @@ def test_a_short_frame_is_seen_at_once(gap_s: float, verdict: Verdict) -> None:
     assert judges.short_frame(_seen(*events, over_s=0, habit=habit, probed=False)).verdict is verdict
 
 
-def test_whoever_polls_no_sooner_than_its_timeout_cannot_be_judged_by_that() -> None:
+def test_a_client_that_polls_slower_than_its_timeout_gives_no_verdict_on_it() -> None:
     events = [Asked(_at(0), 1, READ), Told(_at(0), 1, b"x", False), Asked(_at(1), 1, READ)]
     habit = Habit(longest_gap_s=1.0, silent_gap_s=1.0)
     assert judges.short_frame(_seen(*events, over_s=0, habit=habit, probed=False)).verdict is Verdict.INCONCLUSIVE
@@ -153,7 +153,7 @@ def test_nmt_and_sync_against_the_standard() -> None:
 
 
 @pytest.mark.parametrize("cases", [CASES, CANOPEN_CASES], ids=["modbus", "canopen"])
-def test_every_case_says_what_it_is(cases: tuple[object, ...]) -> None:
+def test_every_case_describes_itself(cases: tuple[object, ...]) -> None:
     abouts = [case.about for case in cases]  # type: ignore[attr-defined]
     assert len({about.id for about in abouts}) == len(abouts)
     for about in abouts:
@@ -169,7 +169,7 @@ NOT_OF_MASTERS = {
 
 
 @pytest.mark.parametrize(("prefix", "rows", "cases"), [("MB", 70, CASES), ("CO", 66, CANOPEN_CASES)])
-def test_every_row_of_the_catalogue_is_played_or_is_no_business_of_a_master(
+def test_every_row_of_the_list_has_a_case_or_does_not_concern_clients(
     prefix: str, rows: int, cases: tuple[object, ...]
 ) -> None:
     played = {int(case.about.id[3:6]) for case in cases}  # type: ignore[attr-defined]

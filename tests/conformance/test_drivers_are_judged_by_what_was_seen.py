@@ -75,7 +75,7 @@ def _poller(
         (_poller(0.05, sees_short=False), Verdict.FAILED, "it waits out its timeout"),
     ],
 )
-def test_a_master_that_backs_off_is_no_master_that_waits_for_silence(
+def test_a_client_that_backs_off_does_not_count_as_waiting_for_silence(
     master: Callable[..., object], verdict: Verdict, says: str
 ) -> None:
     result = judge(master, LINE, "MB-021")["MB-021"]  # type: ignore[arg-type]
@@ -150,7 +150,7 @@ def test_a_number_in_a_line_of_another_form_is_inconclusive_with_the_way_out(tmp
     assert "give a tcp:// probe" in found["MB-024"][1]
 
 
-def test_with_a_mark_before_each_value_other_numbers_are_no_values(tmp_path: Path) -> None:
+def test_with_a_mark_before_each_value_other_numbers_are_not_values(tmp_path: Path) -> None:
     program = PUBLISHES.format(refused="exception 6 at 12 o'clock", good="level=%d")
     code, found, said = run_check(tmp_path, *MODBUS, program=program, probe="output:level=")
     assert code == 0, (found, said)
@@ -177,7 +177,7 @@ def test_only_the_places_of_values_in_lines_of_known_forms_are_values() -> None:
     assert seen == [(Word.SECOND, "2222"), (Word.OTHER, "0"), (Word.POISON, "3333"), (Word.UNCLEAR, "retry 5")]
 
 
-def test_a_marked_value_that_is_no_number_is_no_value() -> None:
+def test_a_marked_text_that_is_not_a_number_is_not_a_value() -> None:
     probe = MarkedOutputProbe("level=", Classifier(3333, frozenset({"-1"})))
     seen: list[tuple[Word, str]] = []
     probe.on_shown = lambda word, text: seen.append((word, text))

@@ -121,7 +121,7 @@ def test_a_failure_names_the_clause_that_requires_it_or_its_kind(id: str, said: 
     assert why(CaseResult(MASTERS[id], failed("seen"))) == said
 
 
-def test_the_printed_results_name_clauses_and_leave_out_cases_for_other_wires(
+def test_the_printed_results_name_clauses_and_omit_cases_for_other_wires(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     results = [
@@ -199,7 +199,7 @@ def test_fail_on_decides_whether_a_robustness_failure_of_a_client_gives_exit_cod
     assert '"pill failed' not in page
 
 
-def test_the_tables_of_known_failures_tell_required_cases_from_others() -> None:
+def test_the_tables_of_known_failures_distinguish_required_cases() -> None:
     text = (Path(__file__).parents[2] / "docs" / "conformance.md").read_text()
     devices = {case.id: case for case in DEVICES}
     rows = re.findall(r"^\| ([^|]+ \|(?: [^|]+ \| \d+ \|)?) ([^|]+) \| ([^|]+) \|$", text, re.MULTILINE)

@@ -110,13 +110,13 @@ def test_our_block_uploads_bear_lost_segments_and_wrong_check_sums() -> None:
     )
 
 
-def test_our_block_downloads_bear_what_nodes_make_of_them() -> None:
+def test_our_block_downloads_tolerate_the_behaviour_of_nodes() -> None:
     cases = ("CO-014a", "CO-014b", "CO-015b", "CO-016b")
     results = judge_canopen(partial(our_canopen, download=True), *cases)
     assert {id: (r.verdict, r.reason) for id, r in results.items()} == dict.fromkeys(cases, (Verdict.PASSED, ""))
 
 
-def test_without_a_probe_what_only_values_tell_is_skipped_and_says_so() -> None:
+def test_without_a_probe_cases_about_values_are_skipped_with_the_reason() -> None:
     results = judge(ours, LINE, "MB-002", "MB-020", "MB-022", "MB-013", probed=False)
     assert results["MB-002"].verdict is Verdict.SKIPPED
     assert "--probe" in results["MB-002"].reason

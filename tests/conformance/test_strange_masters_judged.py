@@ -124,7 +124,7 @@ def test_canopens_client_takes_a_29_bit_frame_for_an_answer(tmp_path: Path) -> N
     assert {id: verdict for id, (verdict, _) in found.items()} == {"CO-005": "passed", "CO-060": "failed"}
 
 
-def test_a_program_that_never_asks_is_told_with_its_last_words(tmp_path: Path) -> None:
+def test_a_program_that_never_asks_is_reported_with_its_last_output(tmp_path: Path) -> None:
     code, found, said = run_check(
         tmp_path,
         "modbus-master",
@@ -153,7 +153,7 @@ def test_a_program_that_never_asks_is_told_with_its_last_words(tmp_path: Path) -
         (["canopen-master", "--listen", "can:fieldtwin/127.0.0.1:0", "--hold", "6041=1"], "--hold"),
     ],
 )
-def test_bad_usage_is_told_in_one_line(args: list[str], says: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_usage_is_reported_in_one_line(args: list[str], says: str, capsys: pytest.CaptureFixture[str]) -> None:
     from fieldtwin.cli.main import main
 
     before = sys.argv

@@ -162,7 +162,7 @@ while True:
 
 
 @pytest.mark.long
-def test_a_port_that_the_case_gives_back_is_no_connection_of_the_master(tmp_path: Path) -> None:
+def test_a_port_that_the_case_releases_is_not_a_connection_of_the_client(tmp_path: Path) -> None:
     """Defect: the evidence said that the client opened a connection, but the reason said that the client sent nothing
     any more."""
     (tmp_path / "master.py").write_text(GIVES_UP_ITS_PORT)

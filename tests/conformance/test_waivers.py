@@ -44,13 +44,13 @@ def test_a_failure_is_waived_up_to_and_on_the_last_day() -> None:
 
 
 @pytest.mark.parametrize("finding", [failed("published 3333"), passed(), skipped("no such request")])
-def test_an_expired_waiver_is_a_failure_that_says_so_whatever_was_found(finding: Finding) -> None:
+def test_an_expired_waiver_is_a_failure_that_states_the_expiry(finding: Finding) -> None:
     result = _waived(finding, date(2027, 6, 1))
     assert result.verdict is Verdict.FAILED
     assert "its waiver expired on 2027-05-31 (replaced in May)" in result.reason
 
 
-def test_what_passes_needs_no_waiver() -> None:
+def test_a_passing_case_needs_no_waiver() -> None:
     assert _waived(passed(), date(2027, 1, 1)).verdict is Verdict.PASSED
 
 
@@ -68,7 +68,7 @@ def test_what_passes_needs_no_waiver() -> None:
         ),
     ],
 )
-def test_a_bad_file_is_told_with_its_place(old: str, new: str, says: str) -> None:
+def test_a_bad_file_is_reported_with_its_place(old: str, new: str, says: str) -> None:
     with pytest.raises(FileInvalid) as error:
         _waivers(GOOD.replace(old, new))
     assert says in str(error.value)

@@ -106,7 +106,7 @@ async def _gives_up(net: MemoryNet, endpoint: Endpoint, clock: VirtualClock, pub
     await asyncio.Event().wait()
 
 
-def test_a_master_that_never_asks_again_is_wedged_and_what_follows_is_inconclusive() -> None:
+def test_a_client_that_never_asks_again_is_wedged_and_later_cases_are_inconclusive() -> None:
     results = judge(_gives_up, "rtu:/line?baudrate=19200", "MB-003", "MB-014")
     assert results["MB-003"].verdict is Verdict.FAILED
     assert "wedged" in results["MB-003"].reason
@@ -145,7 +145,7 @@ async def _naive_sdo(net: MemoryNet, endpoint: Endpoint, clock: VirtualClock, pu
         await asyncio.sleep(LAZY_S)
 
 
-def test_a_naive_sdo_client_fails_what_it_does_not_look_at() -> None:
+def test_a_naive_sdo_client_fails_the_cases_that_it_ignores() -> None:
     results = judge_canopen(_naive_sdo, "CO-001", "CO-005", "CO-060", "CO-008")
     assert "published 14" in results["CO-001"].reason, "the indicated length, taken for the value"
     for case in ("CO-001", "CO-005", "CO-060"):

@@ -22,7 +22,7 @@ from fieldtwin.cli.main import COMMANDS
 from fieldtwin.cli.system.schema_command import SCHEMAS
 
 
-def test_links_between_files_lead_somewhere():
+def test_links_between_files_work():
     pages = book.pages()
     for source, page in pages.items():
         book.with_links((ROOT / source).read_text("utf-8"), source, page, pages)
@@ -72,7 +72,7 @@ def test_the_books_source_has_every_kind_of_file_every_fault_and_every_command(t
     assert all(f"`{name}`" in faults for name in form_pages.FAULTS)
 
 
-def test_the_public_api_is_in_the_reference_and_what_is_there_exists():
+def test_the_public_api_equals_the_reference():
     page = (ROOT / "docs/reference/api.md").read_text("utf-8")
     told = re.findall(r"^\.\. auto\w+:: ([\w.]+)$", page, re.MULTILINE)
     assert {name.removeprefix("fieldtwin.") for name in told} >= set(fieldtwin.__all__) - {"__version__"}

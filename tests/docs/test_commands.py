@@ -88,7 +88,7 @@ def test_commands_of_a_page_are_there(page):
     assert not wrong, "\n".join(wrong)
 
 
-def test_every_command_is_shown_somewhere():
+def test_every_command_is_shown_on_a_page():
     told = {words[1] for page in PAGES for words in shown(page.read_text("utf-8")) if len(words) > 1}
     assert set(COMMANDS) - told == set()
 
@@ -114,7 +114,7 @@ def test_yaml_and_json_of_the_pages_can_be_read():
             json.loads(value)
 
 
-def test_python_of_the_pages_is_python_and_imports_what_there_is():
+def test_python_of_the_pages_compiles_and_imports_existing_names():
     ours = {"fieldtwin", "gateway", "plc", "twin", "emulators"}
     for page, body in fences("python"):
         for node in ast.walk(ast.parse(body, page)):

@@ -17,7 +17,7 @@ def _as_test(page: Path):
 
 
 @pytest.mark.parametrize("page", [_as_test(page) for page in PAGES])
-def test_what_a_page_shows_is_so(page):
+def test_the_output_on_a_page_is_true(page):
     # short, because socket paths are created below it
     with tempfile.TemporaryDirectory(prefix="pg", dir="/tmp") as folder:
         reader = Reader(Path(folder))
@@ -33,7 +33,7 @@ def test_a_tutorial_cannot_be_left_out():
     assert tutorials <= {page.name for page in PAGES}
 
 
-def test_a_page_that_shows_something_else_is_noticed(tmp_path):
+def test_a_page_with_wrong_output_is_detected(tmp_path):
     reader = Reader(tmp_path)
     reader.does(Block("file", "a.txt", "one\n", 1))
     reader.does(Block("run", "", "$ cat a.txt\none\n", 3))

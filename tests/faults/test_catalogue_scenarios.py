@@ -57,7 +57,7 @@ def test_every_row_of_the_catalogues_has_a_scenario_or_a_reason() -> None:
 
 
 @pytest.mark.parametrize(("row", "why"), ELSEWHERE.items())
-def test_what_has_no_scenario_is_tested_elsewhere(row: str, why: int) -> None:
+def test_rows_without_a_scenario_are_tested_elsewhere(row: str, why: int) -> None:
     tests = FOLDER.parents[1]
     names = (row, row.replace("-", "_").lower())
     files = [f for place in WHERE[why][1] for f in ([tests / place] if "." in place else (tests / place).glob("*.py"))]

@@ -117,7 +117,7 @@ def test_on_a_line(name: str, said: dict[str, Any], expected: list[tuple[bytes, 
         ("corrupt-crc", {}, "0007 0000 0007" + REPLY),
     ],
 )
-def test_behind_an_mbap_header(name: str, said: dict[str, Any], expected: str) -> None:
+def test_faults_after_an_mbap_header(name: str, said: dict[str, Any], expected: str) -> None:
     assert pieces(struck(name, ON_TCP, Framing.MBAP, **said)) == [(bytes.fromhex(expected), 0.0)]
 
 
@@ -138,7 +138,7 @@ def test_the_check_sum_of_ascii() -> None:
     assert (spoilt[:-4], spoilt[-2:]) == (IN_ASCII[:-4], b"\r\n")
 
 
-def test_what_is_left_to_chance() -> None:
+def test_random_choices_of_faults() -> None:
     ((spoilt, _),) = pieces(struck("corrupt-bits", ON_LINE, bits=3))
     assert sum((a ^ b).bit_count() for a, b in zip(spoilt, ON_LINE, strict=True)) == 3
     ((fits, _),) = pieces(struck("corrupt-bits", ON_LINE, fits=True))
@@ -161,7 +161,7 @@ def test_an_echo_goes_back_first() -> None:
     assert struck("echo", ON_LINE).pieces == (Piece(ON_LINE, back=True), Piece(ON_LINE))
 
 
-def test_what_becomes_of_a_connection() -> None:
+def test_faults_of_a_connection() -> None:
     assert struck("reset", ON_TCP, Framing.MBAP, at=4) == Outcome((Piece(ON_TCP[:4]),), Hang.RESET)
     assert struck("half-open", ON_TCP, Framing.MBAP) == Outcome(hang=Hang.HALF_OPEN)
     assert made("disconnect").appears() is Hang.CLOSE
@@ -230,7 +230,7 @@ def test_on_a_can_bus(
         assert after == expected
 
 
-def test_what_a_node_says_unasked() -> None:
+def test_faults_of_unsolicited_frames_of_a_node() -> None:
     emcy = made("emcy-burst", count=3, code=0x8110, every_ms=2).appears(NODE, Random(1))
     assert [(p.frame.can_id, p.frame.data[:2], p.delay_s) for p in emcy] == [
         (0x85, b"\x10\x81", n * 0.002) for n in range(3)
@@ -243,7 +243,7 @@ def test_what_a_node_says_unasked() -> None:
     assert [(p.frame, p.delay_s) for p in boots] == [(CanFrame(0x705, b"\0"), n * 0.05) for n in range(3)]
 
 
-def test_what_comes_late_on_a_can_bus() -> None:
+def test_late_frames_on_a_can_bus() -> None:
     (beat,) = made("heartbeat-late", most_ms=300).strike(CanFrame(0x705, b"\5"), NODE, Random(1))
     assert 0 < beat.delay_s <= 0.3
     sync = made("sync-jitter", most_ms=5)
@@ -253,7 +253,7 @@ def test_what_comes_late_on_a_can_bus() -> None:
     assert 0 < heard.delay_s <= 0.005
 
 
-def test_what_is_of_the_wire_itself() -> None:
+def test_faults_of_the_wire_itself() -> None:
     assert (made("error-frame").attempts, made("bus-off").attempts) == (None, 32)
     assert isinstance(made("bus-off"), BusFault)
 
@@ -330,7 +330,7 @@ def hits(fault: Active, times: int = 8, frame: Frame = REQUEST) -> list[int]:
         ({"probability": 0.0}, []),
     ],
 )
-def test_what_is_aimed_at(aim: dict[str, Any], struck: list[int]) -> None:
+def test_faults_with_a_target(aim: dict[str, Any], struck: list[int]) -> None:
     assert hits(active(**aim)) == struck
 
 
@@ -353,7 +353,7 @@ def test_faults_strike_one_after_the_other() -> None:
 
 
 @pytest.mark.parametrize("divides", [kind for kind in FAULTS.values() if issubclass(kind, WireFault) and kind.divides])
-def test_what_divides_a_frame_strikes_after_all_others(divides: type[WireFault]) -> None:
+def test_a_fault_that_divides_a_frame_acts_after_all_others(divides: type[WireFault]) -> None:
     """Otherwise the bytes of `garbage` would be inside the frame, and Modbus TCP has no checksum to detect them."""
     faults = WireFaults(Framing.MBAP)
     for fault in (divides(divides.form()), made("garbage", data="FFFF")):
@@ -418,7 +418,7 @@ def test_frames_of_a_stream_are_found_however_they_are_cut(
     assert [f.data for f in found] == frames
 
 
-def test_of_mqtt_only_what_nobody_agreed_to_bring_is_struck() -> None:
+def test_only_mqtt_packets_without_delivery_guarantee_are_dropped() -> None:
     """PUBLISH with QoS 0. Other packets establish the session with the broker, and TCP delivers them."""
     faults = WireFaults(Framing.MQTT)
     faults.put_in(Active("drop", made("drop"), Aim(), Random(1), 0, None))

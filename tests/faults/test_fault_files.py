@@ -41,7 +41,7 @@ from fieldtwin.twin.site.system import load_system
         ("faults:\n  - {name: drop, by_ms: 5}\n", ":2:18: unknown key 'by_ms' in fault drop"),
     ],
 )
-def test_what_is_wrong_is_said_where_it_is(tmp_path: Path, text: str, told: str) -> None:
+def test_an_error_in_a_fault_file_is_reported_at_its_position(tmp_path: Path, text: str, told: str) -> None:
     path = tmp_path / "faults.yaml"
     path.write_text(text)
     with pytest.raises(FileInvalid) as raised:
@@ -127,7 +127,7 @@ def test_they_are_listed() -> None:
         ("{name: drop, device: ctd, until: soon}", "5s, 250ms, 2min or 24h", 31),
     ],
 )
-def test_what_a_system_cannot_suffer_is_refused_where_it_stands(
+def test_a_fault_that_a_system_cannot_have_is_refused_at_its_position(
     tmp_path: Path, said: str, told: str, column: int
 ) -> None:
     system = load_system("observatory")

@@ -139,7 +139,7 @@ def test_the_table_has_every_fault() -> None:
     assert {row.name for row in ROWS} == set(FAULTS)
 
 
-def test_each_fault_is_seen_for_what_it_is_and_is_over_when_it_is_over() -> None:
+def test_each_fault_has_its_effect_and_ends_with_its_time() -> None:
     run = through([(row.wire, row.name, row.said) for row in ROWS], _by_hand)
     assert run.errors == []
     wrong = [f"{row.wire} {row.name}: {what}" for row in ROWS for what in _wrong(row, run.seen[row.wire, row.name])]

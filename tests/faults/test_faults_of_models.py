@@ -59,7 +59,7 @@ def tank(tmp_path: Path) -> tuple[StatedRegisters, DistortedRegisters]:
     return bank, DistortedRegisters(bank, bank.peek, profile, bank.journal)
 
 
-def test_registers_of_a_model_hold_something_else_and_their_own_again(
+def test_registers_of_a_model_hold_the_set_value_and_their_own_again(
     tank: tuple[StatedRegisters, DistortedRegisters],
 ) -> None:
     bank, seen = tank
@@ -138,7 +138,7 @@ LOG = """
 """
 
 
-def test_a_node_that_plays_a_log_holds_what_is_set(tmp_path: Path) -> None:
+def test_a_node_that_replays_a_log_holds_a_set_value(tmp_path: Path) -> None:
     made = node(tmp_path, LOG)
     assert held(made, 0x6010, 0) == 1234
     id = put(made.distortions, "set", "slope_long", value=-7.25)
@@ -152,7 +152,7 @@ def test_a_node_that_plays_a_log_holds_what_is_set(tmp_path: Path) -> None:
     ]
 
 
-def test_a_node_without_a_recording_holds_what_is_set_and_its_own_value_again(tmp_path: Path) -> None:
+def test_a_node_without_a_recording_holds_a_set_value_and_its_own_again(tmp_path: Path) -> None:
     made = node(tmp_path)
     before = held(made, 0x6010, 0)
     ids = [

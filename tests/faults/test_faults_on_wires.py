@@ -119,7 +119,7 @@ def test_half_open_is_silence_until_a_new_connection() -> None:
     run(main())
 
 
-def test_what_is_split_arrives_in_pieces() -> None:
+def test_a_split_frame_arrives_in_pieces() -> None:
     async def main() -> None:
         async with device(at_once({"name": "split", "at": 3, "pause_ms": 30})) as connect:
             reader, writer = await connect()
@@ -130,7 +130,7 @@ def test_what_is_split_arrives_in_pieces() -> None:
     run(main())
 
 
-def test_a_pty_hears_what_the_fault_makes_of_it(tmp_path: Path) -> None:
+def test_a_pty_receives_the_output_of_the_fault(tmp_path: Path) -> None:
     async def main() -> None:
         plant = Endpoint.parse("rtu:/dev/ttyS0?baudrate=19200&frame=8N1")
         port, _ = await OsPorts().serial(tmp_path / "line", plant, None)
@@ -172,7 +172,7 @@ async def linked(stranger: Any, faults: Any) -> Any:
         await server.wait_closed()
 
 
-def test_a_link_puts_faults_between_strangers() -> None:
+def test_a_link_injects_faults_between_third_party_programs() -> None:
     async def main() -> None:
         async def stranger(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
             while await reader.read(100):

@@ -24,7 +24,7 @@ FIELDS = {
 """By tshark's name: which of the frames carry it, according to CiA 301."""
 
 
-def test_all_that_the_node_says_is_sound_canopen(tmp_path: Path) -> None:
+def test_all_frames_of_the_node_are_valid_canopen(tmp_path: Path) -> None:
     endpoint = Endpoint.parse("can:fieldtwin/127.0.0.1:1")
     frames = [
         CanFrame(int(can_id, 16), bytes.fromhex(data))

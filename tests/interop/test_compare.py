@@ -89,7 +89,7 @@ def test_polls_may_repeat_and_fall_anywhere() -> None:
     ]
 
 
-def test_what_a_poll_was_answered_counts_and_not_how_often() -> None:
+def test_the_values_of_a_poll_count_and_not_their_number() -> None:
     old, new = (READ[0], "01 03 02 0001"), (READ[0], "01 03 02 0002")
     r = rules(polls=[POLL])
     assert found(talk(old, old, new), talk(old, new, new), r) == []
@@ -100,7 +100,7 @@ def test_what_a_poll_was_answered_counts_and_not_how_often() -> None:
     assert found(talk(old, new), talk(old, (READ[0], "01 03 02 0003")), spare) != []  # and not if it differs
 
 
-def test_swapped_words_are_another_value() -> None:
+def test_swapped_words_are_a_different_value() -> None:
     at = {"name": "pressure", "at": 3, "format": ">f", "within": 0.5, "why": "test"}
     r = rules(polls=[{**POLL, "fields": [at]}])
 
@@ -113,7 +113,7 @@ def test_swapped_words_are_another_value() -> None:
     assert found(read(near), read(near[2:] + near[:2]), r)[0].startswith("pressure: 10.5 +- 0.5 / ")
 
 
-def test_streams_have_an_order_of_their_own() -> None:
+def test_streams_are_ordered_separately() -> None:
     one, two, three = (("01 06 0009 " + v, "01 06 0009 " + v) for v in ("0001", "0002", "0003"))
     r = rules(streams=[{"request": "01 06 0009", "why": "test", "spare": {"most": 1, "why": "test"}}])
     assert found(talk(one, WRITE, two), talk(WRITE, one, two, three), r) == []
@@ -183,7 +183,7 @@ def test_an_rtu_capture_becomes_exchanges_however_it_was_cut() -> None:
         ),
     ],
 )
-def test_a_frame_that_is_none_is_a_fault_and_a_difference(
+def test_an_invalid_frame_is_a_fault_and_a_difference(
     read: Callable[[str, list[Captured]], Conversation], items: list[tuple[Direction, bytes | CanFrame]], fault: str
 ) -> None:
     faulty = read("device", captured(*items))

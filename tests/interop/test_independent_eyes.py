@@ -104,7 +104,7 @@ def changed(captured: list[Captured], endpoint: Endpoint, spot: int) -> list[Cap
     return [captured[0], Captured(reply.t_ns, endpoint, reply.direction, item), *captured[2:]]
 
 
-def test_what_a_run_captures(short_dir: Callable[[], Path], tmp_path: Path) -> None:
+def test_the_content_of_a_capture(short_dir: Callable[[], Path], tmp_path: Path) -> None:
     """``fieldtwin run --capture FILE`` from the command line: tshark can read every wire in the file."""
     capture = tmp_path / "capture.jsonl"
     command = [sys.executable, "-m", "fieldtwin", "run", "observatory", "--prototype", "--for", "3s"]

@@ -85,7 +85,7 @@ async def ctd(wire: str, folder: Path) -> AsyncIterator[Master]:
 
 
 @pytest.mark.parametrize("wire", ["rtu", "tcp"])
-def test_mbpoll_reads_what_the_ctd_holds(wire: str, tmp_path: Path) -> None:
+def test_mbpoll_reads_the_values_of_the_ctd(wire: str, tmp_path: Path) -> None:
     async def main() -> None:
         async with ctd(wire, tmp_path) as mbpoll:
             assert await mbpoll("4", 1, count=2) == ["0", "0"]  # standby, period 0
@@ -110,7 +110,7 @@ def test_mbpoll_reads_what_the_ctd_holds(wire: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("wire", ["rtu", "tcp"])
-def test_mbpoll_is_refused_as_the_profile_says(wire: str, tmp_path: Path) -> None:
+def test_mbpoll_is_refused_according_to_the_profile(wire: str, tmp_path: Path) -> None:
     async def main() -> None:
         async with ctd(wire, tmp_path) as mbpoll:
             assert "Illegal data address" in (await mbpoll("4", 50))[0]

@@ -18,7 +18,7 @@ HERE = Path(__file__).parent
 pytestmark = [pytest.mark.interop, pytest.mark.long, pytest.mark.timeout(300)]
 
 
-def test_a_scan_finds_the_two_units_and_says_once_what_the_others_answered(tmp_path: Path) -> None:
+def test_a_scan_finds_the_two_units_and_reports_the_other_answers_once(tmp_path: Path) -> None:
     fetched = subprocess.run(
         [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--target", str(tmp_path / "old"), "pymodbus==3.9.2"],
         capture_output=True, text=True, timeout=200, check=False,

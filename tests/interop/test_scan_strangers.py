@@ -70,7 +70,7 @@ def test_on_a_line_the_units_are_found(peer: str, short_dir: Callable[[], Path])
     run(main(), timeout_s=40)
 
 
-def test_pymodbus_on_tcp_says_which_units_are_missing() -> None:
+def test_pymodbus_on_tcp_answers_for_missing_units() -> None:
     async def main() -> None:
         async with serving("pymodbus", "mbap", [5, 9]) as port:
             found = await scan(f"tcp://127.0.0.1:{port}", units=(4, 5, 6, 9), timeout_s=1.0)

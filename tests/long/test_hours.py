@@ -65,7 +65,7 @@ def behind_all_else() -> Iterator[None]:
         os.setpriority(os.PRIO_PROCESS, 0, 0)
 
 
-def test_hours_in_peace(tmp_path: Path) -> None:
+def test_hours_without_faults(tmp_path: Path) -> None:
     run_hours(slow_scan(tmp_path), HOURS // 10, random_faults=False)
 
 

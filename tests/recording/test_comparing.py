@@ -39,7 +39,7 @@ def compared(
         (Tolerance(share=0.01), 990, True), (Tolerance(share=0.01), 989, False), (Tolerance(20, 0.01), 1020, True),
     ],
 )  # fmt: skip
-def test_words_are_alike_inside_their_tolerance(tolerance: Tolerance, other: int, alike: bool) -> None:
+def test_words_are_equal_within_their_tolerance(tolerance: Tolerance, other: int, alike: bool) -> None:
     result = compared([asked(read(5), values(1000))], [asked(read(5), values(other))], Rules(tolerance))
     assert result.met is alike
     assert [(d.where, d.recorded, d.other) for d in result.differences] == (
@@ -47,7 +47,7 @@ def test_words_are_alike_inside_their_tolerance(tolerance: Tolerance, other: int
     )
 
 
-def test_tags_have_tolerances_of_their_own_and_counters_may_have_grown(tmp_path: Path) -> None:
+def test_tags_have_separate_tolerances_and_counters_may_have_increased(tmp_path: Path) -> None:
     path = tmp_path / "p.yaml"
     path.write_text(
         'device: a/b\nsource: ""\nprotocol: modbus\ntags:\n'
@@ -81,7 +81,7 @@ def test_latencies_are_judged_by_median_and_90_percent(latency_s: float, met: bo
     assert compared(one, two, Rules(latency=None)).met
 
 
-def test_what_counts_the_wire_is_not_compared_and_nothing_is_no_agreement() -> None:
+def test_wire_counters_are_not_compared_and_an_empty_comparison_is_not_a_match() -> None:
     request = bytes.fromhex("08000b0000")
     assert compared([asked(request, request)], [asked(request, bytes.fromhex("08000b0007"))]).met
     assert not compared([], []).met

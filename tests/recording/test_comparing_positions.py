@@ -60,7 +60,7 @@ def compared(
     return comparer.result()
 
 
-def test_an_emulator_that_loops_is_alike_whatever_was_read_before() -> None:
+def test_an_emulator_that_loops_is_equal_whatever_was_read_before() -> None:
     for before in range(14):
         device = emulator(RAMP, WhenUsedUp.LOOP)
         for _ in range(before):
@@ -71,7 +71,7 @@ def test_an_emulator_that_loops_is_alike_whatever_was_read_before() -> None:
 
 
 @pytest.mark.parametrize("before", range(1, 9))
-def test_what_an_emulator_that_holds_has_left_is_compared_and_the_rest_is_inconclusive(before: int) -> None:
+def test_the_remaining_values_of_a_holding_emulator_are_compared_and_the_rest_is_inconclusive(before: int) -> None:
     device = emulator(RAMP)
     for _ in range(before):
         device(1, READ)
@@ -122,7 +122,7 @@ def test_another_dialogue_is_a_difference(values: tuple[int, ...]) -> None:
     assert (result.met, result.inconclusive) == (False, False)
 
 
-def test_a_wrong_register_beside_one_that_moved_is_a_difference() -> None:
+def test_a_wrong_register_next_to_one_that_changed_is_a_difference() -> None:
     left = iter((30, 40, 50, 60, 60, 60))
     result = compared(RAMP, lambda unit, pdu: registers(8, next(left)))
     assert (result.met, result.inconclusive) == (False, False)

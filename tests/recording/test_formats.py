@@ -74,7 +74,7 @@ def test_tables_of_all_sorts_become_signals(tmp_path: Path, text: str, columns: 
         assert bool(reader.header.start_utc) == ("T12" in text)
 
 
-def test_a_flaw_in_a_table_is_told_with_its_line_and_leaves_nothing(tmp_path: Path) -> None:
+def test_an_error_in_a_table_is_reported_with_its_line_and_leaves_no_file(tmp_path: Path) -> None:
     for text, line in (("t,x\n1,2\n0,3\n", 3), ("t,x\n1,2\nnoon,3\n", 3), ('t,x\n1,"2\n', 2), ("", 1), ("t,x\n", 2)):
         with pytest.raises(FileInvalid) as caught:
             import_csv(table(tmp_path, text), tmp_path / "r.jsonl", columns={})
@@ -151,7 +151,7 @@ Data type.............: {kind}
         ("16-bit register, input register table", 1, "Read input register failed: Connection timed out", "0421000001", None),
     ],
 )  # fmt: skip
-def test_what_mbpoll_prints_is_an_exchange(
+def test_the_output_of_mbpoll_becomes_exchanges(
     kind: str, count: int, printed: str, request_hex: str, reply_hex: str | None
 ) -> None:
     text = POLL.format(kind=kind, count=count, values=f"{printed}\n-- Polling slave 7...\n{printed}")
@@ -178,7 +178,7 @@ Illegal Data Address exception response!
 """
 
 
-def test_what_modpoll_prints_is_an_exchange() -> None:
+def test_the_output_of_modpoll_becomes_exchanges() -> None:
     request = bytes.fromhex("0400630002")
     assert [(e.t_s, e.request, e.reply) for e in read_polls(MODPOLL.splitlines())] == [
         (0.0, request, bytes.fromhex("04040007fff8")), (1.0, request, None), (2.0, request, b"\x84\x02"),
@@ -251,7 +251,7 @@ def test_parquet(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(TSHARK is None, reason="tshark is not installed")
-def test_tshark_opens_what_is_exported(tmp_path: Path) -> None:
+def test_tshark_opens_exported_files(tmp_path: Path) -> None:
     def tshark(path: Path, *fields: str) -> list[list[str]]:
         command = [str(TSHARK), "-r", str(path), "-T", "fields", "-E", "occurrence=a"]
         done = subprocess.run(

@@ -52,7 +52,7 @@ def node_of(frames: Log) -> CanopenNode:
     return CanopenNode(dictionary, 5, NodeContext(source=objects, factory=objects.initial, refusals=objects.refusals))
 
 
-def test_it_answers_as_it_did_and_sends_what_it_sent() -> None:
+def test_it_answers_and_sends_as_recorded() -> None:
     frames = log()
     assert nodes_of(frames) == [5]
     node = node_of(frames)
@@ -77,7 +77,7 @@ def test_it_answers_as_it_did_and_sends_what_it_sent() -> None:
     assert 35 <= len({d[0] for d in data}) <= 41
 
 
-def test_a_mapping_that_the_log_tells_is_used() -> None:
+def test_a_mapping_in_the_log_is_used() -> None:
     told = "605#40001A0000000000 585#4F001A0001000000 605#40001A0100000000 585#43001A0110000260"
     frames = [(n * MS, frame(text)) for n, text in enumerate(told.split())]
     frames += [(at * MS, frame("185#3412")) for at in range(100, 600, 100)]

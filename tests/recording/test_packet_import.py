@@ -87,7 +87,7 @@ def test_segments_in_any_order_repeated_and_overlapping_give_the_same(tmp_path: 
     assert [e.request for e in found] == [read(i) for i in range(6)]
 
 
-def test_what_the_capture_lost_is_told_and_the_rest_is_found(tmp_path: Path) -> None:
+def test_losses_of_the_capture_are_reported_and_the_rest_is_found(tmp_path: Path) -> None:
     talk = Talk()
     talk.say(True, mbap(1, 1, read(1)))
     talk.say(False, mbap(1, 1, values(1))[:4])
@@ -194,7 +194,7 @@ def test_can_frames_become_a_log(tmp_path: Path) -> None:
     ]  # fmt: skip
 
 
-def test_a_line_whose_directions_nobody_said(tmp_path: Path) -> None:
+def test_a_line_with_unknown_directions(tmp_path: Path) -> None:
     _, found = imported(tmp_path, pcap([crc(b"\x01" + read(1)), crc(b"\x01" + values(5)), crc(b"\x01" + read(2))], 147))
     assert told(found) == [(1, read(1), values(5)), (1, read(2), None)]
 

@@ -47,7 +47,7 @@ def pieces(data: bytes, sizes: list[int]) -> list[bytes]:
 
 @settings(max_examples=40)
 @given(st.permutations(range(5)), cuts, cuts)
-def test_pipelined_requests_are_told_in_order_however_they_are_cut(
+def test_pipelined_requests_are_paired_in_order_however_they_are_cut(
     order: list[int], one: list[int], two: list[int]
 ) -> None:
     requests = b"".join(mbap(7 + i, i, read(i)) for i in range(5))
@@ -58,7 +58,7 @@ def test_pipelined_requests_are_told_in_order_however_they_are_cut(
     assert (wire.counters.exchanges, wire.counters.malformed, wire.counters.strays) == (5, 0, 0)
 
 
-def test_what_has_no_answer_another_one_or_none_to_it_is_told() -> None:
+def test_missing_wrong_and_surplus_answers_are_reported() -> None:
     bad: list[Bad] = []
     wire = MbapPairer(0, bad.append)
     found = run(
@@ -85,7 +85,7 @@ def test_what_has_no_answer_another_one_or_none_to_it_is_told() -> None:
     ]
 
 
-def test_requests_that_nobody_answers_do_not_pile_up() -> None:
+def test_unanswered_requests_do_not_pile_up() -> None:
     wire = MbapPairer(0)
     found = [e for i in range(1000) for e in wire.feed(True, mbap(i, 1, read(i)), i)]
     assert len(found) == 1000 - 64
@@ -102,7 +102,7 @@ def test_a_line_is_paired_however_it_is_cut(sizes: list[int]) -> None:
     assert told(run(SerialPairer("rtu", 0), *chunks)) == [(1 + i, read(i), values(i), None) for i in range(3)]
 
 
-def test_silence_noise_strangers_and_broadcasts_on_a_line() -> None:
+def test_silence_noise_foreign_frames_and_broadcasts_on_a_line() -> None:
     broadcast = bytes.fromhex("06 0001 0005")
     wire = SerialPairer("rtu", 0)
     found = run(
@@ -122,7 +122,7 @@ def test_silence_noise_strangers_and_broadcasts_on_a_line() -> None:
     assert (wire.counters.strays, wire.counters.malformed) == (1, 1)
 
 
-def test_ascii_and_one_wire_both_ways() -> None:
+def test_ascii_and_half_duplex_in_both_directions() -> None:
     def ascii_frame(data: bytes) -> bytes:
         return b":" + (data + bytes((-sum(data) & 0xFF,))).hex().upper().encode() + b"\r\n"
 

@@ -94,7 +94,7 @@ def test_a_device_is_recorded_emulated_and_compared(tmp_path: Path) -> None:
         (("tcp://127.0.0.1:1", "--like", "w.jsonl", "-o", "x.jsonl"), "asks nothing that may be asked again"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_recorded_is_said(
+def test_unrecordable_items_are_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...], error: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -145,7 +145,7 @@ def test_a_dry_run_prints_the_frames_and_opens_nothing(tmp_path: Path) -> None:
     assert not out.exists()
 
 
-def test_tolerances_that_are_none_and_files_that_are_not_there(tmp_path: Path) -> None:
+def test_invalid_tolerances_and_missing_files(tmp_path: Path) -> None:
     path = _write(tmp_path / "w.jsonl", "0300010001")
     for tolerance in ("x", "-1", "nan%", "1,5"):
         with pytest.raises(UsageError, match="tolerance"):

@@ -32,7 +32,7 @@ outcomes = st.sampled_from(["values", "values", "values", "02", "03", "silence",
 
 @settings(max_examples=80)
 @given(st.lists(st.tuples(spans, outcomes, st.booleans()), min_size=1, max_size=25))
-def test_every_cell_goes_on_in_recorded_order_whatever_it_was_read_with(
+def test_every_cell_continues_in_recorded_order_whatever_it_was_read_with(
     steps: list[tuple[tuple[int, int], str, bool]],
 ) -> None:
     """Compare with a handwritten list per cell; some writes occur between reads, to a register that is never read."""
@@ -70,7 +70,7 @@ def test_outcomes_of_a_read_keep_their_order_and_latency() -> None:
     assert replay.counters.silences == 1
 
 
-def test_copies_share_what_was_recorded_and_each_begins_at_the_beginning() -> None:
+def test_copies_share_the_recording_and_each_starts_at_its_beginning() -> None:
     replay = ExchangeReplay([asked(read(0, 2), values(n, n + 50)) for n in range(3)], when_used_up=WhenUsedUp.LOOP)
     one, two = replay.copy(), replay.copy()
     assert [words(one, 0)[0] for _ in range(5)] == [0, 1, 2, 0, 1]
@@ -87,7 +87,7 @@ def test_a_recording_that_is_too_long_keeps_its_newer_half(monkeypatch: pytest.M
     assert words(replay, 0)[0] == first + 1
 
 
-def test_what_lies_between_recorded_registers_is_interpolated_when_that_is_said() -> None:
+def test_cells_between_recorded_registers_are_interpolated_on_request() -> None:
     recorded = [asked(read(10, 2), values(0, 100)), asked(read(15), values(500)), asked(read(10, 2), values(0, 200)),
                 asked(read(3, 1, 1), b"\x01\x01\x01"), asked(read(8, 1, 1), b"\x01\x01\x00")]  # fmt: skip
     replay = ExchangeReplay(recorded, never_recorded=NeverRecorded.INTERPOLATE)

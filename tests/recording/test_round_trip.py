@@ -164,7 +164,7 @@ def _free_port() -> int:
         return found
 
 
-def test_a_server_of_somebody_else_is_recorded_and_its_emulator_is_as_good(tmp_path: Path) -> None:
+def test_a_third_party_server_is_recorded_and_its_emulator_is_equivalent(tmp_path: Path) -> None:
     """A pymodbus server: 100 registers that count, then exception 02."""
     requests = ["0300000064", "0300000001", "0300630001", "0300640001", "03005f000a"]
     wanted = write(tmp_path / "wanted.jsonl", [Exchange(0, 1, bytes.fromhex(r), b"\x83\x01") for r in requests])
@@ -206,7 +206,7 @@ def test_a_planted_difference_of_each_kind_is_found(tmp_path: Path) -> None:
     assert (more.met, more.extra) == (True, 1)
 
 
-def test_a_profile_is_polled_in_few_reads_with_what_is_refused_in_parts(tmp_path: Path) -> None:
+def test_a_profile_is_polled_in_few_reads_and_refused_reads_are_split(tmp_path: Path) -> None:
     """The device has a gap where the profile reads across it: the exception is recorded too, and requested once."""
     profile_path = tmp_path / "p.yaml"
     profile_path.write_text(
@@ -240,7 +240,7 @@ def test_only_reads_are_asked_again(tmp_path: Path) -> None:
     assert same.left_out == 2 * 5
 
 
-def test_writes_are_made_again_only_when_that_is_said_and_to_what_wears_once(tmp_path: Path) -> None:
+def test_writes_are_repeated_only_on_request_and_to_wearing_memory_once(tmp_path: Path) -> None:
     write_hex, other_hex, read_hex = "0600010005", "0600020006", "0300010002"
     exchanges = [Exchange(n, 1, bytes.fromhex(h), bytes.fromhex(h)) for n, h in enumerate([write_hex, other_hex] * 3)]
     exchanges.append(Exchange(9, 1, bytes.fromhex(read_hex), bytes.fromhex("030400050006")))
@@ -293,7 +293,7 @@ def test_a_device_that_is_away_for_a_while_is_recorded_again_when_it_is_back(tmp
 
 
 @pytest.mark.parametrize("kind", ["pty", "tcp"])
-def test_a_tap_keeps_every_byte_both_ways_and_the_framing_is_found(tmp_path: Path, kind: str) -> None:
+def test_a_tap_keeps_every_byte_in_both_directions_and_the_framing_is_found(tmp_path: Path, kind: str) -> None:
     original = shipped(tmp_path)
     far = f"rtu:{tmp_path}/far?baudrate=115200" if kind == "pty" else f"tcp://127.0.0.1:{_free_port()}"
     near = f"rtu:{tmp_path}/near?baudrate=115200" if kind == "pty" else f"tcp://127.0.0.1:{_free_port()}"

@@ -42,7 +42,7 @@ def frames() -> list[tuple[Direction, bytes]]:
 
 
 @pytest.mark.parametrize("piece", [1, 3, 1000])
-def test_requests_and_replies_are_told_apart_however_the_bytes_come(piece: int) -> None:
+def test_requests_and_replies_are_distinguished_for_any_chunks(piece: int) -> None:
     directions = Directions("rtu")
     stream = b"".join(data for _, data in frames())
     found = [

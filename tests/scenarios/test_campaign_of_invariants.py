@@ -239,7 +239,7 @@ def test_rate_kinds_and_aims_are_kept_to(folder: Path) -> None:
         (RandomFaults(mean_s=0.0), "the time between two random faults"),
     ],
 )
-def test_what_cannot_be_chosen_is_refused_before_anything_runs(folder: Path, wanted: RandomFaults, told: str) -> None:
+def test_an_impossible_choice_is_refused_before_anything_runs(folder: Path, wanted: RandomFaults, told: str) -> None:
     with pytest.raises(UsageError) as e:
         run_campaign(Campaign(folder / "dry.scenario.yaml", (), wanted), range(1, 3), 1)
     assert told in str(e.value)
@@ -257,7 +257,7 @@ def test_what_cannot_be_chosen_is_refused_before_anything_runs(folder: Path, wan
         ("plain.scenario.yaml", "--seeds", "1..2", "--faults", "random"),
     ],
 )
-def test_options_that_say_nothing_are_refused(folder: Path, words: tuple[str, ...]) -> None:
+def test_options_without_effect_are_refused(folder: Path, words: tuple[str, ...]) -> None:
     with pytest.raises(UsageError):
         judge(*words)
 

@@ -105,7 +105,7 @@ def test_a_check_that_names_no_device_shows_all_of_them(tmp_path: Path) -> None:
     assert plain["on_the_wire"] == []  # it has no expectation, so no check can fail
 
 
-def test_a_wire_on_which_nothing_was_seen_is_said_to_be_silent(tmp_path: Path) -> None:
+def test_a_wire_without_traffic_is_reported_as_silent(tmp_path: Path) -> None:
     path = plant(tmp_path, "  - pause: 12s\n  - expect: {that: 'sensor.level == 43'}\n")
     (tmp_path / "plant.yaml").write_text(re.sub(r"every_ms: \d+", "every_ms: 60000", PLANT))
     (plain,) = json.loads(said(str(path), "--json"))
@@ -120,7 +120,7 @@ def test_a_request_that_got_no_reply_is_shown_as_such(tmp_path: Path) -> None:
     ]
 
 
-def test_a_scenario_that_passes_shows_none(tmp_path: Path) -> None:
+def test_a_passing_scenario_shows_no_frames(tmp_path: Path) -> None:
     (plain,) = json.loads(said(str(plant(tmp_path, STEPS.replace("43", "42"))), "--json"))
     assert (plain["verdict"], plain["on_the_wire"]) == ("passed", [])
 

@@ -64,7 +64,7 @@ def test_a_fault_that_never_struck_makes_a_scenario_inconclusive(
         assert (optional.verdict, optional.faults[0].struck) == (Verdict.PASSED, 0)
 
 
-def test_a_failure_stays_one_and_says_of_its_faults_as_well(tmp_path: Path) -> None:
+def test_a_failure_stays_a_failure_and_also_reports_its_faults(tmp_path: Path) -> None:
     steps = GOOD + fault("name: silence, device: modem, from: 1h")
     result = run(tmp_path, steps + "  - expect: {tag: inclinometer.slope_long, quality: bad}\n")
     assert result.verdict is Verdict.FAILED
@@ -80,7 +80,7 @@ def test_faults_are_counted_in_processes_too(tmp_path: Path, monkeypatch: pytest
     assert result.verdict is Verdict.INCONCLUSIVE, result.reason
 
 
-def test_terminal_json_junit_and_html_say_how_often(tmp_path: Path) -> None:
+def test_terminal_json_junit_and_html_report_the_counts(tmp_path: Path) -> None:
     path = written(tmp_path, GOOD + fault("name: lost-frame, device: inclinometer"))
     told = CliRunner().invoke(judge_command, [str(path)], standalone_mode=False)
     assert "fault f (lost-frame on inclinometer): struck" in told.output
@@ -95,7 +95,7 @@ def test_terminal_json_junit_and_html_say_how_often(tmp_path: Path) -> None:
     assert result.faults[0].text in (tmp_path / "r.html").read_text()
 
 
-def test_a_run_says_how_often_each_of_its_faults_struck(tmp_path: Path) -> None:
+def test_a_run_reports_how_often_each_of_its_faults_took_effect(tmp_path: Path) -> None:
     faults = tmp_path / "faults.yaml"
     faults.write_text(
         "faults:\n  - {id: lost, name: lost-frame, device: inclinometer, from: 2s, until: 4s}\n"
@@ -110,7 +110,7 @@ def test_a_run_says_how_often_each_of_its_faults_struck(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("seeds", "for_", "ended"), [("1..2", "10s", "inconclusive"), ("3..4", "6min", "ok")])
-def test_a_campaign_says_how_often_faults_struck_and_needs_one(seeds: str, for_: str, ended: str) -> None:
+def test_a_campaign_reports_how_often_faults_took_effect_and_needs_one(seeds: str, for_: str, ended: str) -> None:
     words = ["observatory", "--prototype", "--virtual", "--for", for_, "--seeds", seeds, "--faults", "random"]
     told = CliRunner().invoke(run_command, [*words, "--jobs", "1"], standalone_mode=False)
     assert told.output.rstrip().endswith(ended)

@@ -50,7 +50,7 @@ def takes_s(tmp_path_factory: pytest.TempPathFactory) -> float:
     return (check.t_ns - check.since_ns) / 1e9
 
 
-def test_a_miss_by_less_than_the_lateness_passes_and_says_so(tmp_path: Path, takes_s: float) -> None:
+def test_a_miss_by_less_than_the_lateness_passes_with_a_note(tmp_path: Path, takes_s: float) -> None:
     result = judge(tmp_path, REACTS % f"{takes_s * 0.6:.3f}s", takes_s * 0.8, takes_s * 0.8)
     assert result.verdict is Verdict.PASSED, result.checks
     assert "late by itself for" in result.checks[-1].reason
@@ -70,7 +70,7 @@ def test_lateness_that_may_be_the_system_s_own_never_passes(tmp_path: Path, take
     assert "host or system, nobody knows" in result.checks[-1].got
 
 
-def test_what_never_comes_fails_however_late_the_host_was(tmp_path: Path) -> None:
+def test_an_event_that_never_occurs_fails_however_late_the_host_was(tmp_path: Path) -> None:
     result = judge(tmp_path, "steps:\n  - wait: {until: \"relay.state == 'OFF'\", within: 2s}\n", 1.5, 1.5)
     assert result.verdict is Verdict.FAILED, result.checks
     assert result.simulated_s == pytest.approx(3.5, abs=0.1)
@@ -101,7 +101,7 @@ def test_a_rule_of_the_whole_run_is_prolonged_too(tmp_path: Path, takes_s: float
     assert judge(tmp_path, rule % (takes_s * 0.3) + steps, takes_s * 0.1, takes_s * 0.1).verdict is Verdict.FAILED
 
 
-def test_only_what_was_late_after_the_begin_counts() -> None:
+def test_only_lateness_after_the_start_counts() -> None:
     late = HostLateness()
     late.slept(1.0, 0.004)  # lateness of sleeps
     late.slept(2.0, 0.505)
@@ -180,7 +180,7 @@ def test_retries_are_reported_in_text_json_junit_and_html(tmp_path: Path, monkey
     )  # in the table, and at the failed step
 
 
-def test_what_is_written_to_a_plant_is_not_repeated(tmp_path: Path) -> None:
+def test_writes_to_a_plant_are_not_repeated(tmp_path: Path) -> None:
     path = tmp_path / "x.scenario.yaml"
     path.write_text(HEAD + "steps:\n  - pause: 1s\n")
     words = [str(path), "--target", "real", "--allow", "write", "--retry-inconclusive", "3"]

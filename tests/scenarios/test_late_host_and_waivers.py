@@ -78,7 +78,7 @@ def test_a_waiver_holds_until_its_day(found: Verdict, expires: date, verdict: Ve
     assert not all_well([] if verdict is Verdict.PASSED else [waived])
 
 
-def test_waivers_are_read_and_said(tmp_path: Path) -> None:
+def test_waivers_are_read_and_reported(tmp_path: Path) -> None:
     path = tmp_path / "x.scenario.yaml"
     path.write_text(HEAD + "steps:\n  - expect: {tag: relay.state, value: ACTIVE, within: 1s}\n")
     waivers = tmp_path / "waivers.yaml"

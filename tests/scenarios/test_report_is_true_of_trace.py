@@ -206,7 +206,7 @@ def check_headline(result: ScenarioResult) -> None:
 
 @given(STEPS, RULES)
 @settings(max_examples=40, deadline=None, suppress_health_check=list(HealthCheck))
-def test_what_a_report_says_is_true_of_the_trace(
+def test_the_statements_of_a_report_are_true_of_the_trace(
     tmp_path_factory: pytest.TempPathFactory, steps: list[str], rules: list[tuple[str, str]]
 ) -> None:
     path = SYSTEM.parent / "unused.scenario.yaml"
@@ -255,7 +255,7 @@ def test_the_headline_names_the_rule_that_broke_and_not_the_step_that_it_interru
     assert rule.t_ns - rule.since_ns == pytest.approx(2 * NS, abs=NS // 25)
 
 
-def test_an_unreachable_probe_is_said_with_its_endpoint_and_error(
+def test_an_unreachable_probe_is_reported_with_its_endpoint_and_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))

@@ -80,7 +80,7 @@ def test_values(text: str, value: bool | None) -> None:
         ("1" * 2000, "too long"),
     ],
 )
-def test_what_is_refused(text: str, told: str) -> None:
+def test_invalid_scenarios_are_refused(text: str, told: str) -> None:
     with pytest.raises(UsageError, match=told):
         Expression(text, KNOWN)
 
@@ -95,7 +95,7 @@ def test_any_text_is_an_expression_or_refused(text: str) -> None:
     expression.evaluate(look)
 
 
-def test_it_says_what_it_is_about() -> None:
+def test_an_error_names_its_subject() -> None:
     assert Expression("quality(ctd.pressure) == 'good' and relay.state == 'OFF'", KNOWN).names == [
         "ctd.pressure",
         "relay.state",

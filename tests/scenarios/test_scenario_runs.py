@@ -63,7 +63,7 @@ ACTIVE = "  - send: {period_s: 1}\n  - wait: {until: \"relay.state == 'ACTIVE'\"
         ),
     ],
 )
-def test_what_does_not_hold_fails_with_what_was_seen(tmp_path: Path, steps: str, expected: str, got: str) -> None:
+def test_a_failed_check_shows_the_observed_value(tmp_path: Path, steps: str, expected: str, got: str) -> None:
     result = run(tmp_path, steps)
     assert result.verdict is Verdict.FAILED
     (failed,) = (check for check in result.checks if check.verdict is Verdict.FAILED)
@@ -98,7 +98,7 @@ def test_always_and_never_are_looked_at_all_the_time(tmp_path: Path) -> None:
     assert "sample_period_s" in never.checks[-1].got
 
 
-def test_what_lasts_must_last_and_what_always_holds_holds_at_once(tmp_path: Path) -> None:
+def test_duration_checks_must_last_and_invariants_hold_at_once(tmp_path: Path) -> None:
     good = "  - wait: {until: \"quality(inclinometer.slope_long) == 'good'\"}\n"
     dead = good + "  - fault: {name: lost-frame, device: inclinometer}\n"
     lasting = run(tmp_path, dead + "  - expect: {tag: inclinometer.slope_long, quality: good, during: 10s}\n")
@@ -112,7 +112,7 @@ def test_what_lasts_must_last_and_what_always_holds_holds_at_once(tmp_path: Path
         run(tmp_path, "  - pause: 1s\n", "never: [{wire: ctd, register: nothere}]\n")
 
 
-def test_what_a_target_cannot_do_is_skipped_and_has_not_passed(tmp_path: Path) -> None:
+def test_an_unsupported_step_of_a_target_is_skipped_and_does_not_pass(tmp_path: Path) -> None:
     result = run(tmp_path, "  - pause: 1s\n", "needs: [probe]\n")
     assert result.verdict is Verdict.SKIPPED
     assert "probe" in result.reason
@@ -184,7 +184,7 @@ def test_a_file_that_is_not_there_is_named_where_it_is_asked_for(tmp_path: Path,
     assert e.value.line == line.count("\n") + 1
 
 
-def test_what_expects_nothing_has_not_passed(tmp_path: Path) -> None:
+def test_a_scenario_without_expectations_does_not_pass(tmp_path: Path) -> None:
     result = run(tmp_path, "  - send: {period_s: 1}\n  - pause: 1s\n")
     assert result.verdict is Verdict.INCONCLUSIVE
     assert "expects nothing" in result.reason
@@ -205,7 +205,7 @@ def test_a_scenario_can_be_judged_as_a_run_is(tmp_path: Path, steps: str, verdic
         assert "modem." in check.got
 
 
-def test_a_time_that_is_none_is_named_where_it_stands(tmp_path: Path) -> None:
+def test_an_invalid_time_is_named_at_its_position(tmp_path: Path) -> None:
     with pytest.raises(FileInvalid, match="a time") as e:
         load_scenario(written(tmp_path, "  - expect: {tag: ctd.pressure, quality: bad, within: 3 sec}\n"))
     assert (e.value.line, e.value.column) == (4, 47)

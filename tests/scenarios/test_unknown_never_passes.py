@@ -141,7 +141,7 @@ DEAD = "  - fault: {id: dead, name: silence, device: ctd}\n  - send: {period_s: 
         ),
     ],
 )  # fmt: skip
-def test_no_construct_passes_on_what_is_unknown(
+def test_no_construct_passes_on_unknown_values(
     tmp_path: Path, head: str, steps: str, verdict: Verdict, told: str
 ) -> None:
     result = run(tmp_path, steps, head)
@@ -165,7 +165,7 @@ def test_a_rule_is_judged_from_when_it_is_known(tmp_path: Path, head: str, verdi
     assert result.verdict is verdict, result.checks[-1]
 
 
-def test_a_rule_that_becomes_unknown_is_inconclusive_and_says_since_when(tmp_path: Path) -> None:
+def test_a_rule_that_becomes_unknown_is_inconclusive_and_states_since_when(tmp_path: Path) -> None:
     """The temperature is 0 for a while, so a quotient by it has no value."""
     steps = (
         "  - send: {period_s: 1}\n  - wait: {until: \"quality(ctd.pressure) == 'good'\", within: 15s}\n  - pause: 3s\n"
@@ -178,7 +178,7 @@ def test_a_rule_that_becomes_unknown_is_inconclusive_and_says_since_when(tmp_pat
 
 
 @pytest.mark.parametrize("said", ["times: 0, within: 1ms", "requests_per_s: {max: 9}, during: 1ms"])
-def test_no_exchange_on_a_wire_that_was_never_seen_is_no_evidence(tmp_path: Path, said: str) -> None:
+def test_no_exchange_on_an_unobserved_wire_is_not_evidence(tmp_path: Path, said: str) -> None:
     result = run(tmp_path, f"  - expect: {{wire: ctd, {said}}}\n")
     assert result.verdict is Verdict.INCONCLUSIVE, result.checks
     assert "no exchange with ctd" in result.checks[0].got

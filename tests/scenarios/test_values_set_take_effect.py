@@ -26,7 +26,9 @@ def run(folder: Path, system: str, steps: str) -> ScenarioResult:
     ("tag", "value", "back"),
     [("ctd.sample_count", 4711, "< 1000"), ("ctd.status", 7, "== 1"), ("ctd.instrument_time", 5, "> 1000")],
 )
-def test_what_a_sensor_counts_itself_can_be_set_and_given_back(tmp_path: Path, tag: str, value: int, back: str) -> None:
+def test_values_that_a_sensor_counts_itself_can_be_set_and_released(
+    tmp_path: Path, tag: str, value: int, back: str
+) -> None:
     steps = (
         f"  - wait: {{until: '{tag} {back}', within: 15s}}\n"
         f"  - set: {{tag: {tag}, value: {value}}}\n"
@@ -71,7 +73,7 @@ def test_an_object_that_no_simulation_feeds_can_be_set_and_given_back(tmp_path: 
     assert result.verdict is Verdict.PASSED, result.checks[-1]
 
 
-def test_a_value_that_never_took_effect_is_said(tmp_path: Path) -> None:
+def test_a_set_value_without_effect_is_reported(tmp_path: Path) -> None:
     """The sensor is in standby and takes no samples, so its signal never gets the set value."""
     steps = "  - wait: {until: \"quality(inclinometer.slope_long) == 'good'\", within: 5s}\n"
     result = run(tmp_path, "observatory", steps + "  - set: {tag: ctd.pressure, value: 5}\n  - pause: 2s\n")

@@ -79,7 +79,7 @@ def test_the_whole_run_is_judged(tmp_path: Path, head: str, steps: str, verdict:
     assert told in result.checks[-1].got
 
 
-def test_probes_see_what_is_served_under_their_names(tmp_path: Path) -> None:
+def test_probes_see_served_values_under_their_names(tmp_path: Path) -> None:
     steps = ACTIVE + (
         "  - expect: {that: 'desk.pressure == ctd.pressure', within: 3s}\n"
         "  - set: {tag: ctd.temperature, value: 50}\n"

@@ -96,7 +96,7 @@ def test_mbpoll_through_the_bridge(tmp_path: Path) -> None:
     run(main(), timeout_s=40)
 
 
-def test_pymodbus_clients_through_the_bridge_and_read_only_unless_told(tmp_path: Path) -> None:
+def test_pymodbus_clients_through_the_bridge_are_read_only_by_default(tmp_path: Path) -> None:
     async def reads(port: int, unit: int) -> None:
         client = AsyncModbusTcpClient("127.0.0.1", port=port, timeout=10)
         assert await client.connect()
@@ -138,7 +138,7 @@ def test_pymodbus_clients_through_the_bridge_and_read_only_unless_told(tmp_path:
         (("tcp://192.0.2.1:1502", "rtu:/dev/ttyNONE"), "cannot listen", 4),
     ],
 )
-def test_what_cannot_be(
+def test_impossible_bridges_are_refused(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], args: tuple[str, ...], says: str, code: int
 ) -> None:
     monkeypatch.setattr(sys, "argv", ["fieldtwin", "bridge", *args])

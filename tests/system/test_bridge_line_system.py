@@ -154,7 +154,7 @@ def use_the_plant(tmp_path: Path, system: Path, masters: Path) -> None:
     no_tracebacks(tmp_path / "run")
 
 
-def test_a_cable_carries_both_ways_and_stays_when_an_end_is_closed(tmp_path: Path) -> None:
+def test_a_cable_carries_both_directions_and_remains_when_an_end_is_closed(tmp_path: Path) -> None:
     async def main() -> None:
         plant = Endpoint.parse(f"rtu:/dev/ttyNONE?{LINE}")
         cable = await BridgeCable.open(plant, tmp_path, "door")

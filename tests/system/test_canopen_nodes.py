@@ -68,7 +68,7 @@ def test_three_nodes_on_one_bus(tmp_path: Path) -> None:
     assert tags["winch.speed"]["value"] > 0
 
 
-def test_whoever_comes_first_makes_the_bus_and_whoever_is_left_without_one_says_so(tmp_path: Path) -> None:
+def test_the_first_process_creates_the_bus_and_one_without_a_bus_reports_it(tmp_path: Path) -> None:
     where = f"can:fieldtwin/127.0.0.1:{free_port()}"
     with fieldtwin(tmp_path, "emulate", "io-cia401", "--on", where, "--bitrate", "500000", name="io") as io:
         wait_for(lambda: "a bus made here at 500000 bit/s" in io.err, 15, "the bus")
@@ -86,7 +86,7 @@ def test_whoever_comes_first_makes_the_bus_and_whoever_is_left_without_one_says_
     no_tracebacks(tmp_path)
 
 
-def test_a_name_that_is_nearly_one_and_a_recording_of_something_else(tmp_path: Path) -> None:
+def test_a_nearly_correct_name_and_a_recording_of_a_different_device(tmp_path: Path) -> None:
     on = ("--on", "can:fieldtwin/127.0.0.1:0")
     misspelt = run_to_end(tmp_path, "emulate", "drive-cia40", *on, name="misspelt")
     assert misspelt.process.returncode == 2

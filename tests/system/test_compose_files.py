@@ -57,7 +57,7 @@ def test_profiles_have_the_services_that_they_are_for() -> None:
     assert (CHECKOUT / ".env").read_text(encoding="utf-8").splitlines()[-1] == "COMPOSE_PROFILES=prototype"
 
 
-def test_who_is_waited_for_comes_up_with_the_same_profile() -> None:
+def test_a_dependency_starts_in_the_same_profile() -> None:
     """Compose 1.29 and 2 both refuse a service that depends on one omitted by its profile."""
     for name, service in SERVICES.items():
         for other in service.get("depends_on", {}):
@@ -153,7 +153,7 @@ def test_the_memory_disk_is_the_run_directory_and_belongs_to_the_image_s_user() 
     assert checked["twin"] == [f"{match[1]}/observatory-twin/{Twinning.kind}.sock"]
 
 
-def test_what_is_kept_is_where_the_image_s_user_may_write() -> None:
+def test_stores_are_in_folders_that_the_images_user_may_write() -> None:
     kept = re.search(r"install -d -o fieldtwin -g fieldtwin -m 700 (.*)$", DOCKERFILE, re.MULTILINE)
     assert kept
     for service in ("controller-twin", "shadow", "twin"):
@@ -215,7 +215,7 @@ def test_a_wildcard_address_is_reached_by_the_name_of_its_host(listening: str, h
 
 
 @pytest.mark.parametrize("listening", ["pty:line1", "tcp://127.0.0.1:1502", "can:fieldtwin/127.0.0.1:29536"])
-def test_what_stays_on_the_field_side_s_host_is_refused_elsewhere(listening: str) -> None:
+def test_options_for_the_field_host_are_refused_elsewhere(listening: str) -> None:
     with pytest.raises(UsageError, match="prototype file"):
         reachable(Endpoint.parse(listening), "field")
 
@@ -231,7 +231,7 @@ def container_health(*sockets: Path) -> tuple[int, str]:
 
 @pytest.mark.timeout(150)  # a shore of 8 s and four starts: half a minute on a busy computer
 @pytest.mark.long
-def test_field_side_controller_and_shore_as_three_strangers(tmp_path: Path) -> None:
+def test_field_controller_and_shore_as_three_separate_processes(tmp_path: Path) -> None:
     """Run the compose file's three commands on free ports, and check the health checks, exit codes and the summary that it
     relies on."""
     text = PROTOTYPE_FILE.read_text(encoding="utf-8")

@@ -12,7 +12,7 @@ RUN = ("run", "observatory", "--prototype", "--json", "--instance", "r")
 
 
 @pytest.mark.long
-def test_one_field_side_serves_run_after_run(tmp_path: Path) -> None:
+def test_one_field_simulator_serves_several_runs(tmp_path: Path) -> None:
     port = free_port()
     with fieldtwin(tmp_path, "emulate", "observatory", "--control", f"127.0.0.1:{port}", name="field") as side:
         wait_for(
@@ -44,7 +44,7 @@ def test_one_field_side_serves_run_after_run(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_field_side_that_comes_back_is_found_again(tmp_path: Path) -> None:
+def test_a_field_simulator_that_returns_is_found_again(tmp_path: Path) -> None:
     """On the same ports, as in a container: a process that was killed and started again has no state of the first one."""
     port, can, lan, far = free_port(), free_port(), free_port(), free_port()
     there = tmp_path / "there"

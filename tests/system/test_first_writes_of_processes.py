@@ -38,7 +38,7 @@ def running(plc: Asking) -> bool:
 
 
 @pytest.mark.parametrize("language", ["st", "python"])
-def test_a_plant_is_not_written_with_what_was_never_read(tmp_path: Path, language: str) -> None:
+def test_a_plant_is_not_written_with_values_that_were_never_read(tmp_path: Path, language: str) -> None:
     with devices(tmp_path, language=language) as system:
         words = ("run", str(system), "--plant", "--allow-writes", "--for", "3s", "--instance", "p", "--json")
         run = run_to_end(tmp_path, *words)
@@ -127,7 +127,7 @@ def test_a_program_that_never_starts_is_shown_and_the_run_is_not_ok(tmp_path: Pa
 @pytest.mark.parametrize(
     ("at_timeout", "state"), [("wait", "waiting"), ("stop", "stopped"), ("start_anyway", "running")]
 )
-def test_what_happens_at_the_timeout_is_as_the_system_file_says(tmp_path: Path, at_timeout: str, state: str) -> None:
+def test_the_system_file_decides_what_happens_at_the_timeout(tmp_path: Path, at_timeout: str, state: str) -> None:
     system = hall(tmp_path, port=free_port())
     text = system.read_text().replace("plc:\n", f"plc:\n  start: {{timeout_ms: 300, at_timeout: {at_timeout}}}\n")
     system.write_text(text)

@@ -69,7 +69,7 @@ def test_a_virtual_run_ends_without_a_traceback(tmp_path: Path, number: int, cod
 
 
 @pytest.mark.parametrize("when", ["while they import", "while they work"])
-def test_workers_end_with_who_started_them(tmp_path: Path, when: str) -> None:
+def test_workers_end_with_their_parent(tmp_path: Path, when: str) -> None:
     if when == "while they work":
         text = "import os, time\ndef work(s):\n    os.write(1, b'here\\n')\n    time.sleep(s)\n"
     else:  # first our process, then the group

@@ -48,7 +48,7 @@ def test_a_live_run_with_a_broken_invariant_is_not_ok(folder: Path) -> None:
     assert error.endswith("plant.yaml:14)")
 
 
-def test_a_live_run_whose_invariants_hold_says_so(folder: Path) -> None:
+def test_a_live_run_whose_invariants_hold_reports_it(folder: Path) -> None:
     write_program(folder, "50")
     told = summary(folder)
     assert [one["verdict"] for one in told["invariants"]] == ["passed", "passed"], told["invariants"]

@@ -52,7 +52,7 @@ def check(result: dict[str, Any], verdict: str) -> None:
 
 
 @HOLDS
-def test_what_runs_already_is_judged_by_its_invariants(site: Path, limit: str, verdict: str) -> None:
+def test_a_running_system_is_checked_by_its_invariants(site: Path, limit: str, verdict: str) -> None:
     write_program(site, limit)
     with fieldtwin(site, "run", str(site / "shed.yaml"), "--prototype") as running:
         every_device_online(running.control("shed", "gateway"))
@@ -69,7 +69,7 @@ def test_a_plant_is_judged_by_its_invariants(site: Path, limit: str, verdict: st
         check(judged(site, str(site / "well.scenario.yaml"), "--target", "real", "--json"), verdict)
 
 
-def test_with_a_controller_of_the_user_they_are_skipped_and_that_is_said(site: Path) -> None:
+def test_with_a_users_controller_they_are_skipped_with_a_message(site: Path) -> None:
     write_program(site, "10")
     words = (str(site / "probed.scenario.yaml"), "--json", "--with", "--", "sleep", "600")
     result = judged(site, *words)

@@ -53,7 +53,7 @@ class Watch(Program):
 
 
 @pytest.mark.long
-def test_what_is_learnt_in_one_run_is_known_in_the_next(tmp_path: Path) -> None:
+def test_facts_learned_in_one_run_are_known_in_the_next(tmp_path: Path) -> None:
     for name, text in FILES.items():
         (tmp_path / name).write_text(text.lstrip(), encoding="utf-8")
     written: list[int] = []

@@ -39,7 +39,7 @@ def test_a_scenario_of_a_network_runs_unchanged_as_processes(tmp_path: Path) -> 
     no_tracebacks(tmp_path)
 
 
-def test_a_run_of_a_network_says_what_became_of_each(tmp_path: Path) -> None:
+def test_a_run_of_a_network_reports_the_result_of_each_system(tmp_path: Path) -> None:
     """Also of faults: one system has a fault for a while, and the acoustic channel at the western receiver."""
     (tmp_path / "f.yaml").write_text(
         "faults:\n  - {name: silence, device: east.current, from: 0, until: 2}\n  - {name: drop, bus: water, device: west}\n"

@@ -62,21 +62,21 @@ def judged(tmp_path: Path, source: str) -> dict[str, Any]:
 
 
 @pytest.mark.long
-def test_a_libmodbus_master_does_what_our_program_does(tmp_path: Path) -> None:
+def test_a_libmodbus_client_behaves_like_our_program(tmp_path: Path) -> None:
     result = judged(tmp_path, (HERE / "loop.c").read_text(encoding="utf-8"))
     assert result["verdict"] in ("passed", "inconclusive"), result
     assert result["verdict"] == "passed" or "late by itself" in str(result["checks"])
 
 
 @pytest.mark.long
-def test_one_that_decides_otherwise_is_found_out(tmp_path: Path) -> None:
+def test_a_controller_with_a_different_decision_fails(tmp_path: Path) -> None:
     wrong = (HERE / "loop.c").read_text(encoding="utf-8").replace("dbar > 50.0f", "dbar > 500.0f")
     result = judged(tmp_path, wrong)
     assert result["verdict"] in ("failed", "inconclusive")
     assert "sensor.period" in str(result["checks"][-1])
 
 
-def test_what_is_asked_of_our_own_controller_wants_one(tmp_path: Path) -> None:
+def test_a_check_of_our_own_controller_needs_one(tmp_path: Path) -> None:
     scenario = tmp_path / "a.scenario.yaml"
     scenario.write_text(
         "scenario: ours\nsystem: observatory\nsteps:\n  - expect: {tag: ctd.pressure, quality: good, within: 1s}\n"
@@ -86,7 +86,7 @@ def test_what_is_asked_of_our_own_controller_wants_one(tmp_path: Path) -> None:
     assert "gateway.sock" in ended.out
 
 
-def test_nobody_says_of_another_s_scans_that_they_were_in_time(tmp_path: Path) -> None:
+def test_the_scan_lateness_of_a_foreign_controller_is_not_claimed(tmp_path: Path) -> None:
     bench = ControlBench(load_system("observatory"), Where(tmp_path), Trace(), target="compose", names=[])
     with pytest.raises(UsageError, match="somebody else's controller"):
         bench.late_ms()

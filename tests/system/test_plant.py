@@ -30,7 +30,7 @@ SYSTEMS = CHECKOUT / "profiles" / "systems"
 
 
 @pytest.mark.long
-def test_with_nobody_there_it_says_so_retries_and_keeps_scanning(tmp_path: Path) -> None:
+def test_without_devices_it_reports_retries_and_keeps_scanning(tmp_path: Path) -> None:
     (tmp_path / "systems").mkdir()
     system = (SYSTEMS / "observatory.yaml").read_text(encoding="utf-8")
     system = system.replace("rtu:/dev/ttyS0", f"rtu:{tmp_path}/ttyNONE").replace(
@@ -141,7 +141,7 @@ def test_a_plant_is_only_read_until_it_may_be_written(plant: Plant) -> None:
 
 
 @pytest.mark.long
-def test_a_plant_obeys_its_twin_while_its_switch_says_remote_and_both_know_the_same_in_the_end(plant: Plant) -> None:
+def test_a_plant_obeys_its_twin_while_its_switch_is_remote_and_both_know_the_same_in_the_end(plant: Plant) -> None:
     """No emulated connection anywhere: the plant's own file on both sides, the switch changed while the plant runs."""
     place = f"tcp://127.0.0.1:{free_port()}"
     with plant.system.open("a", encoding="utf-8") as file:

@@ -19,7 +19,7 @@ def ended(tmp_path_factory: pytest.TempPathFactory) -> Fieldtwin:
     return run_to_end(root, "run", "observatory", "--prototype", "--for", "8s", "--instance", "a", "--json")
 
 
-def test_it_ends_well_and_says_so(ended: Fieldtwin) -> None:
+def test_it_ends_well_and_reports_it(ended: Fieldtwin) -> None:
     assert ended.process.returncode == 0, ended.err + ended.out
     summary = ended.summary
     assert summary["errors"] == []
@@ -51,7 +51,7 @@ def test_every_published_value_was_held(ended: Fieldtwin) -> None:
     assert published["wrong"] == 0
 
 
-def test_talk_is_on_stderr_and_names_the_mapping(ended: Fieldtwin) -> None:
+def test_diagnostics_are_on_stderr_and_name_the_mapping(ended: Fieldtwin) -> None:
     json.loads(ended.out)  # the whole of stdout is one JSON document
     for plant, target in ended.summary["mapping"].items():
         assert f"{plant}  →  {target}" in ended.err

@@ -88,7 +88,7 @@ def test_a_scenario_fails_on_a_refused_output_in_text_html_and_junit(tmp_path: P
         assert "pump.st:5" in text
 
 
-def test_a_scenario_that_expects_a_refusal_says_so(tmp_path: Path) -> None:
+def test_a_scenario_that_expects_a_refusal_declares_it(tmp_path: Path) -> None:
     written(tmp_path)
     assert run_virtual(load_scenario(scenario(tmp_path, head="refused: [drive.speed]\n"))).verdict is Verdict.PASSED
     judged = scenario(tmp_path, head="refused: [drive.speed]\njudge: run\n")
@@ -127,7 +127,7 @@ def test_a_scenario_in_processes_fails_on_a_refused_output(tmp_path: Path) -> No
 
 
 @pytest.mark.long
-def test_a_read_only_plant_says_what_it_did_not_write_and_is_ok(tmp_path: Path) -> None:
+def test_a_read_only_plant_lists_its_unwritten_outputs_and_is_ok(tmp_path: Path) -> None:
     with fieldtwin(
         tmp_path, "emulate", str(written(tmp_path)), "--control", "127.0.0.1:0", "--instance", "f", name="field"
     ) as side:

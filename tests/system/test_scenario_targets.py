@@ -50,7 +50,7 @@ def test_a_scenario_runs_unchanged_as_processes(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_what_does_not_hold_fails_there_too(tmp_path: Path) -> None:
+def test_a_failing_expectation_fails_there_too(tmp_path: Path) -> None:
     path = tmp_path / "f.scenario.yaml"
     path.write_text(
         "scenario: f\nsystem: observatory\nsteps:\n  - expect: {tag: relay.state, value: 'OFF', within: 2s}\n"
@@ -97,7 +97,7 @@ steps:
 """
 
 
-def test_a_plant_is_observed_and_nothing_else(tmp_path: Path) -> None:
+def test_a_plant_is_only_observed(tmp_path: Path) -> None:
     port = free_port()
     (tmp_path / "shed.yaml").write_text(PLANT.format(port=port))
     (tmp_path / "shed_lamp.py").write_text(LAMP)

@@ -132,13 +132,13 @@ def test_a_scenario_about_our_gateway_is_skipped_with_the_reason(site: Path) -> 
         (["--with", "--", "no-such-program"], "no such program"),
     ],
 )
-def test_what_does_not_fit_is_a_usage_error(site: Path, words: list[str], told: str) -> None:
+def test_inconsistent_options_are_a_usage_error(site: Path, words: list[str], told: str) -> None:
     ended = run_to_end(site, "test", str(site / "valve.scenario.yaml"), *words)
     assert ended.process.returncode == 2
     assert told in " ".join(ended.err.split())
 
 
-def test_inside_of_with_the_judge_finds_the_field_side(site: Path) -> None:
+def test_inside_of_with_the_test_finds_the_field_simulator(site: Path) -> None:
     """The shell starts a controller and then tests it: FIELDTWIN_CONTROL gives the address of the simulated devices."""
     fieldtwin_test = f"{sys.executable} -m fieldtwin test {site / 'as_is.scenario.yaml'} --target compose --json"
     script = f"{' '.join(controller(site))} >&2 & {fieldtwin_test}; status=$?; kill $!; exit $status"
@@ -147,7 +147,7 @@ def test_inside_of_with_the_judge_finds_the_field_side(site: Path) -> None:
     assert json.loads(ended.out)[0]["verdict"] == "passed"
 
 
-def test_from_another_terminal_the_judge_finds_the_only_field_side_of_the_system(site: Path) -> None:
+def test_from_another_terminal_the_test_finds_the_only_field_simulator_of_the_system(site: Path) -> None:
     with fieldtwin(site, "with", str(site / "shed.yaml"), "--", *controller(site), name="with") as running:
         wait_for(lambda: "controller " in running.out, 30, running.err)
         words = (str(site / "as_is.scenario.yaml"), "--target", "compose", "--json")

@@ -168,7 +168,7 @@ def test_nothing_stays_in_after_a_failed_scenario(running: Running) -> None:
     assert "in already" not in json.dumps(again)
 
 
-def test_what_a_person_set_is_there_again_after_the_scenario(running: Running) -> None:
+def test_a_value_set_by_the_user_is_restored_after_the_scenario(running: Running) -> None:
     running.field("set", device="tank", tag="level", value=33)
     running.field("fault", fault={"id": "mine", "name": "delay", "device": "tank"})
     (running.site / "over.scenario.yaml").write_text(
@@ -194,7 +194,7 @@ def test_a_killed_judge_s_faults_and_values_expire(running: Running) -> None:
     assert running.field("get")["lease"]["expired"] == 1
 
 
-def test_a_terminated_judge_takes_out_at_once_what_it_put_in(running: Running) -> None:
+def test_a_terminated_test_removes_its_faults_and_values_at_once(running: Running) -> None:
     hanging = str(running.site / "hanging.scenario.yaml")
     with fieldtwin(running.site, "test", hanging, *running.words, name="hanging") as judge:
         wait_for(lambda: running.put_in() == (["dead"], {"tank.level": 120}), 30, judge.err)
@@ -238,7 +238,7 @@ steps:
 """
 
 
-def test_a_line_a_can_bus_and_a_modem_are_made_anew(tmp_path: Path) -> None:
+def test_a_line_a_can_bus_and_a_modem_are_rebuilt(tmp_path: Path) -> None:
     """A serial line, CANopen nodes and a transmitter whose mailboxes were used: the second run starts like the first."""
     port = free_port()
     scenario = tmp_path / "scenarios" / "a.scenario.yaml"

@@ -28,7 +28,7 @@ def judged(folder: Path, where: str) -> ScenarioResult:
 
 
 @pytest.mark.long
-def test_the_bus_is_where_it_is_said_to_be(tmp_path: Path) -> None:
+def test_the_bus_is_at_the_given_endpoint(tmp_path: Path) -> None:
     where = f"fieldtwin/127.0.0.1:{free_port()}"
     result = judged(tmp_path, where)
     assert result.verdict is Verdict.PASSED, (result.reason, result.checks)

@@ -102,7 +102,7 @@ def test_the_run_with_all_faults_is_ok_without_a_bug(files: Path) -> None:
     assert all(fault["struck"] for fault in summary["faults"]), summary["faults"]
 
 
-def test_no_late_reply_is_published_as_good_beside_the_other_faults_without_a_bug(files: Path) -> None:
+def test_without_a_bug_no_late_reply_is_published_as_good_under_the_other_faults(files: Path) -> None:
     status, summary = run(ROOT, files, "late.yaml")
     assert summary["errors"] == []
     assert status == 0

@@ -34,7 +34,7 @@ def test_a_shadow_opposite_a_prototype_follows_its_states_and_survives_its_own_d
     no_tracebacks(root)
 
 
-def test_a_shadow_of_nobody_says_so(tmp_path: Path) -> None:
+def test_a_shadow_without_a_plant_reports_it(tmp_path: Path) -> None:
     ended = run_to_end(
         tmp_path / "r",
         "shadow",

@@ -55,7 +55,7 @@ def test_a_run_whose_plc_stopped_and_began_again_is_not_ok(tmp_path: Path) -> No
     assert "PLC: stopped by itself once, and began again after that; the last time: program once" in done.out
 
 
-def test_a_run_whose_gateway_is_gone_does_not_claim_to_know_its_outputs(tmp_path: Path) -> None:
+def test_a_run_whose_gateway_died_does_not_claim_to_know_its_outputs(tmp_path: Path) -> None:
     with fieldtwin(tmp_path, "run", "observatory", "--prototype", "--for", "6s") as run:
         gateway = run.control("observatory", "gateway")
         every_device_online(gateway)

@@ -45,7 +45,7 @@ def test_a_twin_commands_a_prototype_and_a_restarted_one_repeats_nothing(tmp_pat
 
 
 @pytest.mark.long
-def test_a_twin_that_asks_first_sends_what_its_prototype_allows_and_nothing_else(tmp_path: Path) -> None:
+def test_a_twin_that_asks_first_sends_only_what_its_prototype_allows(tmp_path: Path) -> None:
     root, place = tmp_path / "r", f"tcp://127.0.0.1:{free_port()}"
     question = ("--what-if", "20s", "--finally", "relay.state == 'ACTIVE'")
     with fieldtwin(

@@ -67,7 +67,7 @@ def test_many_seeds() -> None:
         (["--prototype", "--virtual", "--for", "1s", "--seeds", "1..2", "--seed", "1"], "belong to one"),
     ],
 )
-def test_what_makes_no_sense_is_refused(words: list[str], told: str) -> None:
+def test_invalid_options_are_refused(words: list[str], told: str) -> None:
     from click.testing import CliRunner
 
     from fieldtwin.cli.run.run_command import command

@@ -101,7 +101,7 @@ def test_an_emulated_field_listens_on_loopback(tmp_path: Path) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("mode", [("can-bus", "--listen"), ("bridge",)], ids=["can-bus", "bridge"])
-def test_other_servers_listen_only_where_they_are_told(tmp_path: Path, mode: tuple[str, ...]) -> None:
+def test_other_servers_listen_only_at_their_configured_endpoints(tmp_path: Path, mode: tuple[str, ...]) -> None:
     port = free_port()
     words = {
         "can-bus": ("can-bus", "--listen", f"{LOOPBACK}:{port}"),
@@ -157,7 +157,7 @@ def a_plant(folder: Path, serve: str, bridge: str = "") -> Path:
 
 
 @pytest.mark.long
-def test_a_plant_listens_where_serve_and_bridge_say_and_nowhere_else(tmp_path: Path) -> None:
+def test_a_plant_listens_only_at_the_endpoints_of_serve_and_bridge(tmp_path: Path) -> None:
     serve, bridge = free_port(), free_port()
     site = a_plant(tmp_path, f"tcp://{LOOPBACK}:{serve}", f"tcp://{LOOPBACK}:{bridge}")
     with fieldtwin(tmp_path, "run", str(site), "--plant", "--instance", "p", "--json") as run:
@@ -171,7 +171,7 @@ def test_a_plant_listens_where_serve_and_bridge_say_and_nowhere_else(tmp_path: P
 
 
 @pytest.mark.long
-def test_a_plant_listens_off_loopback_only_where_its_file_says_so(tmp_path: Path) -> None:
+def test_a_plant_listens_off_loopback_only_if_its_file_requests_it(tmp_path: Path) -> None:
     """With `serve` and with a thread, both on TLS: connections without a certificate of the authority are refused."""
     pki = make_pki(tmp_path)
     keys = f"ca={pki.ca}&cert={pki.cert('server')}&key={pki.key('server')}"
@@ -200,7 +200,7 @@ def test_a_plant_listens_off_loopback_only_where_its_file_says_so(tmp_path: Path
 
 
 @pytest.mark.long
-def test_the_test_host_listens_for_its_devices_on_loopback_and_for_nothing_else(tmp_path: Path) -> None:
+def test_the_test_host_listens_only_for_its_devices_on_loopback(tmp_path: Path) -> None:
     environment = {**os.environ, "PYTHONPATH": str(CHECKOUT), "FIELDTWIN_RUN": str(tmp_path)}
     with subprocess.Popen(
         [sys.executable, "-m", "fieldtwin", "test-host"],

@@ -32,7 +32,7 @@ sys.exit(9)
 
 
 @pytest.mark.interop
-def test_a_stranger_finds_every_port(tmp_path: Path) -> None:
+def test_a_third_party_program_finds_every_port(tmp_path: Path) -> None:
     pytest.importorskip("pymodbus")
     ended = run_to_end(tmp_path, "with", "observatory", "--", sys.executable, "-c", STRANGER)
     assert ended.process.returncode == 9, ended.err
@@ -58,7 +58,9 @@ def test_mbpoll_reads_the_sensor(tmp_path: Path) -> None:
         (["observatory", "--", "no-such-program"], 2, "no such program"),
     ],
 )
-def test_what_cannot_start_is_said_before_anything_runs(tmp_path: Path, words: list[str], code: int, told: str) -> None:
+def test_an_impossible_start_is_reported_before_anything_runs(
+    tmp_path: Path, words: list[str], code: int, told: str
+) -> None:
     ended = run_to_end(tmp_path, "with", *words)
     assert ended.process.returncode == code
     assert told in ended.err
@@ -77,7 +79,7 @@ def test_a_signal_ends_the_program_first_and_then_the_field(tmp_path: Path, numb
     wait_for(lambda: not Path(f"/proc/{field}").exists(), 5, "the field side ended")
 
 
-def test_a_field_that_dies_is_no_success(tmp_path: Path) -> None:
+def test_a_field_that_dies_is_not_a_success(tmp_path: Path) -> None:
     script = "echo up; while [ ! -e gone ]; do sleep 0.05; done"
     with fieldtwin(tmp_path, "with", "--instance", "w", "observatory", "--", "sh", "-c", script) as started:
         wait_for(lambda: "up" in started.out, 20, started.err)

@@ -18,7 +18,7 @@ PLACES = {"a": (0.0, 0.0), "b": (15.0, 0.0)}
 WATER = Water(range_m=100.0, bytes_per_s=10_000.0)
 
 
-def test_what_one_says_the_other_hears(tmp_path: Path) -> None:
+def test_each_end_receives_the_messages_of_the_other(tmp_path: Path) -> None:
     async def main() -> None:
         clock = WallClock()
         medium = AcousticMedium(WATER, PLACES, 1)
@@ -64,7 +64,7 @@ def test_a_modem_hands_over_so_much_and_no_more(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("first", [b"M\x00\x01z", b"S\x00\x01x", b"M\xff\xff"])
-def test_who_is_not_in_the_water_is_let_go(tmp_path: Path, first: bytes) -> None:
+def test_a_client_without_a_place_in_the_channel_is_disconnected(tmp_path: Path, first: bytes) -> None:
     async def main() -> None:
         server = AcousticServer(AcousticMedium(WATER, PLACES, 1), WallClock())
         await server.open(tmp_path / "w")

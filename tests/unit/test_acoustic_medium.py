@@ -42,7 +42,7 @@ def test_two_at_once_spoil_each_other_where_both_are_heard() -> None:
     assert sea.counters["middle"].lost["collision"] == 2
 
 
-def test_who_speaks_hears_nothing() -> None:
+def test_a_sending_modem_receives_nothing() -> None:
     sea = AcousticMedium(WATER, ROW, seed=1)
     sea.say("west", b"one", 0)
     sea.say("middle", b"two", s(1.9))  # it sends until 2.45 s, and the message from west arrives from 2 s on
@@ -76,7 +76,7 @@ def test_a_listener_that_takes_nothing_loses_the_oldest() -> None:
     assert sea.counters["middle"].dropped == 3
 
 
-def test_a_ship_says_it_more_than_once() -> None:
+def test_a_ship_repeats_its_message() -> None:
     sea = AcousticMedium(WATER, ROW, seed=1)
     ship = AcousticLink(sea, "west", times=3, every_ns=s(5))
     middle = AcousticLink(sea, "middle")
@@ -87,7 +87,7 @@ def test_a_ship_says_it_more_than_once() -> None:
     assert (ship.sent, ship.resent, middle.delivered) == (1, 2, 3)
 
 
-def test_faults_take_what_they_like() -> None:
+def test_faults_drop_messages() -> None:
     struck: list[tuple[int, int, bytes]] = []
 
     def spoils(t_ns: int, listener: int, payload: bytes) -> bool:
@@ -114,7 +114,7 @@ def test_no_such_modem() -> None:
     seed=st.integers(0, 99),
     looks=st.integers(1, 50),
 )  # fmt: skip
-def test_everything_said_is_heard_once_or_lost_for_a_reason_whoever_looks_when(
+def test_every_message_is_received_once_or_lost_for_a_reason_independent_of_polls(
     said: list[tuple[str, int, bytes]], loss: float, seed: int, looks: int
 ) -> None:
     said = sorted(said, key=lambda one: one[1])

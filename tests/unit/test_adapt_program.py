@@ -159,7 +159,7 @@ def test_in_the_end_all_know_the_same(loss: float, seed: int, told: list[tuple[s
     assert [s.unknown for s in ocean.stations.values()] == [0] * 3
 
 
-def test_a_restarted_observatory_hears_what_the_ship_ordered() -> None:
+def test_a_restarted_observatory_receives_the_ships_order() -> None:
     ocean = Ocean(0.0, 3)
     ocean.order(10)
     ocean.run(60)
@@ -227,7 +227,7 @@ def test_a_front_of_which_nothing_is_heard_any_more_is_over_after_a_while() -> N
     "nonsense",
     [b"", b"\x00", b"\x6f" * 11, b"\x6e" + bytes(11), b"\x6f\x09" + bytes(10), b"\x6f\x01\x00" + bytes(9), bytes(64), b"abc"],
 )  # fmt: skip
-def test_what_is_no_message_changes_nothing(nonsense: bytes) -> None:
+def test_an_invalid_message_changes_nothing(nonsense: bytes) -> None:
     ocean = Ocean(0.0, 1)
     ocean.order(10)
     ocean.run(60)

@@ -33,7 +33,7 @@ def test_held_inside_its_age(raw: bytes, asked_ns: int, now_ns: int, right: bool
     assert bool(oracle.wrong) is not right
 
 
-def test_real_devices_are_nobodys_to_judge_and_what_is_old_is_forgotten() -> None:
+def test_real_devices_are_not_checked_and_old_values_are_dropped() -> None:
     oracle = AgeOracle()
     oracle.published("real.x", b"a", 1, 0, 10)
     oracle.judge(EMULATED)

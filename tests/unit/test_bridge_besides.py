@@ -56,7 +56,7 @@ def test_functions_with_replies_of_no_fixed_length(tmp_path: Path) -> None:
     run(main())
 
 
-def test_a_serial_port_that_is_not_there_is_no_path(tmp_path: Path) -> None:
+def test_a_missing_serial_port_is_not_a_path(tmp_path: Path) -> None:
     async def main() -> None:
         async with rig(tmp_path) as r, r.client() as client:
             assert (await client.read_registers(1, "holding", 0, 1)).registers == (100,)

@@ -81,7 +81,7 @@ def test_a_request_is_read_or_refused_with_01_02_or_03(pdu: bytes) -> None:
         ("FC24", "18 04DE", [(0x4DE, 1, False)]),
     ],
 )
-def test_what_a_request_touches(case: str, pdu: str, accesses: list[tuple[int, int, bool]]) -> None:
+def test_the_addresses_of_a_request(case: str, pdu: str, accesses: list[tuple[int, int, bool]]) -> None:
     table = "coil" if pdu.startswith("0F") else "holding"
     assert list(examine(bytes.fromhex(pdu)).accesses) == [Access(table, *a) for a in accesses], case  # type: ignore[arg-type]
 
@@ -180,14 +180,14 @@ def test_replies_of_every_function_end_where_they_end(pdu: str, reply: str, piec
 
 @pytest.mark.parametrize("pieces", [1, 3, 8, 100])
 @pytest.mark.parametrize("reply", ["64 0A0B0C0D", "64", "64 5D 00 12 34"])
-def test_a_reply_that_tells_no_length_ends_with_a_silence(reply: str, pieces: int) -> None:
+def test_a_reply_of_unknown_length_ends_with_a_silence(reply: str, pieces: int) -> None:
     answer = bytes.fromhex(reply)
     frame = with_crc(b"\5" + answer)
     assert passed_on("64 01 02", frame, pieces=pieces) is None
     assert passed_on("64 01 02", frame, pieces=pieces, silence=True) == answer
 
 
-def test_a_reply_that_looks_like_a_shorter_one_with_a_zero_behind_it_is_passed_on_whole() -> None:
+def test_a_reply_that_looks_like_a_shorter_one_followed_by_a_zero_is_passed_on_whole() -> None:
     found = next(
         answer for n in range(0x10000) if (answer := b"\x64" + n.to_bytes(2)) and with_crc(b"\5" + answer)[-1] == 0
     )
@@ -197,7 +197,7 @@ def test_a_reply_that_looks_like_a_shorter_one_with_a_zero_behind_it_is_passed_o
         assert passed_on("64 01 02", frame, pieces=pieces, silence=True) == found
 
 
-def test_an_acknowledgement_of_something_else_is_no_answer() -> None:
+def test_an_acknowledgement_of_a_different_request_is_not_an_answer() -> None:
     with pytest.raises(Exception, match="differs from the request"):
         passed_on("06 0001 1234", with_crc(bytes.fromhex("05 06 0001 1235")))
 
@@ -228,7 +228,7 @@ def test_networks() -> None:
 
 
 @given(PDUS)
-def test_without_leave_nothing_that_may_change_a_unit_passes(pdu: bytes) -> None:
+def test_without_permission_no_request_that_may_change_a_unit_passes(pdu: bytes) -> None:
     try:
         asked = examine(pdu)
     except ModbusExceptionReply:

@@ -95,7 +95,7 @@ def test_clients_take_turns_among_themselves() -> None:
     assert queue.take(0) is None
 
 
-def test_what_waited_too_long_and_what_nobody_wants_stays_off_the_wire() -> None:
+def test_expired_and_abandoned_requests_are_never_sent() -> None:
     queue, results = GuestQueue(), list[Result]()
     queue.put(guest("a", results, queued_ns=0))
     queue.put(guest("a", results, wanted=lambda: False))
@@ -104,7 +104,7 @@ def test_what_waited_too_long_and_what_nobody_wants_stays_off_the_wire() -> None
     assert (queue.counters.stale, queue.counters.gone, queue.size) == (1, 1, 0)
 
 
-def test_when_the_wire_does_not_come_back_all_are_told() -> None:
+def test_if_the_wire_does_not_return_all_clients_get_an_answer() -> None:
     async def main() -> None:
         async with running_bus(make, field()) as r:
             await eventually(lambda: len(r.field.heard) > 4)

@@ -187,7 +187,7 @@ async def refused_raw(raw: TcpConnection, unit: int) -> int:
         ("the unit's own refusal, as it is", "03 003F 0002", 0x02),
     ],
 )
-def test_what_is_refused_and_with_which_exception(tmp_path: Path, case: str, pdu: str, code: int) -> None:
+def test_refused_requests_and_their_exceptions(tmp_path: Path, case: str, pdu: str, code: int) -> None:
     data = bytes.fromhex(pdu)
 
     async def main() -> None:

@@ -179,7 +179,7 @@ def test_while_a_unit_has_its_pause_others_have_the_line() -> None:
     run_virtually(main())
 
 
-def test_a_pause_of_the_bus_is_behind_every_exchange_and_behind_connecting() -> None:
+def test_a_pause_of_the_bus_follows_every_exchange_and_every_connection() -> None:
     config = BusConfig("line", LINE, 0.2, 1, spacing_s=0.05, connect_pause_s=0.7)
     v = observed([1, 2], [1, 2], 10, config, every_ms=10)
     asked = [h.t_s for h in v.line.heard]

@@ -89,7 +89,7 @@ def test_slcan_reaches_the_software_bus() -> None:
         ("can:pcan/PCAN_USBBUS1", 250_000, "driver of pcan is not on this computer"),
     ],
 )
-def test_what_cannot_be_is_said_in_one_line(url: str, bitrate: int, says: str) -> None:
+def test_an_impossible_command_line_is_refused_in_one_line(url: str, bitrate: int, says: str) -> None:
     async def main() -> None:
         with pytest.raises(UsageError, match=says):
             await OsConnector().open_can(Endpoint.parse(url), bitrate)
@@ -97,7 +97,7 @@ def test_what_cannot_be_is_said_in_one_line(url: str, bitrate: int, says: str) -
     run(main())
 
 
-def test_a_scan_by_an_adapter_finds_the_node_behind_another_one() -> None:
+def test_a_scan_by_an_adapter_finds_the_node_on_the_other_bus() -> None:
     async def main() -> None:
         url = "can:virtual/commissioning-2"
         theirs = await OsConnector().open_can(Endpoint.parse(url), 0)

@@ -78,7 +78,7 @@ def test_a_receiver_that_objects_alone_counts_nine() -> None:
     assert fault.counters == ((a, 8, 0), (b, 0, 9), (c, 0, 1))
 
 
-def test_the_frame_that_was_spoilt_arbitrates_again() -> None:
+def test_a_corrupted_frame_arbitrates_again() -> None:
     bus, (a, b, _) = make(3)
     bus.disturb(spoil(Disturbance(at_bit=0)))
     bus.submit(a, ONE, 0)
@@ -86,7 +86,7 @@ def test_the_frame_that_was_spoilt_arbitrates_again() -> None:
     assert [d.frame.can_id for d in bus.advance(END)] == [0, 1]
 
 
-def test_what_an_error_costs_lies_between_17_and_31_bits() -> None:
+def test_an_error_costs_between_17_and_31_bits() -> None:
     costs = set()
     frame = CanFrame(0x123, bytes(range(8)))
     for at in range(bits_to_end(frame)):
@@ -177,7 +177,7 @@ def test_in_bus_off_a_node_neither_hears_nor_acknowledges_nor_sends() -> None:
     assert done[1].receivers == (a,)
 
 
-def test_recovery_counts_the_ends_of_others_frames() -> None:
+def test_recovery_counts_the_ends_of_foreign_frames() -> None:
     bus, (a, b, _) = make(3)
     bus.disturb(spoil(Disturbance(at_bit=3), match=lambda f: f.can_id == 0x7FF, times=32))
     bus.submit(a, CanFrame(0x7FF), 0)
@@ -242,7 +242,7 @@ def test_a_good_frame_brings_a_passive_receiver_back() -> None:
 # -- without acknowledgement ----------------------------------------------------------------------------------------
 
 
-def test_nobody_acknowledges_passive_and_never_bus_off() -> None:
+def test_without_acknowledgement_a_node_gets_passive_and_never_bus_off() -> None:
     bus, (a,) = make(1, monitored=False)
     bus.submit(a, ZERO, 0)
     assert bus.advance(3600 * 10**9) == []  # an hour at once: attempts that change nothing are counted, not simulated
@@ -265,7 +265,7 @@ def test_a_listener_of_the_bus_acknowledges() -> None:
     assert len(bus.advance(END)) == 1
 
 
-def test_who_left_does_not_try_for_ever() -> None:
+def test_a_node_that_left_does_not_retry_for_ever() -> None:
     bus, (a,) = make(1, monitored=False)
     bus.submit(a, ZERO, 0)
     bus.leave(a, 1)
@@ -304,7 +304,7 @@ def test_collisions_of_three_and_the_same_frame_twice() -> None:
     assert [x.senders for x in done] == [(b, c), (d,), (a,)]
 
 
-def test_who_gives_way_again_and_again_goes_to_bus_off_too() -> None:
+def test_a_node_that_always_yields_goes_to_bus_off_too() -> None:
     bus, (a, b, _) = make(3)
     # 16 collisions; then a, error-passive, yields to b, whose frame is corrupted each time: + 8 for both until they are off.
     bus.disturb(spoil(match=lambda frame: frame.data == b"\x7f", times=16))
@@ -319,7 +319,7 @@ def test_who_gives_way_again_and_again_goes_to_bus_off_too() -> None:
     assert back - off > 128 * 11 * BIT_NS
 
 
-def test_collisions_go_on_to_bus_off() -> None:
+def test_repeated_collisions_lead_to_bus_off() -> None:
     bus, (a, b) = make(2)
     for _ in range(40):
         assert bus.submit(a, CanFrame(0x181, b"\xff"), 0)

@@ -54,7 +54,7 @@ def test_a_frame_on_the_wire_is_not_interrupted() -> None:
     assert done[1].start_ns == 400 * US
 
 
-def test_what_waits_can_be_taken_back_and_what_is_on_the_wire_cannot() -> None:
+def test_a_waiting_frame_can_be_withdrawn_and_a_frame_on_the_wire_cannot() -> None:
     bus = CanBus(125_000)
     a, b = bus.join(0), bus.join(0)
     again, other = CanFrame(0x001, b"\x01"), CanFrame(0x002)
@@ -68,7 +68,7 @@ def test_what_waits_can_be_taken_back_and_what_is_on_the_wire_cannot() -> None:
     assert (bus.queued(a), bus.queued(b)) == (0, 0)
 
 
-def test_what_is_taken_back_in_time_takes_no_part_in_the_arbitration() -> None:
+def test_a_frame_withdrawn_in_time_takes_no_part_in_the_arbitration() -> None:
     bus = CanBus(125_000)
     a, b = bus.join(0), bus.join(0)
     bus.submit(a, ZERO, 0)
@@ -79,7 +79,7 @@ def test_what_is_taken_back_in_time_takes_no_part_in_the_arbitration() -> None:
     assert keys(bus.advance(END)) == [0x001]
 
 
-def test_who_comes_before_the_start_takes_part_whoever_has_looked() -> None:
+def test_a_frame_queued_before_the_start_takes_part_independent_of_polls() -> None:
     bus = CanBus(125_000)
     a, b = bus.join(0), bus.join(0)
     bus.submit(a, ONE, 0)
@@ -120,7 +120,7 @@ def test_identical_frames_overlap_and_are_one_on_the_wire() -> None:
     assert bus.conflicts == 0
 
 
-def test_late_joiner_receives_only_what_starts_after_it_came() -> None:
+def test_late_joiner_receives_only_frames_that_start_after_it_joined() -> None:
     bus = CanBus(125_000)
     a = bus.join(0)
     bus.submit(a, ZERO, 0)
@@ -154,7 +154,7 @@ def test_leaving_loses_nothing_that_had_ended() -> None:
     assert delivery.receivers == (b,)
 
 
-def test_a_full_queue_refuses_and_takes_again_when_a_frame_has_gone() -> None:
+def test_a_full_queue_refuses_and_accepts_again_when_a_frame_was_sent() -> None:
     bus = CanBus(125_000, queue_frames=2)
     a, b = bus.join(0), bus.join(0)
     assert [bus.submit(a, ZERO, 0) for _ in range(3)] == [True, True, False]

@@ -124,7 +124,7 @@ class Mirror(DeviceModel):
         return Outcome({(0x2002, 0): situation.objects.number(0x2006)}, {(0x6000, 0): self.steps})
 
 
-def test_a_model_sees_an_object_as_it_is_now_whoever_changed_it() -> None:
+def test_a_model_sees_the_current_object_whoever_changed_it() -> None:
     rig = Rig(context=NodeContext(model=Mirror()))
     assert rig.read(0x2002) == 7  # the data sheet's
     rig.write(0x2006, 0, 9, 2)
@@ -135,7 +135,7 @@ def test_a_model_sees_an_object_as_it_is_now_whoever_changed_it() -> None:
     assert rig.read(0x2002) == 7
 
 
-def test_errors_that_come_and_go_are_told_to_the_model_at_the_next_turn() -> None:
+def test_errors_that_come_and_go_are_reported_to_the_model_at_its_next_step() -> None:
     model = Mirror()
     rig = Rig(context=NodeContext(model=model))
     before = model.steps
@@ -181,7 +181,7 @@ def delivered(bus: CanBus, sender: int, at_ms: int) -> tuple[int, ...]:
     return tuple(delivery.receivers)
 
 
-def test_a_frame_goes_to_who_is_on_the_bus_when_it_begins() -> None:
+def test_a_frame_goes_to_the_nodes_on_the_bus_at_its_start() -> None:
     bus = CanBus(125_000)
     a, b, c = (bus.join(0) for _ in range(3))
     assert delivered(bus, a, 0) == (b, c)
@@ -220,7 +220,7 @@ def test_a_node_in_bus_off_receives_nothing_until_it_is_back() -> None:
     assert delivered(bus, a, 210) == (b, c)
 
 
-def test_a_frame_is_stamped_and_stays_what_it_was() -> None:
+def test_a_frame_is_stamped_and_not_changed_afterwards() -> None:
     frame = CanFrame(0x1ABCDEF, b"\x01\x02", extended=True)
     assert (frame.at(5).t_ns, frame.t_ns, frame.at(5).key()) == (5, 0, frame.key())
 
@@ -250,7 +250,7 @@ def on_bus(node: CanopenNode, script: Any, *, queue_frames: int = 64, faulty: bo
 
 
 @pytest.mark.parametrize("faulty", [False, True])
-def test_what_finds_no_room_on_the_spot_is_sent_in_order_when_there_is_some(faulty: bool) -> None:
+def test_frames_without_room_are_sent_in_order_when_there_is_room(faulty: bool) -> None:
     """Eight TPDOs at one event, and room for two."""
     maps = [pdo(f"18{n:02X}", f"1A{n:02X}", f"0x{0x190 + n:X}", 254, [0x20020010]) for n in range(8)]
     text = RICH.split("[1800]")[0] + RICH[RICH.index("[2000]") :] + "".join(maps)
@@ -268,7 +268,7 @@ def test_what_finds_no_room_on_the_spot_is_sent_in_order_when_there_is_some(faul
     on_bus(node, script, queue_frames=2, faulty=faulty)
 
 
-def test_what_a_node_raises_by_its_timer_ends_it() -> None:
+def test_an_error_raised_in_a_nodes_timer_ends_it() -> None:
     calls = 0
 
     def source(now_ns: int) -> dict[tuple[int, int], bytes]:
@@ -334,7 +334,7 @@ def test_another_scale_holds_for_the_next_frame() -> None:
     loop.run_until_complete(main())
 
 
-def test_a_node_that_is_watched_anew_is_missed_in_its_own_time() -> None:
+def test_a_node_that_is_monitored_again_is_missed_after_its_own_time() -> None:
     """Its heartbeats change nothing, and the active timer belongs to a different node, far in the future."""
     lost: list[tuple[int, int]] = []
 

@@ -31,7 +31,7 @@ def test_a_controller_with_a_bit_rate() -> None:
     assert (link.is_can, link.is_up, link.kind, link.bitrate) == (True, True, "can", 125_000)
 
 
-def test_a_virtual_interface_has_none() -> None:
+def test_a_virtual_interface_has_no_bit_rate() -> None:
     link = read_link(newlink(280, 0, attribute(18, attribute(1, b"vcan\0"))))
     assert (link.is_can, link.is_up, link.kind, link.bitrate) == (True, False, "vcan", 0)
 
@@ -56,7 +56,7 @@ def test_garbage_is_an_oserror_or_a_link(data: bytes) -> None:
 
 
 @pytest.mark.skipif(not hasattr(socket, "AF_NETLINK"), reason="no netlink on this platform")
-def test_the_real_loopback_is_no_can() -> None:
+def test_the_real_loopback_is_not_a_can_interface() -> None:
     link = query_link("lo")
     assert not link.is_can
     with pytest.raises(OSError):

@@ -39,7 +39,7 @@ def test_a_frame_that_is_kept_out_would_have_done_nothing(can_id: int, data: byt
     assert node.state is untouched.state
 
 
-def test_whom_it_lets_in() -> None:
+def test_frames_that_the_filter_accepts() -> None:
     node = started()
     let_in = {i for i in range(0x800) if node.accepts(CanFrame(i, b""))}
     assert let_in >= {0x000, 0x080, 0x085, 0x185, 0x205, 0x285, 0x305, 0x585, 0x605, 0x705, 0x7E5}
@@ -47,7 +47,7 @@ def test_whom_it_lets_in() -> None:
     assert node.accepts(CanFrame(0x12345, b"", extended=True))
 
 
-def test_it_follows_what_a_client_writes_and_what_a_reset_restores() -> None:
+def test_the_filter_follows_writes_of_a_client_and_resets() -> None:
     node = started()
     moved, watched = CanFrame(0x3A0, bytes(3)), CanFrame(0x722, b"\x05")
     assert not node.accepts(moved)
@@ -62,7 +62,7 @@ def test_it_follows_what_a_client_writes_and_what_a_reset_restores() -> None:
     assert not node.accepts(watched)
 
 
-def test_a_connection_with_a_filter_takes_only_what_passes_and_calls_the_rest_no_overrun() -> None:
+def test_a_connection_with_a_filter_counts_no_overrun_for_rejected_frames() -> None:
     class End(CanConnection):
         async def send(self, frame: CanFrame) -> None:
             raise AssertionError("nobody sends here")

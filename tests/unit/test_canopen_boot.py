@@ -179,7 +179,7 @@ def test_a_node_that_runs_is_halted_before_its_configuration_changes(tmp_path: P
     run_virtually(main())
 
 
-def test_an_object_that_the_node_refuses_is_told_and_nothing_is_started(tmp_path: Path) -> None:
+def test_an_object_that_the_node_refuses_is_reported_and_nothing_is_started(tmp_path: Path) -> None:
     async def main() -> None:
         wrong = Configuration((Setting(0x2FFF, 0, b"\x01"),))
         async with rig(tmp_path, PeerBus([node()]), CanopenNodeConfig(configuration=wrong)) as r:
@@ -294,7 +294,7 @@ def test_sync_and_time_are_produced_where_writing_is_allowed(tmp_path: Path) -> 
     run_virtually(main(False, (0, 0)))
 
 
-def test_a_computer_that_does_not_know_the_date_tells_no_time(tmp_path: Path) -> None:
+def test_a_computer_without_a_date_sends_no_time(tmp_path: Path) -> None:
     async def main() -> None:
         wanted = CanopenBusConfig(time_ms=500)
         async with rig(tmp_path, PeerBus([node()]), bus=wanted, today_ns=0) as r:
@@ -331,7 +331,7 @@ def test_a_node_id_is_given_over_lss_to_the_one_that_shall_have_it(tmp_path: Pat
     run_virtually(main())
 
 
-def test_without_leave_to_write_there_is_no_lss(tmp_path: Path) -> None:
+def test_without_write_permission_there_is_no_lss(tmp_path: Path) -> None:
     async def main() -> None:
         peers = PeerBus([node()])
         async with rig(tmp_path, peers, CanopenNodeConfig(lss=WHO), allow_writes=False) as r:

@@ -38,7 +38,7 @@ def write(tmp_path: Path, dcf: str = DCF, **keys: str) -> str:
     return str(path)
 
 
-def test_what_the_keys_become(tmp_path: Path) -> None:
+def test_the_effect_of_the_keys(tmp_path: Path) -> None:
     who = "identity: {vendor: 1, product: 0x10, revision: 3, serial: 4}"
     system = load_system(
         write(
@@ -74,7 +74,7 @@ def drive(tmp_path: Path, **keys: str) -> str:
     return str(path)
 
 
-def test_what_the_keys_of_outputs_polls_and_pace_become(tmp_path: Path) -> None:
+def test_the_effect_of_the_keys_of_outputs_polls_and_pace(tmp_path: Path) -> None:
     pace = "timeout_ms: 80, retries: 3, backoff_first_ms: 100, backoff_limit_ms: 900"
     poll = "poll: {values: {every_ms: 500, phase_ms: 40}}"
     node = RPDO1 + "{map: [controlword, target_velocity], transmission: sync, event_ms: 50}, rpdos: node"
@@ -102,7 +102,7 @@ def test_what_the_keys_of_outputs_polls_and_pace_become(tmp_path: Path) -> None:
         ("spacing_ms: 5", "a Modbus bus"),
     ],
 )  # fmt: skip
-def test_what_is_wrong_with_outputs_is_said_with_its_line(tmp_path: Path, node: str, says: str) -> None:
+def test_errors_in_outputs_are_reported_with_their_line(tmp_path: Path, node: str, says: str) -> None:
     with pytest.raises(FileInvalid, match=says) as caught:
         load_system(drive(tmp_path, NODE=node))
     assert "s.yaml:7:" in str(caught.value)
@@ -127,7 +127,7 @@ def test_what_is_wrong_with_outputs_is_said_with_its_line(tmp_path: Path, node: 
         ({"NODE": "dcf: nothing.dcf"}, "no such file"),
     ],
 )
-def test_what_is_wrong_is_told_with_its_line(tmp_path: Path, keys: dict[str, str], says: str) -> None:
+def test_errors_are_reported_with_their_line(tmp_path: Path, keys: dict[str, str], says: str) -> None:
     with pytest.raises(FileInvalid) as told:
         load_system(write(tmp_path, **keys))
     assert says in str(told.value)
@@ -144,14 +144,14 @@ def test_what_is_wrong_is_told_with_its_line(tmp_path: Path, keys: dict[str, str
         (DCF + "[2001]\nParameterName=again\n", "2001"),
     ],
 )
-def test_a_malformed_dcf_is_told_with_file_section_and_key(tmp_path: Path, dcf: str, says: str) -> None:
+def test_a_malformed_dcf_is_reported_with_file_section_and_key(tmp_path: Path, dcf: str, says: str) -> None:
     with pytest.raises(FileInvalid) as told:
         load_system(write(tmp_path, dcf, NODE="dcf: node5.dcf"))
     assert says in str(told.value), str(told.value)
     assert "node5.dcf" in str(told.value)
 
 
-def test_a_dcf_that_sets_nothing_is_told(tmp_path: Path) -> None:
+def test_a_dcf_that_sets_nothing_is_reported(tmp_path: Path) -> None:
     with pytest.raises(FileInvalid, match="sets nothing"):
         load_system(
             write(tmp_path, "[DeviceInfo]\nVendorName=x\n\n" + var("2001", 6, "rw", "0"), NODE="dcf: node5.dcf")

@@ -84,7 +84,7 @@ def test_nmt_to_no_node_is_refused() -> None:
 # -- heartbeats ----------------------------------------------------------------------------------------------------
 
 
-def test_co036_monitoring_starts_at_the_first_heartbeat_and_loss_is_told_once() -> None:
+def test_co036_monitoring_starts_at_the_first_heartbeat_and_loss_is_reported_once() -> None:
     async def main() -> None:
         bench = Bench()
         bench.master.add_node(5, heartbeat_consumer_ms=1500)
@@ -107,7 +107,7 @@ def test_co036_monitoring_starts_at_the_first_heartbeat_and_loss_is_told_once() 
     run_virtual(main())
 
 
-def test_co037_a_late_heartbeat_inside_the_consumer_time_is_no_event() -> None:
+def test_co037_a_late_heartbeat_inside_the_consumer_time_is_not_an_event() -> None:
     async def main() -> None:
         bench = Bench()
         bench.master.add_node(5, heartbeat_consumer_ms=1500)
@@ -195,7 +195,7 @@ def test_a_heartbeat_that_waits_unread_is_not_late() -> None:
 
 
 @pytest.mark.parametrize("text", ["705#", "705#01", "705#85", "705#0505"])
-def test_co039_what_is_no_heartbeat_is_ignored_and_counted(text: str) -> None:
+def test_co039_an_invalid_heartbeat_is_ignored_and_counted(text: str) -> None:
     async def main() -> None:
         bench = Bench()
         async with running(bench.master):
@@ -207,7 +207,7 @@ def test_co039_what_is_no_heartbeat_is_ignored_and_counted(text: str) -> None:
     run_virtual(main())
 
 
-def test_co035_a_boot_up_that_nobody_asked_for_is_unexpected() -> None:
+def test_co035_an_unrequested_boot_up_is_unexpected() -> None:
     async def main() -> None:
         bench = Bench()
         async with running(bench.master):
@@ -272,7 +272,7 @@ def test_sdo_is_serial_on_a_node_and_concurrent_over_nodes() -> None:
     run_virtual(main())
 
 
-def test_errors_say_where_and_are_counted() -> None:
+def test_errors_name_their_place_and_are_counted() -> None:
     async def main() -> None:
         bench = Bench()
         async with running(bench.master):
@@ -324,7 +324,7 @@ def test_co063_a_bus_that_takes_no_frames_is_a_time_out_and_kills_no_task() -> N
     run_virtual(main())
 
 
-def test_a_lost_bus_fails_what_waits_at_once_and_what_comes_later() -> None:
+def test_a_lost_bus_fails_waiting_and_later_requests_at_once() -> None:
     async def main() -> None:
         bench = Bench()
         async with running(bench.master) as reader:
@@ -366,7 +366,7 @@ def test_a_boot_up_ends_the_transfer_under_way_and_it_is_asked_again_at_once() -
     run_virtual(main())
 
 
-def test_a_cancelled_master_leaves_nobody_waiting() -> None:
+def test_a_cancelled_master_leaves_no_request_waiting() -> None:
     async def main() -> None:
         bench = Bench()
         async with running(bench.master):

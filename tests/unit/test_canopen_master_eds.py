@@ -89,7 +89,7 @@ def test_a_clean_file() -> None:
         od.find("slope")
 
 
-def test_without_node_id_what_depends_on_it_is_unknown() -> None:
+def test_without_node_id_dependent_values_are_unknown() -> None:
     entry = parse_dictionary(EDS).get(0x1800, 1)
     assert entry is not None
     assert entry.default is None
@@ -119,7 +119,7 @@ def test_a_dcf_brings_its_node_id_and_values() -> None:
         ("AccessType=ro\nLowLimit", "AccessType=\nLowLimit", "[6010] AccessType: missing, read as rw"),
     ],
 )
-def test_what_is_mended_is_said(old: str, new: str, said: str) -> None:
+def test_corrections_are_reported(old: str, new: str, said: str) -> None:
     assert old in EDS
     od = parse_dictionary(EDS.replace(old, new), 5)
     assert any(said in line for line in od.mended), od.mended
@@ -138,7 +138,7 @@ def test_what_is_mended_is_said(old: str, new: str, said: str) -> None:
         ("[1800]\nParameterName=TPDO1\nObjectType=0x9\nSubNumber=2\n", ""),
     ],
 )
-def test_harmless_ways_of_writing(old: str, new: str, tmp_path: Path) -> None:
+def test_harmless_variants_are_accepted(old: str, new: str, tmp_path: Path) -> None:
     text = EDS.replace(old, new)
     if not new:
         text += "\n" + old  # the object after its sub-objects
@@ -223,7 +223,7 @@ def test_compact_arrays_have_all_their_entries() -> None:
         ("PDOMapping=1", "PDOMapping=08", 57, "PDOMapping: cannot be read"),
     ],
 )
-def test_what_is_refused_says_where(old: str, new: str, line: int, match: str) -> None:
+def test_refusals_name_the_place(old: str, new: str, line: int, match: str) -> None:
     assert old in EDS
     with pytest.raises(FileInvalid, match=match) as caught:
         parse_dictionary(EDS.replace(old, new), 5, path="probe.eds")
@@ -237,7 +237,7 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
         parse_dictionary("[FileInfo]\nFileName=x\n")
 
 
-def test_an_encoding_other_than_utf8_is_read_and_said(tmp_path: Path) -> None:
+def test_an_encoding_other_than_utf8_is_read_and_reported(tmp_path: Path) -> None:
     path = tmp_path / "probe.eds"
     path.write_bytes(EDS.replace("Nobody", "Mößler").encode("cp1252"))
     od = load_dictionary(path)

@@ -81,7 +81,7 @@ async def bench(*nodes: CanopenNode, bitrate: int = 125_000) -> AsyncIterator[Be
 
 @pytest.mark.parametrize("size", [0, 1, 7, 8, 441, 442, 889, 890, 5000])
 @pytest.mark.parametrize("block", [1, 127])
-def test_block_transfers_both_ways(size: int, block: int) -> None:
+def test_block_transfers_in_both_directions(size: int, block: int) -> None:
     async def main() -> None:
         node = CanopenNode(parse_eds(DOMAIN_EDS, "x"), 5, NodeContext(sdo_block=block))
         async with bench(node, bitrate=1_000_000) as b:

@@ -237,7 +237,7 @@ def test_a_tpdo_is_configured_read_back_and_received() -> None:
     run(main())
 
 
-def test_a_node_that_acknowledges_and_holds_something_else_is_told_on() -> None:
+def test_a_node_that_acknowledges_and_holds_a_different_value_is_reported() -> None:
     async def main() -> None:
         async with pair() as p:
             p.node.add_read_callback(lambda index, subindex, od: 200 if (index, subindex) == (0x1800, 2) else None)
@@ -247,7 +247,7 @@ def test_a_node_that_acknowledges_and_holds_something_else_is_told_on() -> None:
     run(main())
 
 
-def test_what_cannot_be_asked_for_is_refused_before_anything_is_sent() -> None:
+def test_an_impossible_request_is_refused_before_anything_is_sent() -> None:
     async def main() -> None:
         async with pair() as p:
             for number, objects, cob_id, kind in (

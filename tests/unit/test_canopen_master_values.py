@@ -59,7 +59,7 @@ def test_values_and_bytes(kind: DataType, value: Scalar, data: str) -> None:
         (DataType.TIME_OF_DAY, b"\x01"),
     ],
 )
-def test_what_does_not_fit_is_refused(kind: DataType, value: Scalar) -> None:
+def test_values_that_do_not_fit_are_refused(kind: DataType, value: Scalar) -> None:
     with pytest.raises(UsageError):
         encode(kind, value)
 
@@ -76,7 +76,7 @@ def test_any_bytes_decode_or_have_the_wrong_length(kind: DataType, data: bytes) 
         assert encode(kind, value) == data
 
 
-def test_strings_lose_their_padding_and_nothing_else() -> None:
+def test_strings_lose_only_their_padding() -> None:
     assert decode(DataType.VISIBLE_STRING, b"a\0b\xb0\0\0") == "a\0b\\xb0"
     assert decode(0x40, b"\x01") == b"\x01"
     assert size_of(0x40) is None
@@ -117,7 +117,7 @@ def test_a_mapping_that_cannot_be() -> None:
 
 
 @given(bits=st.lists(st.integers(1, 32), max_size=12).filter(lambda b: sum(b) <= 64), data=st.binary(max_size=8))
-def test_what_is_cut_out_goes_back_together(bits: list[int], data: bytes) -> None:
+def test_extracted_bits_can_be_reassembled(bits: list[int], data: bytes) -> None:
     mapping = PdoMapping.of([(0x2000, i, n) for i, n in enumerate(bits)])
     if len(data) < mapping.length:
         with pytest.raises(PdoLengthMismatch):

@@ -173,7 +173,7 @@ async def rig(
         audit.close()
 
 
-def test_what_a_scan_commands_goes_in_one_frame_and_only_when_it_changes(tmp_path: Path) -> None:
+def test_the_commands_of_a_scan_go_in_one_frame_and_only_when_they_change(tmp_path: Path) -> None:
     async def main() -> None:
         async with rig(tmp_path) as r:
             assert r.status.online
@@ -250,7 +250,7 @@ def test_nothing_goes_to_a_node_that_is_not_operational_and_all_of_it_when_it_is
 
 
 @pytest.mark.parametrize("heartbeat", [HEARTBEAT, None])
-def test_a_node_that_restarts_is_mapped_again_and_told_again(tmp_path: Path, heartbeat: Heartbeat | None) -> None:
+def test_a_node_that_restarts_is_mapped_and_commanded_again(tmp_path: Path, heartbeat: Heartbeat | None) -> None:
     async def main() -> None:
         async with rig(tmp_path, replace(DRIVEN, heartbeat=heartbeat)) as r:
             r.want(controlword=6, target_velocity=5, mode=3)
@@ -293,7 +293,7 @@ def test_a_read_only_plant_is_sent_no_rpdo_and_no_download(tmp_path: Path) -> No
     run_virtually(main())
 
 
-def test_another_node_is_told_nothing(tmp_path: Path) -> None:
+def test_a_different_node_is_not_commanded(tmp_path: Path) -> None:
     async def main() -> None:
         async with rig(tmp_path, replace(DRIVEN, expect={"serial": "4711"})) as r:
             r.want(controlword=6, mode=3)
@@ -375,7 +375,7 @@ def test_an_rpdo_is_repeated_and_a_full_bus_is_counted(tmp_path: Path) -> None:
     run_virtually(main())
 
 
-def test_a_device_that_holds_something_else_is_told_again(tmp_path: Path) -> None:
+def test_a_device_that_holds_a_different_value_is_commanded_again(tmp_path: Path) -> None:
     async def main() -> None:
         async with rig(tmp_path, replace(DRIVEN, poll={"values": 50})) as r:
             r.want(mode=3)
@@ -388,7 +388,7 @@ def test_a_device_that_holds_something_else_is_told_again(tmp_path: Path) -> Non
     run_virtually(main())
 
 
-def test_what_is_polled_stays_good_and_what_was_read_at_boot_grows_stale(tmp_path: Path) -> None:
+def test_polled_values_stay_good_and_values_read_at_boot_become_stale(tmp_path: Path) -> None:
     async def main() -> None:
         async with rig(tmp_path, DRIVEN) as r:
             await asyncio.sleep(1)
@@ -420,7 +420,7 @@ def test_a_node_without_a_heartbeat_is_lost_when_a_poll_is_not_answered(tmp_path
     run_virtually(main())
 
 
-def test_a_boot_up_ends_the_time_for_which_a_lost_node_is_left_alone(tmp_path: Path) -> None:
+def test_a_boot_up_ends_the_back_off_of_a_lost_node(tmp_path: Path) -> None:
     async def main() -> None:
         async with rig(tmp_path, replace(DRIVEN, backoff_first_s=60.0, backoff_limit_s=60.0, timeout_s=0.02)) as r:
             await r.field.power_off()

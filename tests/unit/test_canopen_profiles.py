@@ -67,12 +67,12 @@ def shipped(name: str) -> DeviceProfile:
 
 
 @pytest.mark.parametrize("sheet", make_eds.SHEETS, ids=lambda sheet: sheet.name)
-def test_a_shipped_data_sheet_is_what_its_table_makes(sheet: make_eds.Sheet) -> None:
+def test_a_shipped_data_sheet_is_generated_from_its_table(sheet: make_eds.Sheet) -> None:
     assert (DEVICES / sheet.file).read_text(encoding="ascii") == make_eds.text(sheet)
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_three_readers_take_a_data_sheet_alike(name: str) -> None:
+def test_three_readers_interpret_a_data_sheet_identically(name: str) -> None:
     path, node = DEVICES / f"{name}.eds", 9
     ours, gateways = load_eds(path), load_dictionary(path, node)
     theirs = canopen.import_od(str(path), node)
@@ -128,7 +128,7 @@ def test_a_data_sheet_is_right_to_a_stricter_eye(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_what_a_pdo_maps_by_default_is_there_may_be_mapped_and_fits(name: str) -> None:
+def test_default_pdo_mappings_exist_are_mappable_and_fit(name: str) -> None:
     dictionary = load_eds(DEVICES / f"{name}.eds")
     for index in [i for i in dictionary.objects if 0x1600 <= i < 0x1800 or 0x1A00 <= i < 0x1C00]:
         subs = dictionary.objects[index].entries
@@ -159,7 +159,7 @@ def test_a_profile_is_at_most_forty_lines_cites_its_source_and_fits_its_data_she
 
 
 @pytest.mark.parametrize("name", PLAYED)
-def test_a_shipped_recording_is_what_the_script_makes_and_says_synthetic(name: str, tmp_path: Path) -> None:
+def test_a_shipped_recording_is_the_output_of_the_script_and_marked_synthetic(name: str, tmp_path: Path) -> None:
     make_device_recordings.make_node(name, tmp_path, make_device_recordings.DEFAULT_SEED)
     assert (tmp_path / f"{name}.jsonl").read_bytes() == RECORDINGS[name].read_bytes()
     with RecordingReader(RECORDINGS[name]) as reader:
@@ -169,7 +169,7 @@ def test_a_shipped_recording_is_what_the_script_makes_and_says_synthetic(name: s
     assert rows[0].values == rows[-1].values  # a loop has no jump
 
 
-def test_an_identity_that_is_no_number_and_a_data_sheet_without_an_object_are_told(tmp_path: Path) -> None:
+def test_an_invalid_identity_and_a_data_sheet_without_an_object_are_reported(tmp_path: Path) -> None:
     profile = shipped("encoder-cia406")
     with pytest.raises(UsageError, match=r"identity 'serial'.*a number"):
         emulated_node(profile, 9, None, 0, {"serial": "x12"})
@@ -236,7 +236,7 @@ async def line(name: str, tmp_path: Path) -> AsyncIterator[Line]:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_driver_reads_what_the_node_holds(name: str, tmp_path: Path) -> None:
+def test_the_driver_reads_the_values_of_the_node(name: str, tmp_path: Path) -> None:
     async def main() -> None:
         async with line(name, tmp_path) as rig:
             readable = [t for t in rig.profile.tags.values() if t.readable]

@@ -52,13 +52,13 @@ async def listen(end: CanConnection, heard: list[str]) -> None:
             heard.append(str(frame))
 
 
-def test_error_passive_is_told_while_it_lasts() -> None:
+def test_error_passive_is_reported_while_it_lasts() -> None:
     heard, _ = run_virtually(spoiled(17))
     assert next(frame for frame in heard if frame.startswith("085#")) == "085#2081110000000000"
     assert "085#4081110000000000" not in heard
 
 
-def test_bus_off_is_told_afterwards() -> None:
+def test_bus_off_is_reported_afterwards() -> None:
     heard, node = run_virtually(spoiled(32))
     assert heard.count("085#4081110000000000") == 1
     assert heard.index("085#4081110000000000") < len(heard) - 5, "the heartbeat goes on"

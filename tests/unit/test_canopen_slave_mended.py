@@ -47,11 +47,11 @@ def notes(text: str) -> list[str]:
         (record("1018", [var("1018sub0", 5, "ro", 1)]).replace("SubNumber=1", "SubNumber=5"), "SubNumber of [1018] is 5, 1"),
     ],
 )  # fmt: skip
-def test_what_was_mended_is_said(text: str, told: str) -> None:
+def test_corrections_are_reported(text: str, told: str) -> None:
     assert any(told in note for note in notes(text)), notes(text)
 
 
-def test_nothing_is_said_of_a_file_that_is_in_order() -> None:
+def test_nothing_is_reported_for_a_correct_file() -> None:
     assert parse_eds("[DeviceInfo]\nVendorName=x\n" + LEAST).notes == ()
     for shipped in sorted((CHECKOUT / "profiles" / "devices").glob("*.eds")):
         assert load_eds(shipped).notes == (), shipped
@@ -128,7 +128,7 @@ def test_malformed_files_name_file_section_and_key(tmp_path: Path, text: str, to
     assert re.search(told, str(caught.value)), caught.value
 
 
-def test_the_command_says_what_was_mended_and_where_the_node_is(tmp_path: Path) -> None:
+def test_the_command_reports_corrections_and_the_nodes_place(tmp_path: Path) -> None:
     path = tmp_path / "thing.dcf"
     path.write_text(
         "[DeviceInfo]\nVendorNumber=\n" + LEAST + "[DeviceComissioning]\nNodeID=23\nBaudrate=250\n", encoding="utf-8"

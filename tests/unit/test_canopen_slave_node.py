@@ -418,7 +418,7 @@ def test_no_emcy_when_stopped_or_invalid(rig: Rig) -> None:
     assert rig.node.counters.emcys_dropped == 2
 
 
-def test_what_no_emcy_can_carry(rig: Rig) -> None:
+def test_values_that_no_emcy_can_carry(rig: Rig) -> None:
     for code, register, info in ((0x10000, 1, b""), (0, 1, b""), (0x1000, 256, b""), (0x1000, 1, bytes(6))):
         with pytest.raises(UsageError, match="EMCY"):
             rig.node.raise_error(code, rig.now_ns, register=register, info=info)
@@ -446,7 +446,7 @@ WRITES = st.builds(
 
 @settings(max_examples=150, deadline=None)
 @given(st.lists(st.tuples(FRAMES | WRITES, st.integers(0, 300)), max_size=40))
-def test_any_frames_leave_a_node_that_obeys(traffic: list[tuple[CanFrame, int]]) -> None:
+def test_any_frames_leave_a_working_node(traffic: list[tuple[CanFrame, int]]) -> None:
     rig = Rig()
     for frame, ms in traffic:
         rig.node.feed(frame, rig.now_ns)

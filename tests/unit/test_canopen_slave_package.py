@@ -65,7 +65,7 @@ def remote_node(network: canopen.Network) -> Any:
     return network.add_node(NODE, sheet)  # type: ignore[arg-type]
 
 
-def test_sdo_in_all_its_ways() -> None:
+def test_sdo_transfers_of_all_kinds() -> None:
     node = CanopenNode(parse_eds(RICH), NODE)
 
     def client(network: canopen.Network) -> None:

@@ -18,7 +18,7 @@ def rig() -> Rig:
     return Rig()
 
 
-def test_expedited_both_ways(rig: Rig) -> None:
+def test_expedited_in_both_directions(rig: Rig) -> None:
     assert rig.sdo("2B 0620 00 3412") == "6006200000000000"
     assert rig.sdo("40 0620 00") == "4B06200034120000"
 

@@ -202,7 +202,7 @@ def test_a_node_is_booted_configured_and_kept_so(tmp_path: Path, loop: VirtualLo
     loop.run_until_complete(main())
 
 
-def test_who_is_on_the_bus(tmp_path: Path, loop: VirtualLoop) -> None:
+def test_nodes_on_the_bus(tmp_path: Path, loop: VirtualLoop) -> None:
     async def main() -> None:
         async with winch(tmp_path, loop) as rig:
             told: list[int] = []
@@ -222,7 +222,7 @@ def test_who_is_on_the_bus(tmp_path: Path, loop: VirtualLoop) -> None:
     loop.run_until_complete(main())
 
 
-def test_a_node_of_another_identity_is_left_alone(tmp_path: Path, loop: VirtualLoop) -> None:
+def test_a_node_with_a_different_identity_is_not_touched(tmp_path: Path, loop: VirtualLoop) -> None:
     async def main() -> None:
         async with winch(tmp_path, loop) as rig:
             assert "serial" in rig.status["identity_error"]

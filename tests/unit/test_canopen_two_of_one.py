@@ -105,7 +105,7 @@ async def mastered(connector) -> AsyncIterator[CanopenMaster]:  # type: ignore[n
         yield master
 
 
-def test_another_client_that_reads_the_same_objects_is_no_second_node() -> None:
+def test_another_client_that_reads_the_same_objects_is_not_a_second_node() -> None:
     async def main() -> None:
         async with can_bus(node(5, 0x191, 7)) as connector, mastered(connector) as ours, mastered(connector) as theirs:
             for master in (ours, theirs):

@@ -97,7 +97,7 @@ def test_the_heartbeat_time_alone_serves_the_cases_that_need_a_number(tmp_path: 
     assert {id: verdict for id, (verdict, _) in found.items()} == dict.fromkeys(NEEDS_A_NUMBER, Verdict.PASSED), found
 
 
-def test_a_skipped_case_says_what_each_given_object_is(tmp_path: Path) -> None:
+def test_a_skipped_case_describes_each_given_object(tmp_path: Path) -> None:
     found = verdicts(ours, tmp_path, *NEEDS_A_TEXT, may_write=((0x1017, 0), (0x5FFE, 0)))
     for verdict, reason in found.values():
         assert verdict is Verdict.SKIPPED

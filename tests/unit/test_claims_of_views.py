@@ -29,14 +29,14 @@ SILENT = "faults: [{name: silence, device: ctd}]\n"
 VIRTUAL = ["observatory", "--prototype", "--virtual", "--for", "5s"]
 
 
-def test_a_run_with_faults_says_that_it_did_not_judge_devices(tmp_path: Path) -> None:
+def test_a_run_with_faults_reports_that_it_did_not_check_devices(tmp_path: Path) -> None:
     (tmp_path / "faults.yaml").write_text(SILENT)
     done = CliRunner().invoke(run_system, [*VIRTUAL, "--faults", str(tmp_path / "faults.yaml")], standalone_mode=False)
     assert "not judged     whether devices and outputs were good at the end, because faults were put in" in done.stdout
     assert "not judged" not in CliRunner().invoke(run_system, VIRTUAL, standalone_mode=False).stdout
 
 
-def test_the_audit_log_names_only_what_start_up_writes(tmp_path: Path) -> None:
+def test_the_audit_log_names_only_writes_of_the_start_up(tmp_path: Path) -> None:
     async def main() -> None:
         for number, heartbeat in enumerate((Heartbeat(None, 150), Heartbeat(50, 150))):
             folder = tmp_path / str(number)
@@ -52,7 +52,7 @@ def test_the_audit_log_names_only_what_start_up_writes(tmp_path: Path) -> None:
     run(main())
 
 
-def test_a_dump_is_not_taken_for_the_recording_of_the_profile_beside_it(tmp_path: Path) -> None:
+def test_a_dump_is_not_taken_for_the_recording_of_the_profile_in_its_folder(tmp_path: Path) -> None:
     dump, recording = tmp_path / "dump.jsonl", tmp_path / "recording.jsonl"
     dump.write_text('{"fieldtwin_dump":2,"protocol":"modbus"}\n')
     recording.write_text('{"fieldtwin_recording": 1, "device": "x", "kind": "exchanges", "source": "measured"}\n')

@@ -100,7 +100,7 @@ def test_neither_flag_is_a_default_and_both_exclude_each_other(invoke: Invoke) -
         (("fly",), "No such command"),
     ],
 )
-def test_what_makes_no_sense_is_said_in_one_line(invoke: Invoke, args: tuple[str, ...], told: str) -> None:
+def test_invalid_usage_is_reported_in_one_line(invoke: Invoke, args: tuple[str, ...], told: str) -> None:
     code, out, err = invoke(*args)
     assert code == 2, err
     assert out == ""
@@ -108,7 +108,7 @@ def test_what_makes_no_sense_is_said_in_one_line(invoke: Invoke, args: tuple[str
     assert "Traceback" not in err
 
 
-def test_a_field_side_that_is_not_there_is_unreachable(invoke: Invoke) -> None:
+def test_a_missing_field_simulator_is_unreachable(invoke: Invoke) -> None:
     code, out, err = invoke("run", "observatory", "--prototype", "--field", "127.0.0.1:1")
     assert (code, out) == (4, "")
     assert "127.0.0.1:1" in err
@@ -143,7 +143,7 @@ def test_a_field_side_that_is_not_there_is_unreachable(invoke: Invoke) -> None:
         ("cycle_ms: 10", "tasks: {b: {single: modem.link_state}}", "tasks: {b:", "only SINGLE tasks"),
     ],
 )  # fmt: skip
-def test_a_wrong_system_file_is_named_with_line_and_what_was_expected(
+def test_a_wrong_system_file_is_reported_with_line_and_expected_content(
     invoke: Invoke, plant: Callable[..., str], old: str, new: str, line: str, told: str, tmp_path: Path
 ) -> None:
     path = plant(old, new)
@@ -224,7 +224,7 @@ def test_a_transmitter_on_a_serial_line_is_refused_when_the_file_is_read(
 # -- recordings ---------------------------------------------------------------------------------------------------------
 
 
-def test_a_cast_without_a_wanted_column_names_what_it_has(invoke: Invoke, tmp_path: Path) -> None:
+def test_a_cast_without_a_required_column_names_its_columns(invoke: Invoke, tmp_path: Path) -> None:
     cast = tmp_path / "x.cnv"
     cast.write_text(
         "* Sea-Bird SBE 9 Data File:\n# nquan = 2\n# nvalues = 1\n# units = specified\n"
@@ -239,7 +239,7 @@ def test_a_cast_without_a_wanted_column_names_what_it_has(invoke: Invoke, tmp_pa
     assert not (tmp_path / "x.jsonl").exists()
 
 
-def test_a_recording_that_is_none(invoke: Invoke, tmp_path: Path) -> None:
+def test_a_file_that_is_not_a_recording(invoke: Invoke, tmp_path: Path) -> None:
     (tmp_path / "no.jsonl").write_text("not a recording\n", encoding="utf-8")
     recording = f"ctd={tmp_path / 'no.jsonl'}"
     code, _, err = invoke("run", "observatory", "--prototype", "--for", "1s", "--recording", recording)
@@ -292,7 +292,7 @@ def test_options_can_come_from_the_environment(invoke: Invoke, monkeypatch: pyte
     assert "instance name" in err
 
 
-def test_a_reader_that_leaves_early_is_no_error() -> None:
+def test_a_reader_that_closes_early_is_not_an_error() -> None:
     environment = {**os.environ, "PYTHONPATH": str(SYSTEMS.parents[1])}
     process = subprocess.Popen(
         [sys.executable, "-m", "fieldtwin", "schema", "system"],

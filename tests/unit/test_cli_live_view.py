@@ -73,7 +73,7 @@ def test_it_fits_the_terminal_and_nothing_is_cut_off(session: RunSession, width:
     assert "…" not in text
 
 
-def test_a_low_terminal_still_shows_devices_scan_and_what_is_wrong(session: RunSession) -> None:
+def test_a_low_terminal_still_shows_devices_scan_and_problems(session: RunSession) -> None:
     top = " ".join(" ".join(shown(session, 80)[:20]).split())
     for wanted in ("ctd", "inclinometer", "modem", "scan 10 ms", NOBODY, SILENT):
         assert wanted in top

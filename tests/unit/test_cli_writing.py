@@ -58,7 +58,7 @@ def test_a_locale_without_arrows() -> None:
     assert b"STANDBY -> " in ended.stdout + ended.stderr
 
 
-def test_a_reader_that_leaves_a_table_early_is_no_error() -> None:
+def test_a_reader_that_closes_a_table_early_is_not_an_error() -> None:
     process = subprocess.Popen(
         [sys.executable, "-m", "fieldtwin", "faults"],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, env={**os.environ, "PYTHONPATH": str(ROOT)},

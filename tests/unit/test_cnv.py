@@ -112,13 +112,13 @@ def test_without_a_time_column_the_interval_counts(tmp_path: Path) -> None:
     assert [row[0] for row in rows_of(tmp_path / "out.jsonl")] == [0.0, 0.041667, 0.083333]
 
 
-def test_values_that_touch_are_told_apart_by_their_width(tmp_path: Path) -> None:
+def test_adjacent_values_are_distinguished_by_their_width(tmp_path: Path) -> None:
     content = cnv(rows=[]) + b"   -1.50000-4765.69865  4.5000000      0.500 0.0000e+00\r\n"
     import_cnv(write(tmp_path, content), tmp_path / "out.jsonl")
     assert rows_of(tmp_path / "out.jsonl") == [(0.0, -1.5, -4765.69865, 4.5)]
 
 
-def test_a_start_that_is_not_said_to_be_utc_is_left_out(tmp_path: Path) -> None:
+def test_a_start_that_is_not_marked_utc_is_omitted(tmp_path: Path) -> None:
     header = ("start_time = Jul 05 2012 17:39:14 [Instrument's time stamp, header]",)
     assert import_cnv(write(tmp_path, cnv(header=header)), tmp_path / "out.jsonl").start_utc == ""
 
@@ -168,7 +168,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize(("content", "line", "says"), REFUSED.values(), ids=REFUSED)
-def test_what_cannot_be_read_is_refused_with_its_line_and_leaves_no_file(
+def test_unreadable_content_is_refused_with_its_line_and_leaves_no_file(
     tmp_path: Path, content: bytes, line: int | None, says: str
 ) -> None:
     path = write(tmp_path, content)

@@ -52,7 +52,7 @@ def refusals(made: CommandGate) -> list[str]:
     return [str(e.value) for e in made.collect() if e.kind == Kind.REFUSAL]
 
 
-def test_what_is_admitted_is_the_command_bit_by_bit_and_on_record() -> None:
+def test_an_admitted_command_is_forwarded_bit_by_bit_and_recorded() -> None:
     made = gate()
     command = made.admit("twin:1", number(1, 5))
     assert command is not None
@@ -61,7 +61,7 @@ def test_what_is_admitted_is_the_command_bit_by_bit_and_on_record() -> None:
     assert (event.kind, event.name, event.value) == (Kind.COMMAND, "twin:1", encode_period(5).data)
 
 
-def test_what_was_commanded_before_the_plants_log_began_is_not_obeyed() -> None:
+def test_a_command_from_before_the_start_of_the_plants_log_is_not_obeyed() -> None:
     """A plant that lost its store does not know its earlier commands; its twin sends everything again."""
     made = CommandGate(remote=True, bounds=Bounds(0, 3600, 5), clock=Hands(), since_ms=NOW_MS - 1000)
     assert made.admit("twin:1", number(1, t_ms=NOW_MS - 1001)) is None
@@ -72,7 +72,7 @@ def test_what_was_commanded_before_the_plants_log_began_is_not_obeyed() -> None:
 
 
 @given(numbers=st.lists(st.integers(1, 8), max_size=30))
-def test_no_number_is_taken_twice_and_none_after_a_later_one(numbers: list[int]) -> None:
+def test_each_number_is_taken_once_and_never_after_a_later_one(numbers: list[int]) -> None:
     made = gate(bounds=Bounds(per_minute=1000))
     taken = [n for n in numbers if made.admit("twin:1", number(n)) is not None]
     assert taken == sorted(set(taken))
@@ -105,7 +105,7 @@ def test_the_rate_is_bounded_and_recovers() -> None:
         Hands.now_ms = NOW_MS
 
 
-def test_switch_and_limits_may_change_and_what_was_taken_before_counts() -> None:
+def test_switch_and_limits_may_change_and_earlier_commands_count() -> None:
     made = gate(bounds=Bounds(0, 3600, 3))
     assert all(made.admit("t", number(n)) is not None for n in (1, 2))
     made.restate(remote=False, bounds=Bounds(0, 3600, 3))
@@ -120,13 +120,13 @@ def test_switch_and_limits_may_change_and_what_was_taken_before_counts() -> None
     assert [made.admit("t", number(n, 10)) is not None for n in (6, 7, 8)] == [True, True, False]
 
 
-def test_what_is_no_command_is_none_of_its_business() -> None:
+def test_the_gate_ignores_messages_that_are_not_commands() -> None:
     made = gate()
     assert made.admit("twin:1", Event(1, NOW_MS, Kind.VERDICT, "x", "y")) is None
     assert made.collect() == []
 
 
-def test_a_system_file_says_what_may_be_commanded(tmp_path: Path) -> None:
+def test_a_system_file_declares_permitted_commands(tmp_path: Path) -> None:
     system = load_system(str(OBSERVATORY))
     assert (system.commands.period_s, system.commands.per_minute) == ([-32768, 32767], 60)
     text = OBSERVATORY.read_text()
@@ -170,7 +170,7 @@ def test_rules_are_read_and_the_first_that_fits_decides(tmp_path: Path) -> None:
         ("rules: []", "rules"),
     ],
 )
-def test_what_is_wrong_with_rules_is_said_with_its_line(tmp_path: Path, text: str, why: str) -> None:
+def test_errors_in_rules_are_reported_with_their_line(tmp_path: Path, text: str, why: str) -> None:
     rules = tmp_path / "rules.yaml"
     rules.write_text(text)
     with pytest.raises(FileInvalid, match=why) as caught:
@@ -190,7 +190,7 @@ def test_a_planner_in_python_is_made_or_refused(tmp_path: Path, monkeypatch: pyt
         load_planner("python: odd_planner:P", system)
 
 
-def test_what_a_planner_in_python_raises_or_gives_is_a_refusal_and_the_twin_goes_on(
+def test_errors_and_wrong_results_of_a_python_planner_are_refusals_and_the_twin_continues(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "failing_planner.py").write_text(
@@ -236,7 +236,7 @@ def test_a_plan_by_hand_waits_until_the_plant_was_heard_of_and_is_refused_when_i
     assert sent == [encode_period(5)]
 
 
-def test_what_the_plant_refuses_is_said_by_its_twin_unless_it_is_history(
+def test_a_refusal_of_the_plant_is_reported_by_its_twin_unless_it_is_history(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("FIELDTWIN_RUN", str(tmp_path))

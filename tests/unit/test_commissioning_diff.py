@@ -80,7 +80,7 @@ def test_without_a_profile_it_is_registers_and_limits(tmp_path: Path) -> None:
     assert ("not in both", "input:40") in kinds
 
 
-def test_a_profile_that_says_other_than_the_device(tmp_path: Path) -> None:
+def test_a_profile_that_contradicts_the_device(tmp_path: Path) -> None:
     good = dumped(meter({}), tmp_path / "good.jsonl")
     assert not diff_profile(good, SDM).found
     bad = meter({10: 7.0, 2: 99.0}, [Span("input", 0, 30), Span("input", 52, 28), Span("holding", 0, 30)])
@@ -125,7 +125,7 @@ def test_a_node_against_its_data_sheet(tmp_path: Path) -> None:
     assert "4711h:00" in found.notes[0]
 
 
-def test_the_verb_tells_by_its_exit_code(tmp_path: Path) -> None:
+def test_the_exit_code_of_the_command_reports_differences(tmp_path: Path) -> None:
     dumped(meter({}), tmp_path / "a.jsonl")
     dumped(meter({2: 30.0}), tmp_path / "b.jsonl")
     profiles = ["--profiles", str(ROOT / "profiles")]
@@ -144,5 +144,5 @@ def test_the_verb_tells_by_its_exit_code(tmp_path: Path) -> None:
         ([], []),
     ],
 )
-def test_neighbours_are_told_together(cells: list[tuple[str, int]], text: list[str]) -> None:
+def test_neighbours_are_reported_together(cells: list[tuple[str, int]], text: list[str]) -> None:
     assert spans(cells) == text

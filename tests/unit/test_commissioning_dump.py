@@ -56,7 +56,7 @@ def cells(spans: list[tuple[int, int]]) -> set[int]:
 
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 399), st.integers(1, 90)), max_size=6), st.integers(1, 125))
-def test_asking_every_address_finds_exactly_what_is_there(islands: list[tuple[int, int]], limit: int) -> None:
+def test_asking_every_address_finds_exactly_the_existing_ones(islands: list[tuple[int, int]], limit: int) -> None:
     readable = {a for start, count in islands for a in range(start, min(400, start + count))}
     made, _ = sweep(readable, limit, stride=1)
     assert cells(made.found.readable) == readable
@@ -158,7 +158,7 @@ def test_a_dump_holds_values_holes_limits_functions_and_latencies(tmp_path: Path
     )
 
 
-def test_later_passes_read_what_was_found_in_the_fewest_requests(tmp_path: Path) -> None:
+def test_later_passes_read_the_found_registers_in_the_fewest_requests(tmp_path: Path) -> None:
     async def main() -> None:
         wire = wired()
         await dump(job(functions=False), tmp_path / "a.jsonl", words="", connector=wire, clock=loop())
@@ -177,7 +177,7 @@ def test_later_passes_read_what_was_found_in_the_fewest_requests(tmp_path: Path)
 
 @settings(max_examples=12, deadline=None)
 @given(st.integers(1, 4000))
-def test_a_killed_dump_goes_on_and_asks_nothing_twice(tmp_path_factory: pytest.TempPathFactory, cut: int) -> None:
+def test_a_killed_dump_continues_and_repeats_no_request(tmp_path_factory: pytest.TempPathFactory, cut: int) -> None:
     folder = tmp_path_factory.mktemp("killed")
     whole, part = folder / "whole.jsonl", folder / "part.jsonl"
 
@@ -203,7 +203,7 @@ def test_a_killed_dump_goes_on_and_asks_nothing_twice(tmp_path_factory: pytest.T
     run_virtually(main())
 
 
-def test_another_job_a_file_that_is_there_and_nobody_are_refused(tmp_path: Path) -> None:
+def test_a_different_job_an_existing_file_and_a_missing_device_are_refused(tmp_path: Path) -> None:
     async def main() -> None:
         out = tmp_path / "d.jsonl"
         await dump(job(), out, words="", connector=wired(), clock=loop())
@@ -267,7 +267,7 @@ def test_a_nodes_objects_by_its_data_sheet_and_by_sweeping(tmp_path: Path) -> No
     assert raw.passes[0].refused[(0x1002, 0)] == 0x06020000
 
 
-def test_what_is_no_range_and_what_is_no_dump(tmp_path: Path) -> None:
+def test_invalid_ranges_and_invalid_dumps(tmp_path: Path) -> None:
     for text in ("holding:9..3", "nothing", "holding:0..70000"):
         with pytest.raises(UsageError):
             register_spans([text])
@@ -300,7 +300,7 @@ def test_a_damaged_dump_is_invalid_or_a_dump(tmp_path_factory: pytest.TempPathFa
 
 
 @given(st.lists(st.integers(0, 10**9), min_size=1, max_size=40))
-def test_percentiles_are_bounds_of_what_was_seen(us: list[int]) -> None:
+def test_percentiles_are_bounds_of_the_observed_values(us: list[int]) -> None:
     histogram = Histogram()
     for value in us:
         histogram.add(value)

@@ -107,7 +107,7 @@ def series_of_fields(fields: list[Hidden], every_s: float = 10.0) -> Series:
 
 
 @pytest.mark.parametrize("passes", [8, 20])
-def test_what_is_certain_is_so_and_most_floats_are(passes: int) -> None:
+def test_certain_claims_are_true_and_most_floats_are_certain(passes: int) -> None:
     seen: Counter[tuple[str, str]] = Counter()
     for seed in range(8):
         fields = hidden_device(1000 * passes + seed, passes)
@@ -132,7 +132,7 @@ def test_few_passes_or_no_movement_make_nothing_certain() -> None:
     assert all(r.level is not Level.CERTAIN or r.type == "string" for r in infer(series_of_fields(still)).readings)
 
 
-def test_the_same_answer_again_is_no_evidence() -> None:
+def test_a_repeated_answer_is_not_evidence() -> None:
     fields = hidden_device(6, 5)
     slow = [Hidden(f.address, f.kind, f.order, [row for row in f.rows for _ in range(4)]) for f in fields]
     series = series_of_fields(slow)
@@ -145,7 +145,7 @@ def test_the_same_answer_again_is_no_evidence() -> None:
     assert [(r.address, r.type, r.probability) for r in once] == [(r.address, r.type, r.probability) for r in thrice]
 
 
-def test_a_word_that_makes_sense_with_both_neighbours_is_doubtful() -> None:
+def test_a_word_that_fits_both_neighbours_is_doubtful() -> None:
     r = random.Random(3)
     low = [r.randint(0, 65535) for _ in range(12)]
     rows = [[0x4366] * 12, low, [0x4366] * 12]  # ABCD with the first, or CDAB with the last
@@ -156,7 +156,7 @@ def test_a_word_that_makes_sense_with_both_neighbours_is_doubtful() -> None:
 
 @pytest.mark.parametrize("order", ["ABCD", "CDAB", "BADC", "DCBA"])
 @pytest.mark.parametrize("passes", [7, 20])
-def test_smooth_waves_and_ramps_deceive_nobody(order: str, passes: int) -> None:
+def test_smooth_waves_and_ramps_cause_no_false_claims(order: str, passes: int) -> None:
     r = random.Random(passes)
     for _ in range(4):
         fields: list[Hidden] = []

@@ -44,7 +44,7 @@ def test_raw_addresses_names_and_patterns_are_tags() -> None:
         ("60", "canopen", "6041h:00"),
     ],
 )
-def test_what_is_no_address_says_what_would_have_been_one(item: str, protocol: str, says: str) -> None:
+def test_an_invalid_address_is_refused_with_a_valid_example(item: str, protocol: str, says: str) -> None:
     with pytest.raises(UsageError, match=says):
         tags_of([item], protocol, profile=SDM if protocol == "modbus" else None)
 
@@ -89,7 +89,7 @@ def test_a_profiles_limits_and_names_are_kept() -> None:
     run_virtually(main())
 
 
-def test_what_needs_no_device_is_refused_before_anything_is_sent() -> None:
+def test_errors_that_need_no_device_are_reported_before_anything_is_sent() -> None:
     refused = {
         "voltage_l1": ("5", "read-only"),
         "demand_period": ("61", "outside its limits"),
@@ -115,7 +115,7 @@ def test_what_needs_no_device_is_refused_before_anything_is_sent() -> None:
         plan_write(tags_of(["1010h:01"], "canopen", RawForm("uint32"))[0], "0x65766173")
 
 
-def test_a_value_is_put_back_and_one_that_is_not_held_is_told() -> None:
+def test_a_value_is_restored_and_one_that_is_not_held_is_reported() -> None:
     async def main() -> None:
         made = bank([Span("holding", 0, 4), Span("coil", 0, 2)], {"holding": {1: [7]}})
         wire = Wired(unit(made))

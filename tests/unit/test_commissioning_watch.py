@@ -116,7 +116,7 @@ def test_a_restart_is_shown_by_a_dry_run() -> None:
     assert result.stdout.startswith("09 08 00 01 00 00")
 
 
-def test_what_was_written_is_put_back_even_where_a_later_write_fails() -> None:
+def test_a_written_value_is_restored_even_if_a_later_write_fails() -> None:
     async def main() -> None:
         made = bank([Span("holding", 0, 2), Span("holding", 2, 1, "ro")], {"holding": {0: [1, 2, 3]}})
         async with point_at(Target(URL, 1), connector=Wired(unit(made)), clock=loop()) as point:

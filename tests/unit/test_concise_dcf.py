@@ -69,7 +69,7 @@ def test_there_and_back_and_nothing_that_is_cut(settings: list[Setting], data: s
 
 
 @given(st.binary(max_size=60))
-def test_any_bytes_are_settings_or_told(data: bytes) -> None:
+def test_any_bytes_are_settings_or_an_error(data: bytes) -> None:
     try:
         settings = decode_concise(data)
     except Desync:
@@ -82,7 +82,7 @@ def test_too_many_entries_are_refused() -> None:
         encode_concise([Setting(0, 0, b"")] * 65_536)
 
 
-def test_only_what_the_dcf_sets_is_written_pdos_by_their_procedure_and_last() -> None:
+def test_only_settings_of_the_dcf_are_written_pdos_by_their_procedure_and_last() -> None:
     dictionary = dcf(
         var("1000", 7, "ro", "0x2019A", "0x2019A"),  # read-only
         var("1010", 7, "rw", "0", "1"),  # a command
@@ -126,7 +126,7 @@ def test_the_date_is_that_of_1020h() -> None:
     assert configuration_date(dcf(var("2001", 6, "rw", "0", "1"))) is None
 
 
-def test_a_value_that_its_type_cannot_hold_is_told_with_section_and_key() -> None:
+def test_a_value_that_its_type_cannot_hold_is_reported_with_section_and_key() -> None:
     with pytest.raises(FileInvalid, match=r"node5\.dcf.*\[2001sub0\] ParameterValue") as told:
         settings_of(dcf(var("2001", 5, "rw", "0", "256")))
     assert "UNSIGNED8" in str(told.value)

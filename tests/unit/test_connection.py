@@ -73,7 +73,7 @@ class End(ByteConnection):
         self.feed_lost(closed_here(self.endpoint))
 
 
-def test_the_end_tells_when_it_is_full_and_when_there_is_room() -> None:
+def test_the_end_reports_when_it_is_full_and_when_there_is_room() -> None:
     async def main() -> None:
         end = End()
         assert [end.feed(b"1"), end.feed(b"2"), end.feed(b"3")] == [True, True, False]
@@ -112,7 +112,7 @@ def test_a_reader_that_is_cancelled_loses_nothing() -> None:
     run(main())
 
 
-def test_a_read_within_a_time_gives_what_arrives_or_nothing() -> None:
+def test_a_read_with_a_timeout_returns_the_received_bytes_or_nothing() -> None:
     async def main() -> None:
         end = End()
         end.feed(b"here")
@@ -134,7 +134,7 @@ def test_a_read_within_a_time_gives_what_arrives_or_nothing() -> None:
     run(main())
 
 
-def test_what_arrived_is_read_before_the_loss_and_the_first_reason_stays() -> None:
+def test_received_bytes_are_read_before_the_loss_and_the_first_reason_stays() -> None:
     async def main() -> None:
         end = End()
         end.feed(b"last")
@@ -147,7 +147,7 @@ def test_what_arrived_is_read_before_the_loss_and_the_first_reason_stays() -> No
     run(main())
 
 
-def test_each_raise_of_the_loss_is_an_error_of_its_own() -> None:
+def test_each_raise_of_the_loss_is_a_separate_error() -> None:
     """Adding the place of an error must not change the same error for other readers of the loss."""
 
     async def main() -> None:
@@ -167,7 +167,7 @@ def test_each_raise_of_the_loss_is_an_error_of_its_own() -> None:
     run(main())
 
 
-def test_an_observer_is_told_at_arrival() -> None:
+def test_an_observer_is_notified_at_arrival() -> None:
     async def main() -> None:
         end, seen = End(), []
         end.feed(b"before")

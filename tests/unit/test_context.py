@@ -47,7 +47,7 @@ def test_the_command_must_be_in_the_list() -> None:
     assert len(subject) == 1
 
 
-def test_without_a_list_it_is_derived_from_what_was_recorded() -> None:
+def test_without_a_list_it_is_derived_from_the_recording() -> None:
     subject = VirtualContext(recordings=[(B, recorded(1)), (A, recorded(2)), (B, recorded(3))])
     assert subject.command_list == (B, A)
     assert (taken(subject, B, 2), taken(subject, A, 1), len(subject)) == ([1, 3], [2], 0)
@@ -137,7 +137,7 @@ def test_copies_begin_where_the_first_began_and_know_nothing_of_each_other(polic
         second.take(COMMAND(b"c"))
 
 
-def test_what_is_shared_is_not_added_to() -> None:
+def test_shared_series_are_not_extended() -> None:
     first = context([1])
     second = first.copy()
     for subject in (first, second):
@@ -148,7 +148,7 @@ def test_what_is_shared_is_not_added_to() -> None:
         second.copy()
 
 
-def test_what_was_taken_of_a_long_recording_is_let_go() -> None:
+def test_taken_items_of_a_long_recording_are_released() -> None:
     subject = context([n % 256 for n in range(3 * RELEASE_AT)])
     before = sys.getsizeof(subject._series[A.data].recorded)
     assert taken(subject, A, 3 * RELEASE_AT - 1) == [n % 256 for n in range(3 * RELEASE_AT - 1)]

@@ -62,7 +62,7 @@ def splits(draw: st.DrawFn) -> list[tuple[int, int]]:
 
 
 @given(st.lists(splits(), min_size=1, max_size=5), st.data())
-def test_any_split_or_merge_of_the_recorded_ranges_answers_alike(
+def test_any_split_or_merge_of_the_recorded_ranges_gives_the_same_answers(
     polls: list[list[tuple[int, int]]], data: st.DataObject
 ) -> None:
     recorded = [
@@ -130,7 +130,7 @@ def test_a_recorded_session_replayed_is_the_same_session() -> None:
     assert (replay.counters.answered, replay.counters.misfits, len(replay.context)) == (len(OBSERVED), 0, 0)
 
 
-def test_what_is_read_depends_on_what_was_written_and_not_on_how_often_was_read() -> None:
+def test_a_read_depends_on_earlier_writes_and_not_on_the_number_of_reads() -> None:
     replay = session(*OBSERVED)
     assert [words(replay, STATUS, 2, 3) for _ in range(9)] == [(0, 0)] * 9
     replay.respond(1, write(PERIOD, 0xFFFF))
@@ -151,7 +151,7 @@ def accepted(address: int, value: int) -> tuple[bytes, bytes]:
     return write(address, value), write(address, value)[:5]
 
 
-def test_a_register_reads_back_its_own_value_whatever_else_was_written() -> None:
+def test_a_register_reads_back_its_own_value_whatever_was_written_elsewhere() -> None:
     read_back = [(read(5, 1, 3), reply(value, function=3)) for value in (1, 2)]
     replay = session(accepted(5, 1), read_back[0], accepted(6, 1), accepted(5, 2), read_back[1])
     replay.respond(1, write(5, 1))
@@ -169,7 +169,7 @@ def test_in_a_new_situation_the_recorded_one_most_like_it_answers() -> None:
     assert words(replay, STATUS, 1, 3) == (10,)
 
 
-def test_a_register_that_was_only_ever_written_reads_what_was_written() -> None:
+def test_a_register_that_was_only_written_reads_the_written_value() -> None:
     replay = session((write(9, 4), write(9, 4)[:5]), (read(0, 1, 3), reply(0, function=3)))
     assert replay.respond(1, read(9, 1, 3)).reply == b"\x83\x02"
     replay.respond(1, write(9, 5))
@@ -280,7 +280,7 @@ def test_a_devices_own_mistake_is_repeated_to_the_letter() -> None:
 @pytest.mark.parametrize(
     "request_pdu", [read(1), read(0, 2), read(0, 1, 3), b"\x2b\x0e\x01\x00", write(0, 1), b"\x04\x00"]
 )
-def test_what_was_never_recorded_is_refused_or_not_answered(request_pdu: bytes) -> None:
+def test_an_unrecorded_request_is_refused_or_not_answered(request_pdu: bytes) -> None:
     refusing = ExchangeReplay([ok(read(0), reply(1))])
     answer = refusing.respond(1, request_pdu).reply
     assert answer is not None

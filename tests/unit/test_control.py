@@ -217,7 +217,7 @@ def test_a_late_answer_is_not_taken_for_the_next_ones(tmp_path: Path) -> None:
     run(main())
 
 
-def test_closing_the_server_ends_a_verb_that_hangs_and_tells_its_caller(tmp_path: Path) -> None:
+def test_closing_the_server_ends_a_hanging_command_and_informs_its_caller(tmp_path: Path) -> None:
     async def main() -> None:
         async with serving(tmp_path / "s") as server:
             client = await ControlClient.connect_unix(tmp_path / "s")
@@ -231,7 +231,7 @@ def test_closing_the_server_ends_a_verb_that_hangs_and_tells_its_caller(tmp_path
     run(main())
 
 
-def test_a_peer_that_speaks_something_else_is_a_lost_connection(tmp_path: Path) -> None:
+def test_a_peer_with_a_different_protocol_is_a_lost_connection(tmp_path: Path) -> None:
     async def main() -> None:
         for reply in (b"220 mail ready\r\n", b"[1]\n", b"\xff\n", b""):
             path = tmp_path / f"s{len(reply)}"

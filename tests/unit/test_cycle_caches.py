@@ -102,7 +102,7 @@ def value_of(tag: str, value: Any, quality: Quality, t_ns: int) -> TagValue:
 @example([("ticks", 1), ("put", "d.real", 1.5, Quality.GOOD), ("late", 4), ("ticks", 1)])
 @example([("ticks", 1), ("put", "d.int", 2, Quality.GOOD), ("ticks", 5), ("put", "d.int", None, Quality.GOOD)])
 @example([("ticks", 1), ("message",), ("ticks", 2), ("untaken", 1), ("ticks", 1)])
-def test_inputs_are_what_the_table_holds(steps: list[Any]) -> None:
+def test_inputs_equal_the_tag_table(steps: list[Any]) -> None:
     kinds = {"d.real": TagKind.REAL, "d.int": TagKind.INT, "d.bool": TagKind.BOOL, "d.fixed": TagKind.INT}
     inputs = [TagSpec(name, kind) for name, kind in kinds.items()]
     inputs += [message_tag("m.inbox", 8, 4), TagSpec(taken_name("m.out"), TagKind.INT)]
@@ -197,7 +197,7 @@ SCANS = st.one_of(
 @example([("want", math.nan), ("scans", 1), ("want", None)])  # no value in both cases, for different reasons
 @example([("want", 1.0), ("scans", 2), ("arrive", 2), ("scans", 1), ("want", 0.0)])
 @example([("want", 1.0), ("scans", 2), ("hold",), ("send", 6), ("scans", 2), ("taken",)])
-def test_outputs_are_what_the_programs_hold(steps: list[Any]) -> None:
+def test_outputs_equal_the_programs_values(steps: list[Any]) -> None:
     program = Quiet()
     plant = {
         "d.x": TagSpec("d.x", TagKind.REAL),
@@ -283,7 +283,7 @@ def test_a_reader_that_is_put_back_gets_its_messages_though_nothing_changed() ->
     assert [m.data for m in reader.snapshot().messages["m"]] == [b"b"]
 
 
-def test_a_writer_that_attached_anew_has_nothing_that_could_be_the_same() -> None:
+def test_a_reattached_writer_has_no_cached_value() -> None:
     image = one(RegionLayout("r", (TagSpec("x", TagKind.INT), TagSpec("y", TagKind.REAL))))
     image.writer("r").publish_columns([1, 2.0], Quality.GOOD, Reason.NONE, 1)
     image.writer("r").publish_columns([3, 4.0], Quality.GOOD, Reason.NONE, 2, same=True)

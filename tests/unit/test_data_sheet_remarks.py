@@ -119,7 +119,7 @@ def emulated(tmp_path: Path, sheet: str, *options: str) -> tuple[list[str], int,
     return said.read_text().splitlines(), cob_id, status
 
 
-def test_emulate_says_that_a_file_is_for_another_node_and_how_to_override_it(tmp_path: Path) -> None:
+def test_emulate_reports_a_file_of_a_different_node_and_the_override(tmp_path: Path) -> None:
     sheet = DRIVE.replace("DefaultValue=$NODEID+0x180\n", "DefaultValue=$NODEID+0x180\nParameterValue=0x1A0\n")
     lines, cob_id, _ = emulated(tmp_path, sheet)
     assert cob_id == 0x1A0
@@ -129,7 +129,7 @@ def test_emulate_says_that_a_file_is_for_another_node_and_how_to_override_it(tmp
     assert not any("COB-IDs" in line for line in lines), lines
 
 
-def test_emulate_says_that_a_drive_has_no_model_and_how_to_choose_one(tmp_path: Path) -> None:
+def test_emulate_reports_a_drive_without_a_model_and_how_to_choose_one(tmp_path: Path) -> None:
     sheet = DRIVE.replace("DefaultValue=0x00020192\n", "")
     lines, _, status = emulated(tmp_path, sheet)
     assert status == 0
@@ -153,7 +153,7 @@ def prototype_file(folder: Path, **devices: str) -> Path:
     return path
 
 
-def test_a_run_says_at_its_start_what_does_not_fit_a_node(tmp_path: Path) -> None:
+def test_a_run_reports_contradictions_to_a_node_at_its_start(tmp_path: Path) -> None:
     path = prototype_file(tmp_path, drive="profile: odd.yaml", steering="cia: none")
     command = [sys.executable, "-m", "fieldtwin", "run", "lab_vehicle", "--prototype", "--prototype-file", str(path)]
     done = subprocess.run(

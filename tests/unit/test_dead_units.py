@@ -78,7 +78,7 @@ def worst_window(times: list[float], seconds: float, period_s: float = PERIOD_S)
 
 @pytest.mark.parametrize("endpoint", [LINE, LAN], ids=["serial line", "tcp"])
 @pytest.mark.parametrize("live", [1, 16, 31])
-def test_a_live_unit_beside_thirty_silent_ones_keeps_its_polls_in_every_minute(endpoint: Endpoint, live: int) -> None:
+def test_a_live_unit_among_thirty_silent_ones_keeps_its_polls_in_every_minute(endpoint: Endpoint, live: int) -> None:
     """At any position in the file: from the first minute on, counted from the start of the bus."""
     v = thirty_silent(endpoint, live, 900.0)
     assert worst_window(v.line.times(live), 900.0) >= 0.95
@@ -147,7 +147,7 @@ def test_a_unit_that_is_switched_on_is_found_while_the_others_stay_silent() -> N
     run_virtually(main())
 
 
-def test_all_units_are_reached_in_turn_when_the_connection_is_made_anew() -> None:
+def test_all_units_are_reached_in_order_when_the_connection_is_reopened() -> None:
     """Five unanswered requests end a TCP connection. The unit that answers follows them, and must be polled."""
 
     async def main() -> None:
@@ -163,7 +163,7 @@ def test_all_units_are_reached_in_turn_when_the_connection_is_made_anew() -> Non
     run_virtually(main())
 
 
-def test_a_gateway_that_says_nobody_answers_does_not_put_a_unit_into_service() -> None:
+def test_a_gateway_that_answers_for_a_missing_unit_does_not_put_it_into_service() -> None:
     """Exceptions 0A and 0B come from the gateway on the way: the unit did not answer, and is not polled at its full rate."""
 
     async def main() -> None:
@@ -272,7 +272,7 @@ def test_a_slow_unit_stays_in_service_when_its_neighbours_fall_silent() -> None:
 
 
 @pytest.mark.parametrize("count", [2, 31])
-def test_a_half_open_connection_to_several_units_is_made_anew(count: int) -> None:
+def test_a_half_open_connection_to_several_units_is_reopened(count: int) -> None:
     """Defect: shortened timeouts did not count as unanswered requests, so such a connection was kept for ever."""
 
     async def main() -> None:
@@ -293,7 +293,7 @@ def test_a_half_open_connection_to_several_units_is_made_anew(count: int) -> Non
     run_virtually(main())
 
 
-def test_a_unit_that_is_rarely_polled_keeps_its_connection_beside_silent_ones() -> None:
+def test_a_unit_that_is_rarely_polled_keeps_its_connection_among_silent_ones() -> None:
     """The probes of the silent units end without a reply, and give no information about the connection."""
 
     async def main() -> None:

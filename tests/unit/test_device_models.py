@@ -65,7 +65,7 @@ class Rig:
         return codec.decode(self._type(index, sub), reply[4 : 8 - (reply[0] >> 2 & 3)])
 
 
-def test_the_device_type_says_which_model() -> None:
+def test_the_device_type_selects_the_model() -> None:
     for name, number in (("io-cia401", 401), ("drive-cia402", 402), ("measuring-cia404", 404), ("encoder-cia406", 406),
                          ("inclinometer-cia410", 410)):  # fmt: skip
         assert type(model_for(load_eds(DEVICES / f"{name}.eds"))) is MODELS[number]
@@ -114,7 +114,7 @@ def test_polarity_turns_inputs_and_outputs_round() -> None:
     assert rig.model.digital_outputs[1] == 0xFC
 
 
-def test_outputs_fall_to_their_error_values_when_nobody_commands_them() -> None:
+def test_outputs_fall_to_their_error_values_without_commands() -> None:
     rig = Rig("io-cia401")
     assert isinstance(rig.model, IoModule)
     rig.write(0x6206, 0x0F, sub=1)  # the upper four keep what they have
@@ -132,7 +132,7 @@ def test_outputs_fall_to_their_error_values_when_nobody_commands_them() -> None:
     assert rig.model.digital_outputs == {1: 0xFF, 2: 0xFF}
 
 
-def test_analogue_inputs_interrupt_when_they_are_told_to() -> None:
+def test_analogue_inputs_interrupt_when_enabled() -> None:
     rig = Rig("io-cia401")
     rig.played = {(0x6401, n): 0 for n in (1, 2, 3, 4)}
     rig.start()
@@ -157,7 +157,7 @@ def test_analogue_inputs_interrupt_when_they_are_told_to() -> None:
 # -- CiA 404 -----------------------------------------------------------------------------------------------------------
 
 
-def test_a_process_value_in_three_forms_and_the_current_behind_it() -> None:
+def test_a_process_value_in_three_forms_and_its_current() -> None:
     rig = Rig("measuring-cia404")
     rig.played = {(0x6130, 1): 100.0, (0x6130, 2): 21.5}
     assert rig.read(0x6130, 1) == 100.0
@@ -189,7 +189,7 @@ def test_taring_wants_the_four_letters() -> None:
     assert rig.read(0x6130, 1) == 14.5
 
 
-def test_outside_the_span_and_switched_off_the_status_says_so() -> None:
+def test_outside_the_span_and_switched_off_the_status_shows_it() -> None:
     rig = Rig("measuring-cia404")
     rig.played = {(0x6130, 1): 401.0, (0x6130, 2): -41.0}
     assert (rig.read(0x6150, 1), rig.read(0x6150, 2)) == (2, 4)

@@ -133,7 +133,7 @@ def test_the_first_count_that_is_seen_is_only_a_base_line() -> None:
     run(main())
 
 
-def test_missed_samples_are_counted_and_a_restart_is_none() -> None:
+def test_missed_samples_are_counted_and_a_restart_is_not_a_miss() -> None:
     async def main() -> None:
         async with ctd() as c:
             await c.period(60)
@@ -194,7 +194,7 @@ def test_a_command_outside_the_list_is_refused_before_the_wire() -> None:
     run(main())
 
 
-def test_what_is_acknowledged_and_not_held_is_an_error() -> None:
+def test_a_write_that_is_acknowledged_and_not_held_is_an_error() -> None:
     async def main() -> None:
         async with ctd() as c:
             c.sensor._note_tags = lambda *a: c.sensor._cells.poke("holding", 1, 9)  # type: ignore[method-assign]
@@ -220,7 +220,7 @@ def read_sample(sensor: SampledSensor, now_ns: int) -> tuple[float, ...]:
 
 
 @given(period_s=st.integers(1, 20), set_at_s=st.floats(0, 10), looks=st.lists(st.floats(0, 80), min_size=1, max_size=8))
-def test_samples_are_taken_on_time_whoever_looks_and_when(period_s: int, set_at_s: float, looks: list[float]) -> None:
+def test_samples_are_taken_on_time_independent_of_polls(period_s: int, set_at_s: float, looks: list[float]) -> None:
     sensor = sensor_at()
     set_ns = round(set_at_s * NS_PER_S)
     sensor.write("holding", 1, [period_s], set_ns)
@@ -244,7 +244,7 @@ def test_the_status_follows_the_sign_of_the_period(period: int, status: int) -> 
     assert (count > 0) == (period > 0)
 
 
-def test_nobody_looked_for_a_year_and_it_still_answers() -> None:
+def test_after_a_year_without_polls_it_still_answers() -> None:
     sensor = sensor_at()
     sensor.write("holding", 1, [1], 0)
     year_s = 365 * 86400

@@ -128,7 +128,7 @@ def test_messages_wait_for_a_free_mailbox_and_arrive_in_order() -> None:
     run(main())
 
 
-def test_what_was_emitted_and_not_acknowledged_is_not_emitted_again_after_a_reconnection() -> None:
+def test_an_emitted_and_unacknowledged_message_is_not_emitted_again_after_a_reconnection() -> None:
     async def main() -> None:
         modems = pair()
         async with station(modems, "far") as far, station(modems) as near:
@@ -150,7 +150,7 @@ def test_what_was_emitted_and_not_acknowledged_is_not_emitted_again_after_a_reco
     run(main())
 
 
-def test_a_new_driver_reads_again_what_nobody_acknowledged() -> None:
+def test_a_new_driver_reads_unacknowledged_messages_again() -> None:
     """A gateway that died between reading and acknowledging: the command survives."""
 
     async def main() -> None:
@@ -232,7 +232,7 @@ def test_sequences_wrap_to_one() -> None:
 
 
 @pytest.mark.parametrize("payload", [b"", b"x" * 65], ids=["empty", "too long"])
-def test_what_does_not_fit_the_outbox_is_refused_and_gone(payload: bytes) -> None:
+def test_a_message_that_does_not_fit_the_outbox_is_refused_and_dropped(payload: bytes) -> None:
     async def main() -> None:
         async with station(pair()) as near:
             near.driver.consumer.observe(RESPONSE(payload))
@@ -259,7 +259,7 @@ def test_a_transmitter_needs_a_mailbox_and_a_socket() -> None:
 
 
 @pytest.mark.parametrize("log", ["audit.jsonl", "/dev/full"])
-def test_a_plant_that_says_local_takes_no_command_and_says_so(tmp_path: Path, log: str) -> None:
+def test_a_plant_switched_to_local_takes_no_command_and_reports_it(tmp_path: Path, log: str) -> None:
     """With a writable log, and with one that is not: the command is refused in both cases.
 
     Acknowledging it is a write, which waits for a writable log.

@@ -41,7 +41,7 @@ def test_quota_of_a_cgroup(text: str, quota: float | None) -> None:
     assert quota_of(text) == quota
 
 
-def test_less_than_a_processor_is_said() -> None:
+def test_less_than_a_processor_is_reported() -> None:
     assert judged_processor(8, None).verdict is Verdict.OK
     assert judged_processor(8, 2.0).verdict is Verdict.OK
     tight = judged_processor(8, 0.5)
@@ -74,7 +74,7 @@ def test_this_computer_can_be_asked() -> None:
     assert state is None or (state.year >= 2024 and state.error_s >= 0)
 
 
-def test_every_check_that_is_not_ok_says_what_to_do() -> None:
+def test_every_check_that_is_not_ok_names_the_remedy() -> None:
     checks = examine()
     assert len({c.name for c in checks}) == len(checks)
     assert {"python", "serial ports", "kernel CAN", "real time", "clock", "disk", "open files", "processors"} <= {
@@ -91,7 +91,7 @@ def test_a_run_directory_that_cannot_be_written_is_bad(tmp_path: Path, monkeypat
     assert os.fspath(tmp_path) in found.found
 
 
-def test_a_folder_that_may_not_be_looked_into_is_no_bug(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unreadable_folder_is_not_an_internal_error(monkeypatch: pytest.MonkeyPatch) -> None:
     """A foreign directory, such as FIELDTWIN_RUN=/root/x for a service: any file system query may be refused."""
 
     def refused(*args: object, **more: object) -> None:
@@ -106,7 +106,7 @@ def test_a_folder_that_may_not_be_looked_into_is_no_bug(monkeypatch: pytest.Monk
     assert checks[1].found.endswith("at /")
 
 
-def test_a_can_interface_that_is_down_is_said() -> None:
+def test_a_can_interface_that_is_down_is_reported() -> None:
     assert judged_can({}).verdict is Verdict.OK
     assert judged_can({"can0": True, "vcan0": True}).found == "can0, vcan0"
     down = judged_can({"can0": True, "can1": False})

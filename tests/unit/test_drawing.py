@@ -157,7 +157,7 @@ def network(folder: Path, range_m: float, *ats: str) -> water.Map:
     return water.network_map(load_network(path))
 
 
-def test_a_network_is_a_map_of_who_hears_whom(tmp_path: Path):
+def test_a_network_is_a_map_of_receivers(tmp_path: Path):
     sea = network(tmp_path, 3000, "[0, 0, -300]", "[3000, 0, -300]", "[3000, 4000, -300]")
     assert [(way.one, way.other, way.said) for way in sea.ways] == [("west", "middle", "3.0 km, 2.0 s")]
     told = water.text(sea).splitlines()

@@ -177,7 +177,7 @@ def test_a_quick_stop_that_stays_can_be_left_for_operation(option: int) -> None:
     assert rig.read(0x606C) == 10_000
 
 
-def test_without_such_an_option_there_is_no_way_back_from_a_quick_stop() -> None:
+def test_without_that_option_a_quick_stop_cannot_be_left() -> None:
     rig = Rig()
     rig.spin()
     rig.command(QUICK_STOP)
@@ -230,7 +230,7 @@ def test_a_fault_reset_is_an_edge() -> None:
 @pytest.mark.parametrize(
     ("option", "state"), [(0, S.OPERATION_ENABLED), (1, S.FAULT), (2, S.SWITCH_ON_DISABLED), (3, S.QUICK_STOP)]
 )
-def test_what_a_lost_connection_does_is_the_abort_connection_option(option: int, state: DriveState) -> None:
+def test_the_abort_connection_option_decides_the_reaction_to_a_lost_connection(option: int, state: DriveState) -> None:
     rig = Rig()
     rig.write(0x6007, option)
     rig.write(0x1029, 1, sub=1)  # no change of NMT state
@@ -282,7 +282,7 @@ def test_profile_position_with_its_handshake() -> None:
     assert rig.read(0x6064) == 40_000
 
 
-def test_a_second_set_point_waits_or_takes_over_as_bit_5_says() -> None:
+def test_a_second_set_point_waits_or_takes_over_according_to_bit_5() -> None:
     places = {}
     for at_once in (0, 1 << 5):
         rig = Rig()
@@ -319,7 +319,7 @@ def test_a_third_set_point_finds_no_place() -> None:
     assert rig.read(0x6064) == 60_000
 
 
-def test_halt_stops_and_goes_on() -> None:
+def test_halt_stops_and_resumes() -> None:
     rig = Rig()
     rig.spin()
     rig.command(ENABLE | 1 << 8)
@@ -332,7 +332,7 @@ def test_halt_stops_and_goes_on() -> None:
     assert rig.read(0x606C) == 10_000
 
 
-def test_limits_are_kept_and_told() -> None:
+def test_limits_are_observed_and_reported() -> None:
     rig = Rig()
     rig.spin()
     rig.write(0x60FF, 600_000)
@@ -386,7 +386,7 @@ def test_the_same_controlword_again_is_a_command_again() -> None:
     assert rig.state() is S.READY
 
 
-def test_reset_node_starts_anew_and_reset_communication_leaves_the_drive_alone() -> None:
+def test_reset_node_restarts_and_reset_communication_does_not_affect_the_drive() -> None:
     rig = Rig()
     rig.spin()
     rig.node.feed(CanFrame(0, bytes([130, NODE])), rig.now_ns)
@@ -400,7 +400,7 @@ def test_reset_node_starts_anew_and_reset_communication_leaves_the_drive_alone()
     assert rig.read(0x606C) == 0
 
 
-def test_what_is_recorded_is_played_and_never_computed() -> None:
+def test_recorded_objects_are_replayed_and_never_computed() -> None:
     played = {(0x6079, 0): (325_000).to_bytes(4, "little"), (0x6064, 0): (77).to_bytes(4, "little")}
     node = CanopenNode(EDS, NODE, NodeContext(source=lambda now_ns: dict(played), model=Drive()))
     node.start(0)

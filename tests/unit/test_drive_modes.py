@@ -271,7 +271,7 @@ def test_cyclic_torque_accelerates_the_motor_and_is_bounded() -> None:
 
 
 @pytest.mark.parametrize("mode", [8, 9, 10])
-def test_halt_stops_a_cyclic_mode_and_the_drive_goes_on_afterwards(mode: int) -> None:
+def test_halt_stops_a_cyclic_mode_and_the_drive_resumes_afterwards(mode: int) -> None:
     rig = enabled(mode)
     target = {8: 0x607A, 9: 0x60FF, 10: 0x6071}[mode]
     assert rig.write(0x607F, 20_000) == rig.write(target, 900 if mode == 10 else 30_000) == 0

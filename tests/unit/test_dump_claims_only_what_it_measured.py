@@ -233,7 +233,9 @@ def test_blocks_of_eight_that_give_single_registers_or_pairs_are_found(
 
 @settings(max_examples=60, deadline=None)
 @given(st.lists(block, max_size=4), st.sampled_from(["silent", "refuse"]), st.integers(1, 400))
-def test_what_is_reported_is_what_was_asked(blocks: list[tuple[int, int, str]], other: str, budget_s: int) -> None:
+def test_reported_addresses_are_the_requested_ones(
+    blocks: list[tuple[int, int, str]], other: str, budget_s: int
+) -> None:
     answer: dict[str, object] = {"else": other}
     for start, count, _ in blocks:
         answer |= {str(a): (1, 0) for a in range(start, start + count)}
@@ -259,7 +261,7 @@ def test_what_is_reported_is_what_was_asked(blocks: list[tuple[int, int, str]], 
         max_size=30,
     )
 )
-def test_no_address_is_in_two_states_or_in_none(notes: list[tuple[int, int, int]]) -> None:
+def test_each_address_is_in_exactly_one_state(notes: list[tuple[int, int, int]]) -> None:
     coverage = Coverage()
     for at, count, state in notes:
         coverage.note(RegisterRange("input", at, count), state)

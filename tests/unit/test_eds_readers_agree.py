@@ -76,7 +76,7 @@ UNREADABLE = {
 
 
 @pytest.mark.parametrize("text", UNREADABLE.values(), ids=UNREADABLE)
-def test_what_cannot_be_meant_is_noted_by_both_readers_and_refuses_nothing(text: str) -> None:
+def test_invalid_content_is_noted_by_both_readers_and_refuses_nothing(text: str) -> None:
     node, master = read_both(text)
     assert node.entry(0x1000, 0) is not None
     assert node.notes, "the emulated node's reader says nothing"
@@ -122,7 +122,7 @@ PLAIN = {
 
 
 @pytest.mark.parametrize(("text", "value"), PLAIN.values(), ids=PLAIN)
-def test_what_is_plain_means_one_thing_to_both_readers(text: str, value: object) -> None:
+def test_valid_content_has_one_meaning_for_both_readers(text: str, value: object) -> None:
     _, master = read_both(text)
     entry = master.get(0x2000)
     assert entry is not None
@@ -155,7 +155,7 @@ def test_both_readers_agree_on_every_shipped_data_sheet(path: Path) -> None:
 @pytest.mark.parametrize(
     "line", ["DataType=word", "AccessType=perhaps", "PDOMapping=perhaps", "ObjectType=perhaps", "LowLimit"]
 )
-def test_what_decides_what_an_object_is_is_refused_by_both_readers_at_the_same_line(line: str) -> None:
+def test_an_unclear_kind_of_object_is_refused_by_both_readers_at_the_same_line(line: str) -> None:
     key = line.partition("=")[0]
     lines = [old for old in one(7).splitlines() if not old.startswith(key) or old.endswith("ro")]
     text = "\n".join([*lines, line])

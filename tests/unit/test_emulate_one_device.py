@@ -46,7 +46,7 @@ def meter() -> DeviceProfile:
     return resolve(parse(METER, "meter.yaml"))
 
 
-def test_function_11h_tells_data_after_the_run_indicator() -> None:
+def test_function_11h_has_data_after_the_run_indicator() -> None:
     unit = ModbusUnit(MapBank([Span("holding", 0, 1)]), **parts_of(meter()))
     assert unit.respond(b"\x11", 0) == bytes.fromhex("11 06 4D 54 FF 01 02 03")
     unit.running = False
@@ -130,7 +130,7 @@ def test_emulate_gives_registers_their_values_and_answers_any_unit(tmp_path: Pat
         assert ask(port, "03 0004 0004") == b"\x03\x08bench\0\0\0"
 
 
-def test_emulate_puts_faults_in_and_says_how_often_they_struck(tmp_path: Path) -> None:
+def test_emulate_injects_faults_and_reports_how_often_they_took_effect(tmp_path: Path) -> None:
     (tmp_path / "faults.yaml").write_text(
         "faults:\n"
         "  - {name: fewer-registers, by: 2, registers: 4}\n"

@@ -57,7 +57,7 @@ ENDPOINT = st.one_of(
 
 
 @given(ENDPOINT)
-def test_what_is_written_is_read_back(endpoint: Endpoint) -> None:
+def test_written_values_are_read_back(endpoint: Endpoint) -> None:
     assert Endpoint.parse(str(endpoint)) == endpoint
 
 
@@ -118,13 +118,13 @@ def test_short_forms(url: str, expected: Endpoint) -> None:
         ("pty:line1?frame=9X1", "8E1"),
     ],
 )
-def test_what_is_wrong_is_said(url: str, says: str) -> None:
+def test_errors_are_reported(url: str, says: str) -> None:
     with pytest.raises(UsageError) as caught:
         Endpoint.parse(url)
     assert says in str(caught.value)
 
 
-def test_serial_settings_are_those_of_modbus_unless_said() -> None:
+def test_serial_settings_default_to_those_of_modbus() -> None:
     assert Endpoint.parse("rtu:/dev/ttyS0").serial == SerialSettings(19200, "8E1")
     settings = Endpoint.parse("rtu:/dev/ttyS0?frame=7o2&baudrate=9600").serial
     assert (settings.data_bits, settings.parity, settings.stop_bits, settings.bits_per_char) == (7, "O", 2, 11)
@@ -132,7 +132,7 @@ def test_serial_settings_are_those_of_modbus_unless_said() -> None:
     assert SerialSettings(9600, "8N1").char_time_s == pytest.approx(10 / 9600)
 
 
-def test_moving_an_endpoint_keeps_what_is_spoken_on_it() -> None:
+def test_moving_an_endpoint_keeps_its_protocol() -> None:
     serial = Endpoint.parse("rtu:/dev/ttyS0?baudrate=9600&frame=8N2").with_path("/run/line1")
     assert str(serial) == "rtu:/run/line1?baudrate=9600&frame=8N2"
     assert str(Endpoint.parse("tcp://modem:502").with_address("::1", 1502)) == "tcp://[::1]:1502"

@@ -24,7 +24,7 @@ def test_a_new_consumer_is_empty_and_consuming_then_is_a_bug() -> None:
 
 
 @given(st.lists(st.binary(max_size=4)), st.integers(1, 8))
-def test_every_consumer_gets_what_occurred_in_order_and_counts_what_it_lost(items: list[bytes], capacity: int) -> None:
+def test_every_consumer_gets_all_events_in_order_and_counts_its_losses(items: list[bytes], capacity: int) -> None:
     producer: Producer[DATA] = Producer("response")
     wide: Consumer[DATA] = Consumer("response", capacity=max(1, len(items)))
     narrow: Consumer[DATA] = Consumer("response", capacity=capacity)
@@ -54,7 +54,7 @@ def test_the_very_object_is_passed_on() -> None:
     assert consumer.consume() is command
 
 
-def test_what_arrives_while_draining_waits_for_the_next_drain() -> None:
+def test_items_that_arrive_while_draining_wait_for_the_next_drain() -> None:
     consumer: Consumer[DATA] = Consumer("response")
     consumer.observe(DATA(b"1"))
     seen = []

@@ -52,7 +52,9 @@ USES: dict[str, tuple[str, Callable[[Path], None], str]] = {
 
 
 @pytest.mark.parametrize("extra", list(USES))
-def test_who_has_it_not_is_told_what_to_install(extra: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_extra_is_reported_with_its_package(
+    extra: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     package, use, ours = USES[extra]
     assert [re.split("[ ><=]", wanted)[0] for wanted in EXTRAS[extra]] == [package]
     if ours:

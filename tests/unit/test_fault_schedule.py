@@ -18,7 +18,7 @@ SYSTEM = load_system("observatory", [])
 
 @given(st.integers(0, 10_000), st.floats(10.0, 100_000.0))
 @settings(max_examples=60, deadline=None)
-def test_a_seed_chooses_what_can_be_put_in_and_leaves_the_end_in_peace(seed: int, duration_s: float) -> None:
+def test_a_seed_chooses_possible_faults_and_none_at_the_end(seed: int, duration_s: float) -> None:
     faults = random_schedule(SYSTEM, seed, duration_s)
     assert faults == random_schedule(SYSTEM, seed, duration_s)
     assert len(faults) <= MOST
@@ -31,7 +31,7 @@ def test_a_seed_chooses_what_can_be_put_in_and_leaves_the_end_in_peace(seed: int
 
 @given(st.sets(st.integers(0, 39), min_size=1, max_size=4), st.integers(4, 40))
 @settings(max_examples=80, deadline=None)
-def test_exactly_what_it_takes_is_left(needed: set[int], count: int) -> None:
+def test_exactly_the_necessary_faults_are_left(needed: set[int], count: int) -> None:
     needed = {n % count for n in needed}
     asked = 0
 

@@ -22,7 +22,7 @@ def test_an_input_that_was_never_read_writes_nothing(tmp_path: Path, language: s
     assert writes(tmp_path) == []
 
 
-def test_what_the_device_does_not_hold_is_written_once(tmp_path: Path) -> None:
+def test_values_that_the_device_does_not_hold_are_written_once(tmp_path: Path) -> None:
     VirtualHall(hall(tmp_path, mode=0), tmp_path).run(5)
     assert writes(tmp_path) == [("fan.mode", 0, 2, "plc")]
 

@@ -185,7 +185,7 @@ async def numbers(store: KnowledgeStore, origin: str) -> list[int]:
     return [event.sequence for event in await store.read(origin, 1, 1_000_000)]
 
 
-def test_a_disk_that_turns_read_only_under_open_knowledge_is_unreachable_and_keeps_what_it_has(
+def test_a_disk_that_turns_read_only_under_open_knowledge_is_unreachable_and_keeps_its_data(
     small_faulty: FaultyDisk,
 ) -> None:
     async def main() -> None:
@@ -225,7 +225,7 @@ async def until_written(store: KnowledgeStore, origin: str) -> int:
 @pytest.mark.long
 @pytest.mark.interop
 @pytest.mark.timeout(180)
-def test_postgresql_on_a_full_disk_is_a_typed_error_and_goes_on_when_there_is_room(large_faulty: FaultyDisk) -> None:
+def test_postgresql_on_a_full_disk_is_a_typed_error_and_continues_when_there_is_room(large_faulty: FaultyDisk) -> None:
     async def main(url: str) -> None:
         store = await open_knowledge(url)
         origin = await store.own("plant", system="x", prototype=True, log="aa")
@@ -256,7 +256,7 @@ def test_postgresql_on_a_full_disk_is_a_typed_error_and_goes_on_when_there_is_ro
 @pytest.mark.long
 @pytest.mark.interop
 @pytest.mark.timeout(180)
-def test_postgresql_on_a_disk_that_turns_read_only_is_a_typed_error_and_keeps_what_it_acknowledged(
+def test_postgresql_on_a_disk_that_turns_read_only_is_a_typed_error_and_keeps_acknowledged_data(
     large_faulty: FaultyDisk,
 ) -> None:
     async def before(url: str) -> tuple[str, int]:

@@ -178,7 +178,7 @@ def test_a_second_sync_producer_is_noticed(tmp_path: Path) -> None:
     run(main())
 
 
-def test_syncs_that_come_twice_in_a_cycle_are_noticed_by_a_gateway_that_produces_none(tmp_path: Path) -> None:
+def test_duplicate_syncs_in_a_cycle_are_detected_by_a_gateway_that_produces_none(tmp_path: Path) -> None:
     """Without --allow-writes the gateway only listens, and the system file still gives the expected SYNC interval."""
 
     async def main() -> None:
@@ -191,7 +191,7 @@ def test_syncs_that_come_twice_in_a_cycle_are_noticed_by_a_gateway_that_produces
     run(main())
 
 
-def test_what_no_tpdo_brings_is_read_once(tmp_path: Path) -> None:
+def test_values_without_a_tpdo_are_read_once(tmp_path: Path) -> None:
     async def main() -> None:
         async with rig(tmp_path, serial="") as r:
             r.plug_node(serial=4711)
@@ -252,7 +252,7 @@ def test_another_serial_number_blocks_every_write(tmp_path: Path) -> None:
     run(main())
 
 
-def test_without_leave_the_mapping_is_adopted_and_nothing_is_written(tmp_path: Path) -> None:
+def test_without_permission_the_mapping_is_adopted_and_nothing_is_written(tmp_path: Path) -> None:
     async def main() -> None:
         async with rig(tmp_path, allow_writes=False) as r:
             node = r.plug_node()

@@ -104,7 +104,7 @@ def test_a_write_goes_before_every_poll_that_is_due() -> None:
     run(main())
 
 
-def test_a_lost_connection_is_opened_again_with_growing_pauses_and_the_values_say_so() -> None:
+def test_a_lost_connection_is_reopened_with_growing_pauses_and_the_values_show_it() -> None:
     async def main() -> None:
         p = profile(TWO_GROUPS)
 
@@ -134,7 +134,7 @@ def test_a_lost_connection_is_opened_again_with_growing_pauses_and_the_values_sa
     run(main())
 
 
-def test_a_job_that_waits_when_the_connection_is_lost_is_told() -> None:
+def test_a_job_that_waits_when_the_connection_is_lost_gets_an_error() -> None:
     async def main() -> None:
         p = profile(TWO_GROUPS)
 
@@ -167,7 +167,7 @@ class Refusing(MapBank):
         return list(super().read(table, address, count, now_ns))
 
 
-def test_a_refused_group_is_bad_and_the_others_go_on() -> None:
+def test_a_refused_group_is_bad_and_the_others_continue() -> None:
     async def main() -> None:
         p = profile(TWO_GROUPS)
         refusing = Refusing([Span("holding", 0, 1), Span("holding", 10, 1)])

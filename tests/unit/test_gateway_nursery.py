@@ -96,7 +96,7 @@ def test_a_child_that_failed_unnoticed_is_raised_on_leaving() -> None:
     run(main())
 
 
-def test_whoever_is_cancelled_while_children_end_is_cancelled() -> None:
+def test_a_task_that_is_cancelled_while_children_end_is_cancelled() -> None:
     """The children take some time; a timeout around the group still works."""
 
     async def slow_to_end() -> None:

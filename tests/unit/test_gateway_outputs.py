@@ -143,7 +143,7 @@ def test_a_value_is_written_once_and_read_back(tmp_path: Path) -> None:
     [("level", 0.1, 2), ("level", 1 / 3, 2), ("valve", 1.234, 4), ("code", 7, 6)],
     ids=["a float that float32 cannot hold", "a third", "a value between two steps", "a tag that cannot be read"],
 )
-def test_what_the_device_rounds_is_not_written_again_and_again(
+def test_a_value_that_the_device_rounds_is_not_written_repeatedly(
     tmp_path: Path, tag: str, value: float, address: int
 ) -> None:
     async def main() -> None:
@@ -171,7 +171,7 @@ def test_a_coil_is_written_and_confirmed(tmp_path: Path) -> None:
     run(main())
 
 
-def test_a_device_that_restarted_is_told_again(tmp_path: Path) -> None:
+def test_a_device_that_restarted_is_commanded_again(tmp_path: Path) -> None:
     async def main() -> None:
         async with rig(tmp_path / "a", "period") as r:
             r.writer.want("d.period", 5)
@@ -220,7 +220,7 @@ def test_safe_values_win_until_the_plc_is_back(tmp_path: Path) -> None:
         ("valve", 4000.0, {}, "outside its limits"),
     ],
 )
-def test_what_may_not_be_written_is_refused_once_and_on_record(
+def test_a_forbidden_write_is_refused_once_and_recorded(
     tmp_path: Path, tag: str, value: float, options: dict[str, bool], told: str
 ) -> None:
     async def main() -> None:
@@ -276,7 +276,7 @@ def test_a_device_that_acknowledges_and_does_not_hold_is_a_failure(tmp_path: Pat
     run(main())
 
 
-def test_a_write_that_fails_is_on_record_for_who_asked_for_it(tmp_path: Path) -> None:
+def test_a_failing_write_is_recorded_with_its_requester(tmp_path: Path) -> None:
     """Defect: a write of the program was in progress when the gateway stopped, and its failure was recorded as a failure of
     the safe state, with the program's value."""
     writers: list[OutputWriter] = []
@@ -330,7 +330,7 @@ NUMBERS = {
     offset=st.sampled_from([0.0, -40.0, 100.0]),
     value=st.one_of(st.floats(), st.integers(-(2**70), 2**70), st.booleans()),
 )
-def test_whatever_is_asked_for_is_encoded_or_refused_and_nothing_else(
+def test_any_requested_value_is_encoded_or_refused(
     kind: str, order: str, scale: float, offset: float, value: float
 ) -> None:
     """No value of a PLC may raise an error except `NotAllowed`, and an encoded value decodes to itself within a step."""
@@ -355,7 +355,7 @@ def test_whatever_is_asked_for_is_encoded_or_refused_and_nothing_else(
         assert abs(back - value) <= abs(scale) / 2 + abs(value) * 1e-12
 
 
-def test_a_range_wider_than_its_type_is_no_way_around_the_type() -> None:
+def test_a_range_wider_than_its_type_does_not_bypass_the_type() -> None:
     tag = profile('tags:\n  x: {at: "holding:0", type: uint16, access: rw, range: [0, 100000]}\n').tags["x"]
     assert encode(tag, 65535) == b"\xff\xff"
     with pytest.raises(NotAllowed):

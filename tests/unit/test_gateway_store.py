@@ -47,7 +47,7 @@ def good(value: float, t_ns: int, raw: bytes = b"\1") -> TagValue:
 # -- tags ---------------------------------------------------------------------------------------------------------------
 
 
-def test_a_value_that_nobody_refreshes_becomes_stale_and_keeps_its_age() -> None:
+def test_a_value_that_is_not_refreshed_becomes_stale_and_keeps_its_age() -> None:
     clock = Hands()
     table = TagTable(clock)
     table.declare(["d.x"], 100)
@@ -65,7 +65,7 @@ def test_a_value_that_nobody_refreshes_becomes_stale_and_keeps_its_age() -> None
     assert table.current("d.x", limit + 1).good
 
 
-def test_a_bad_tag_keeps_its_last_value_and_says_the_newest_reason() -> None:
+def test_a_bad_tag_keeps_its_last_value_and_gives_the_newest_reason() -> None:
     table = TagTable(Hands())
     table.put("d.x", good(5, 900))
     table.put_bad(["d.x", "d.y"], Reason.TIMEOUT)
@@ -88,7 +88,7 @@ def test_the_journal_holds_every_new_good_value_once() -> None:
     assert table.published == 3
 
 
-def test_the_journal_is_bounded_and_counts_what_it_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_journal_is_bounded_and_counts_its_losses(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tags_module, "JOURNAL", 10)
     table = TagTable(Hands())
     for i in range(1, 26):
@@ -140,7 +140,7 @@ def test_rows_are_kept_in_order_with_their_run(tmp_path: Path) -> None:
         assert db.execute("SELECT system, prototype FROM run").fetchall() == [("obs", 1), ("obs", 0)]
 
 
-def test_what_a_predecessor_stored_and_did_not_tell_the_plc_is_stored_once(tmp_path: Path) -> None:
+def test_records_of_a_predecessor_that_the_plc_never_got_are_stored_once(tmp_path: Path) -> None:
     rows = [("relay.log", n, n, b"x") for n in range(1, 6)]
     log = ExchangeLog(tmp_path / "s", system="obs", prototype=True)
     log.append(rows[:3])
@@ -155,7 +155,7 @@ def test_what_a_predecessor_stored_and_did_not_tell_the_plc_is_stored_once(tmp_p
     assert [row[2] for row in rows_of(tmp_path / "s")] == [1, 2, 3, 4, 5]
 
 
-def test_a_store_of_a_newer_version_and_one_that_is_none_are_refused(tmp_path: Path) -> None:
+def test_a_store_of_a_newer_version_and_a_file_that_is_not_a_store_are_refused(tmp_path: Path) -> None:
     newer = tmp_path / "newer.sqlite"
     with closing(sqlite3.connect(newer)) as db:
         db.execute("PRAGMA user_version=99")

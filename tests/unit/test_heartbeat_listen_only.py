@@ -46,7 +46,7 @@ def test_a_node_that_produces_heartbeats_is_watched_and_its_producer_time_is_not
     run(main())
 
 
-def test_a_node_that_produces_none_is_not_taken_for_watched(tmp_path: Path) -> None:
+def test_a_node_that_produces_no_heartbeat_does_not_count_as_monitored(tmp_path: Path) -> None:
     async def main() -> None:
         async with rig(tmp_path, heartbeat=LISTEN) as r:
             r.plug_node()

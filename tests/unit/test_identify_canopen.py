@@ -63,7 +63,7 @@ def test_another_makers_drive_is_possible_and_another_kind_is_not() -> None:
     run_virtually(main())
 
 
-def test_silence_is_told_as_silence() -> None:
+def test_silence_is_reported_as_silence() -> None:
     async def main() -> None:
         found = await identify({}, node=6)
         assert (found.answers, found.summary) == (False, "node 5 answers no SDO")

@@ -65,7 +65,7 @@ def test_a_shipped_device_is_matched_with_its_own_profile_first(name: str) -> No
     run_virtually(main())
 
 
-def test_what_a_unit_says_of_itself_is_certain_and_another_ones_words_rule_out(tmp_path: Path) -> None:
+def test_a_units_own_identification_is_certain_and_excludes_other_profiles(tmp_path: Path) -> None:
     path = tmp_path / "thermo.yaml"
     path.write_text(MADE_UP)
     thermo = load_profile(path)
@@ -122,7 +122,7 @@ def test_any_registers_never_make_certain(pattern: list[int], zeros: bool) -> No
     run_virtually(main())
 
 
-def test_silence_is_told_as_silence() -> None:
+def test_silence_is_reported_as_silence() -> None:
     async def main() -> None:
         wire = Wired(unit(bank([Span("holding", 0, 1)])), 9)
         found = await identify_modbus(URL, 1, SHIPPED, connector=wire, clock=loop(), timeout_s=0.1)
@@ -133,7 +133,7 @@ def test_silence_is_told_as_silence() -> None:
     run_virtually(main())
 
 
-def test_two_that_fit_equally_are_no_answer() -> None:
+def test_two_equally_good_profiles_give_no_answer() -> None:
     two = [Candidate(name, Sureness.LIKELY, ("x",)) for name in ("a/b", "c/d")]
     assert summary(two) == "2 profiles fit equally well (likely): a/b, c/d"
     assert summary([Candidate("a/b", Sureness.RULED_OUT, ())]) == "no known profile fits"

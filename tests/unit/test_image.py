@@ -122,7 +122,7 @@ def test_before_the_first_publication_everything_was_never_read() -> None:
     assert math.isinf(snapshot.age_ns(10))
 
 
-def test_a_restarted_writer_goes_on_where_the_dead_one_stopped_mid_write() -> None:
+def test_a_restarted_writer_continues_where_the_dead_one_stopped_mid_write() -> None:
     image, _ = one_region(message_tag("m", 4, 2), TagSpec("x", TagKind.INT))
     writer, reader = image.writer("r"), image.reader("r")
     for n in range(1, 4):
@@ -173,7 +173,7 @@ def test_a_message_overwritten_or_damaged_while_it_is_read_is_missed_never_hande
     assert reader.missed["m"] == 2
 
 
-def test_a_restarted_reader_resumes_after_what_it_dealt_with() -> None:
+def test_a_restarted_reader_resumes_after_the_processed_messages() -> None:
     image, _ = one_region(message_tag("m", 4, 8))
     writer = image.writer("r")
     writer.publish([good(0)], 1, {"m": [(0, b"a"), (0, b"b"), (0, b"c")]})

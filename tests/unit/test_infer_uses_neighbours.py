@@ -75,7 +75,7 @@ def test_a_fast_pulse_counter_whose_low_word_wraps_often_is_one_number(order: st
     assert (found.type, found.order) == ("uint32", order)
 
 
-def test_a_low_word_beside_a_still_register_is_not_claimed_with_confidence() -> None:
+def test_a_low_word_next_to_a_constant_register_is_not_claimed_with_confidence() -> None:
     """Nothing tells whether the 3 beside it is the upper half: the low word alone must not be called a number with confidence."""
     columns = columns_of("CDAB", [3 * 65536 + 1000 + 7 * i for i in range(PASSES)])
     found = at(inferred(columns), 0)
@@ -83,7 +83,7 @@ def test_a_low_word_beside_a_still_register_is_not_claimed_with_confidence() -> 
     assert found.registers == 2 or found.probability < 0.8
 
 
-def test_a_high_word_that_changes_on_its_own_is_no_evidence_of_a_carry() -> None:
+def test_a_high_word_that_changes_alone_is_not_evidence_of_a_carry() -> None:
     low = [100 + 5 * i for i in range(PASSES)]
     assert carry_evidence([7] * 10 + [8] * 10, low) == 0
     wrapping = [(65_500 + 10 * i) % 65536 for i in range(PASSES)]
@@ -145,7 +145,7 @@ def test_bits_of_a_status_word_that_changed_are_named(draft: tuple[str, Path]) -
     assert "a status word: bits 9 changed" in text
 
 
-def test_the_draft_says_in_which_states_the_other_registers_were(draft: tuple[str, Path]) -> None:
+def test_the_draft_names_the_states_of_the_other_registers(draft: tuple[str, Path]) -> None:
     text, _ = draft
     assert "# holding: 13 not asked, 6 readable, 1 refused, 1 no reply" in text
     assert "the device is silent in holding:7" in text

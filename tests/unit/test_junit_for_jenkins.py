@@ -99,7 +99,7 @@ def test_the_common_flavour_has_properties_that_the_jenkins_schema_forbids() -> 
     assert violations(render_junit(_report(Verdict.FAILED))) == ["testcase: child properties"]
 
 
-def test_what_stands_in_properties_elsewhere_is_kept_in_the_output() -> None:
+def test_properties_defined_elsewhere_are_kept_in_the_output() -> None:
     common = ET.fromstring(render_junit(_report(Verdict.FAILED)))
     jenkins = ET.fromstring(render_junit(_report(Verdict.FAILED), Flavour.JENKINS))
     lines = (jenkins.findtext(".//testcase/system-out") or "").splitlines()

@@ -85,7 +85,7 @@ EVERY_KIND = [
 ]
 
 
-def test_what_was_kept_is_there_in_order_as_it_was_also_after_opening_again(place: str) -> None:
+def test_stored_data_are_present_in_order_and_unchanged_also_after_reopening(place: str) -> None:
     async def main() -> None:
         store = await opened(place)
         origin = await own(store)
@@ -120,7 +120,7 @@ def test_an_origin_is_the_same_after_a_restart_and_another_for_another_system_or
     run(main())
 
 
-def test_a_store_says_whose_every_origin_is_and_learns_it_of_one_from_before(place: str) -> None:
+def test_a_store_names_the_owner_of_every_origin_and_learns_it_for_older_ones(place: str) -> None:
     async def main() -> None:
         store = await opened(place)
         await own(store)
@@ -161,7 +161,7 @@ def test_the_same_event_twice_is_one_and_gaps_are_known_until_they_are_filled_or
     run(main())
 
 
-def test_what_is_forgotten_is_no_gap_and_its_numbers_are_never_given_again(place: str) -> None:
+def test_deleted_events_are_not_a_gap_and_their_numbers_are_never_reused(place: str) -> None:
     async def main() -> None:
         store = await opened(place)
         origin = await own(store)
@@ -238,7 +238,7 @@ def test_a_plain_value_comes_back_from_a_file_as_it_went(
     asyncio.run(main())
 
 
-def test_what_cannot_be_held_exactly_is_said() -> None:
+def test_values_that_cannot_be_stored_exactly_are_reported() -> None:
     assert of_tag(5, "x", TagValue(math.nan, Quality.GOOD))[4:] == (None, Quality.BAD, Reason.NOT_A_NUMBER)
     assert plain(1 << 64) == float(1 << 64)
     assert plain(True) == 1
@@ -262,7 +262,7 @@ def test_ranges_are_sets_of_numbers(a: list[tuple[int, int]], b: list[tuple[int,
 # -- versions -------------------------------------------------------------------------------------------------------------
 
 
-def test_a_file_of_every_older_version_is_brought_up_to_date_with_what_it_holds(tmp_path: Path) -> None:
+def test_a_file_of_every_older_version_is_migrated_with_its_content(tmp_path: Path) -> None:
     path = tmp_path / "old.db"
     for version in range(LATEST):
         path.unlink(missing_ok=True)
@@ -341,7 +341,7 @@ def test_a_server_that_goes_away_is_unreachable_and_used_again_when_it_is_back(p
     run(main())
 
 
-def test_what_is_no_store_is_left_alone(tmp_path: Path) -> None:
+def test_a_file_that_is_not_a_store_is_not_changed(tmp_path: Path) -> None:
     path = tmp_path / "letter.txt"
     path.write_text("dear plant, " * 100)
     with pytest.raises(FileInvalid, match="not a store of ours"):
@@ -353,7 +353,7 @@ def test_what_is_no_store_is_left_alone(tmp_path: Path) -> None:
 # -- full disks, crashes ----------------------------------------------------------------------------------------------------
 
 
-def test_a_store_at_its_bound_says_so_keeps_what_it_has_and_goes_on_when_there_is_room(tmp_path: Path) -> None:
+def test_a_store_at_its_bound_reports_it_keeps_its_data_and_continues_when_there_is_room(tmp_path: Path) -> None:
     async def main() -> None:
         store = await SqliteKnowledge.open(tmp_path / "k.db", max_bytes=64 * 4096, offload=in_place)
         origin = await own(store)

@@ -44,7 +44,7 @@ async def moody(tmp_path: Path) -> tuple[Moody, str]:
     return store, await store.own("plant", system="s", prototype=True, log="aa")
 
 
-def test_what_is_observed_is_written_in_order_and_told(tmp_path: Path) -> None:
+def test_observed_events_are_written_in_order_and_reported(tmp_path: Path) -> None:
     async def main() -> None:
         store, origin = await moody(tmp_path)
         told: list[int] = []
@@ -88,7 +88,7 @@ def test_through_a_full_disk_nothing_is_lost_that_fits_the_queue_and_the_rest_is
     run(main())
 
 
-def test_a_full_store_forgets_what_may_go_and_nothing_else(tmp_path: Path) -> None:
+def test_a_full_store_deletes_only_deletable_events(tmp_path: Path) -> None:
     async def main() -> None:
         store, origin = await moody(tmp_path)
         may_go = [2, 0]
@@ -112,7 +112,7 @@ def test_a_full_store_forgets_what_may_go_and_nothing_else(tmp_path: Path) -> No
     run(main())
 
 
-def test_short_room_is_said_early_once_and_when_it_is_over(tmp_path: Path) -> None:
+def test_low_space_is_reported_early_once_and_when_it_is_over(tmp_path: Path) -> None:
     async def main() -> None:
         store, origin = await moody(tmp_path)
         said: list[str] = []
@@ -128,7 +128,7 @@ def test_short_room_is_said_early_once_and_when_it_is_over(tmp_path: Path) -> No
     run(main())
 
 
-def test_who_is_stopped_in_the_middle_of_writing_writes_nothing_twice(tmp_path: Path) -> None:
+def test_a_writer_stopped_in_the_middle_writes_nothing_twice(tmp_path: Path) -> None:
     async def main() -> None:
         store, origin = await moody(tmp_path)
         store.slow = asyncio.Event()
@@ -149,7 +149,7 @@ def test_who_is_stopped_in_the_middle_of_writing_writes_nothing_twice(tmp_path: 
     run(main())
 
 
-def test_knowledge_replayed_is_what_was_last_known(tmp_path: Path) -> None:
+def test_replayed_knowledge_equals_the_last_known_state(tmp_path: Path) -> None:
     async def main() -> None:
         store, origin = await moody(tmp_path)
         await store.append(
@@ -167,7 +167,7 @@ def test_knowledge_replayed_is_what_was_last_known(tmp_path: Path) -> None:
     run(main())
 
 
-def test_a_store_that_refuses_is_told_of_and_what_is_queued_stays(tmp_path: Path) -> None:
+def test_a_refusing_store_is_reported_and_queued_events_stay(tmp_path: Path) -> None:
     """A twin's commands: an unrecorded command is not sent, and the twin continues."""
 
     async def main() -> None:

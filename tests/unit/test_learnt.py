@@ -98,7 +98,7 @@ def test_mb_025_with_its_line_in_the_profile_nothing_is_left_to_learn(site: Site
 
 
 @pytest.mark.parametrize("change", ["profile", "unit", "endpoint"])
-def test_another_device_is_asked_anew(site: Site, change: str) -> None:
+def test_a_different_device_is_asked_again(site: Site, change: str) -> None:
     site.run()
     asked = site.exceptions
     if change == "profile":
@@ -111,13 +111,13 @@ def test_another_device_is_asked_anew(site: Site, change: str) -> None:
     assert site.exceptions == asked
 
 
-def test_what_is_there_again_is_forgotten(site: Site) -> None:
+def test_a_gap_that_answers_again_is_forgotten(site: Site) -> None:
     site.run()
     assert site.run(spans=[Span("holding", 0, 2), Span("holding", 5, 8)])["missing"] == []
     assert site.exceptions == 0
 
 
-def test_a_damaged_file_is_none(site: Site) -> None:
+def test_a_damaged_file_counts_as_missing(site: Site) -> None:
     site.run()
     whole = site.path.read_bytes()
     for damaged in (b"", whole[:-3], b"[]", b'{"meter": 1}', whole.replace(b"holding:2", b"nowhere:2"), b"\xff" * 99):
@@ -136,14 +136,14 @@ def test_no_file_does_any_harm(data: bytes, tmp_path_factory: pytest.TempPathFac
     assert driver.learnt.gaps == []
 
 
-def test_a_disk_that_refuses_is_told(site: Site, tmp_path: Path) -> None:
+def test_a_disk_that_refuses_is_reported(site: Site, tmp_path: Path) -> None:
     site.run()
     full = LearntFile(tmp_path / "no such folder" / "learnt.json", [site.driver], {"line": BusConfig("line", LINE)})
     with pytest.raises(Unreachable, match="cannot write what was learnt"):
         full.save()
 
 
-def test_a_device_that_takes_less_than_its_profile_says_keeps_its_borders(site: Site) -> None:
+def test_a_device_that_accepts_less_than_its_profile_states_keeps_its_limits(site: Site) -> None:
     site.profile = profile('tags:\n  x1..9: {at: "holding:0"}\n')
     site.limits = UnitLimits(read_registers=4)
     learnt = site.run(spans=[Span("holding", 0, 9)])

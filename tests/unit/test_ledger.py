@@ -40,7 +40,7 @@ def test_a_line_that_a_kill_cut_off_goes(tmp_path: Path) -> None:
         assert Ledger(path).done("w") == {1, 3}
 
 
-def test_what_is_no_line_is_named(tmp_path: Path) -> None:
+def test_a_file_that_is_not_a_line_is_named(tmp_path: Path) -> None:
     path = tmp_path / "ledger.jsonl"
     path.write_text('{"what": 1}\n')
     with pytest.raises(FileInvalid, match="no line of a ledger") as e:

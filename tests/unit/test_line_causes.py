@@ -35,7 +35,7 @@ def names(report: LineReport) -> list[str]:
     return [c.name for c in report.causes]
 
 
-def test_a_silent_line_is_no_fault_and_nothing_is_sent() -> None:
+def test_a_silent_line_is_not_a_fault_and_nothing_is_sent() -> None:
     async def main() -> None:
         line = UartLine({1: meter()}, counts=True)
         report = await look(line)
@@ -103,7 +103,7 @@ def test_the_probe_sees_echo_and_answer_and_is_one_question() -> None:
     run_virtually(main())
 
 
-def test_no_probe_goes_into_the_traffic_of_others_without_leave() -> None:
+def test_no_probe_is_sent_into_foreign_traffic_without_permission() -> None:
     async def main() -> None:
         line = UartLine({1: meter()}, counts=True, chatter=(exchange(5, 1),))
         with pytest.raises(NotAllowed, match="somebody talks"):

@@ -193,7 +193,7 @@ def test_two_that_are_named_at_once_get_each_its_own_node_id() -> None:
     run_virtually(main())
 
 
-def test_nobody_there_is_told_and_wrong_use_refused() -> None:
+def test_a_missing_device_is_reported_and_wrong_use_refused() -> None:
     async def main() -> None:
         async with master_of([Slave((1, 2, 3, 4))]) as lss:
             with pytest.raises(ReplyTimeout, match="no slave is"):

@@ -100,7 +100,7 @@ def test_patience_grows_with_the_modem_and_shrinks_with_it() -> None:
     assert looks(patience, 99_080, 99_080) == [101_060]  # no longer than two seconds
 
 
-def test_a_message_now_and_then_says_nothing_of_the_modems_pace() -> None:
+def test_an_occasional_message_gives_no_information_on_the_modems_speed() -> None:
     patience = Patience()
     for at_ms in range(0, 60_000, 10_000):
         patience.sent(at_ms * NS_PER_MS)

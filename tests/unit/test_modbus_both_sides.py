@@ -247,7 +247,7 @@ JUDGED = {1, 2, 3, 4, 5, 6, 0x0F, 0x10, 0x16, 0x17}
 
 @settings(max_examples=400, deadline=None)
 @given(SENSIBLE)
-def test_both_servers_judge_a_request_alike(pdu: bytes) -> None:
+def test_both_servers_check_a_request_identically(pdu: bytes) -> None:
     """The emulator and the gateway's own server: the same exception, or neither refuses."""
     if pdu[0] not in JUDGED:
         return

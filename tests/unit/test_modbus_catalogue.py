@@ -64,7 +64,7 @@ def test_each_case_has_a_mutation(case: str) -> None:
     assert case in {mutation["case"] for name in MUTATIONS for mutation in toml(f"mutations/{name}")["mutation"]}
 
 
-def test_each_row_of_bytes_is_played_three_ways() -> None:
+def test_each_row_of_bytes_runs_in_three_ways() -> None:
     """All rows run whole. At least one row of each case runs byte by byte and with trailing garbage."""
     bytewise, garbage = defaultdict[str, bool](bool), defaultdict[str, bool](bool)
     for row in SLAVE:

@@ -159,7 +159,7 @@ def test_many_callers_are_served_one_at_a_time() -> None:
         ("01 03 02 00 00 00 00", CrcError, "crc_errors"),
     ],
 )
-def test_errors_are_counted_and_say_where(frame: str, error: type[FieldtwinError], counter: str) -> None:
+def test_errors_are_counted_and_name_their_place(frame: str, error: type[FieldtwinError], counter: str) -> None:
     async def scenario(client: ModbusClient, device: Device) -> None:
         async def answer(_: bytes) -> None:
             await device.send(frame) if error is CrcError else await device.send_frame(frame)
@@ -206,7 +206,7 @@ def test_a_lost_connection_ends_the_exchange_and_the_client(framing: Framing) ->
     with_client(scenario, framing=framing)
 
 
-def test_a_closed_client_says_so() -> None:
+def test_a_closed_client_reports_it() -> None:
     async def scenario(client: ModbusClient, device: Device) -> None:
         assert not client.closed
         asking = asyncio.create_task(client.read_registers(1, "holding", 0, 1, timeout_s=5.0))
@@ -261,7 +261,7 @@ def test_an_identification_that_goes_round_in_circles_ends() -> None:
         ("can:socketcan/can0", {}, "not spoken"),
     ],
 )
-def test_what_a_wire_has_not_cannot_be_set(url: str, settings: dict[str, bool], says: str) -> None:
+def test_a_setting_that_a_wire_lacks_cannot_be_set(url: str, settings: dict[str, bool], says: str) -> None:
     near, _ = wire("rtu")
     with pytest.raises(UsageError, match=says):
         ModbusClient.at(Endpoint.parse(url), near, CLOCK, **settings)  # type: ignore[arg-type]

@@ -309,7 +309,7 @@ def test_mb_056_transaction_ids_skip_zero_when_they_wrap() -> None:
         lambda: ReadDeviceIdentification(5),
     ],
 )
-def test_what_the_standard_forbids_cannot_be_asked(make: object) -> None:
+def test_requests_that_the_standard_forbids_cannot_be_made(make: object) -> None:
     assert callable(make)
     with pytest.raises(UsageError):
         make()

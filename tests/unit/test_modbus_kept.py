@@ -13,7 +13,7 @@ from fieldtwin.gateway.core.errors import ReplyTimeout
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient, UnitPace
 
 
-def test_a_timeout_that_is_stated_anew_counts_from_the_next_request_on() -> None:
+def test_a_changed_timeout_counts_from_the_next_request_on() -> None:
     endpoint = Endpoint.parse("tcp://plant:502")
     loop = VirtualLoop()
 

@@ -227,7 +227,7 @@ def test_any_pdu_is_a_reply_or_a_typed_error(
 
 
 @given(st.lists(st.integers(0, 65535), min_size=1, max_size=125), st.binary(min_size=1, max_size=250))
-def test_words_and_bits_are_those_that_pymodbus_reads(words: list[int], packed: bytes) -> None:
+def test_words_and_bits_match_those_of_pymodbus(words: list[int], packed: bytes) -> None:
     registers = ReadHoldingRegistersResponse()
     raw = pdus.words_to_bytes(words)
     registers.decode(bytes([len(raw)]) + raw)
@@ -266,7 +266,7 @@ def test_a_flood_of_garbage_is_bounded_in_memory_and_in_work(kind: str, flood: b
     assert answer.registers == (9,)
 
 
-def test_a_reply_behind_more_noise_than_is_searched_is_given_up() -> None:
+def test_a_reply_after_more_noise_than_is_searched_is_given_up() -> None:
     read, reply = ReadRegisters("holding", 0, 1), framed("rtu", 0, registers_pdu(3, [9]))
     assert isinstance(play(RtuFramer(), read, b"\x55" * (MOST_HUNTED - 300) + reply, []), RegistersReply)
     outcome = play(RtuFramer(), read, b"\x55" * (MOST_HUNTED + 300) + reply, [])

@@ -34,7 +34,7 @@ def test_a_system_that_is_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         find("systems", name)
 
 
-def test_a_site_without_a_prototype_says_what_to_do(tmp_path: Path) -> None:
+def test_a_site_without_a_prototype_reports_the_remedy(tmp_path: Path) -> None:
     shutil.copy(data_root() / "profiles" / "systems" / "observatory.yaml", tmp_path / "mysite.yaml")
     with pytest.raises(
         FileInvalid, match=r"mysite.prototype.yaml: there is no prototype file of mysite.yaml.*--prototype-file"

@@ -77,7 +77,7 @@ def test_no_system_of_it_mentions_another() -> None:
         ("seed: 5", "seed: 5\nseed: 6", "seed: 6", "stands twice"),
     ],
 )  # fmt: skip
-def test_what_is_wrong_is_named_at_its_spot(tmp_path: Path, old: str, new: str, at: str, said: str) -> None:
+def test_an_error_is_named_at_its_position(tmp_path: Path, old: str, new: str, at: str, said: str) -> None:
     path = changed(tmp_path, old, new)
     with pytest.raises(FileInvalid) as caught:
         load_network(path, [SYSTEMS.parent])
@@ -86,7 +86,7 @@ def test_what_is_wrong_is_named_at_its_spot(tmp_path: Path, old: str, new: str, 
     assert caught.value.exit_code == 3
 
 
-def test_what_is_wrong_in_a_system_is_named_there(tmp_path: Path) -> None:
+def test_an_error_in_a_system_is_named_there(tmp_path: Path) -> None:
     for file in SYSTEMS.glob("ocean_*.yaml"):
         shutil.copy(file, tmp_path)
     shutil.copy(SYSTEMS / "adapt.st", tmp_path)
@@ -96,7 +96,7 @@ def test_what_is_wrong_in_a_system_is_named_there(tmp_path: Path) -> None:
         load_network(tmp_path / "ocean_network.yaml")
 
 
-def test_a_network_is_no_system_and_a_system_no_network() -> None:
+def test_a_network_is_not_a_system_and_a_system_not_a_network() -> None:
     found = network_file("ocean_network")
     assert found is not None
     assert found.resolve() == SHIPPED
@@ -136,7 +136,7 @@ def test_a_scenario_of_a_network_has_no_probes(tmp_path: Path) -> None:
         load_scenario(path)
 
 
-def test_faults_of_the_water_come_and_go() -> None:
+def test_faults_of_the_acoustic_channel_start_and_end() -> None:
     faults = WaterFaults(load_network(SHIPPED), 1)
     assert faults.inject({"id": "deaf", "name": "drop", "bus": "water", "device": "east"}) == "deaf"
     assert [faults.spoils(5, listener, b"x") for listener in (1, 2, 3, 4)] == [False, False, True, False]
@@ -159,7 +159,7 @@ def test_faults_of_the_water_come_and_go() -> None:
         (["--prototype", "--seed", "3"], "--seed and --trace go with --virtual"),
     ],
 )
-def test_what_a_network_is_not_asked_for(words: list[str], said: str) -> None:
+def test_unsupported_requests_of_a_network(words: list[str], said: str) -> None:
     result = CliRunner().invoke(cli, ["run", "ocean_network", *words], standalone_mode=False)
     assert isinstance(result.exception, UsageError)
     assert said in str(result.exception)

@@ -87,7 +87,7 @@ def test_a_run_with_a_file_of_faults(tmp_path: Path) -> None:
     assert summary["water"]["east"]["fault"] == 0
 
 
-def test_a_fault_that_aims_at_nobody_is_an_error_with_its_place(tmp_path: Path) -> None:
+def test_a_fault_without_a_target_is_an_error_with_its_place(tmp_path: Path) -> None:
     (tmp_path / "x.yaml").write_text("faults:\n  - {name: silence, device: middel.optode}\n")
     result = on_the_command_line(tmp_path, "--for", "10s", "--faults", str(tmp_path / "x.yaml"))
     assert isinstance(result.exception, FileInvalid)
@@ -95,7 +95,7 @@ def test_a_fault_that_aims_at_nobody_is_an_error_with_its_place(tmp_path: Path) 
     assert "middle.optode" in str(result.exception)
 
 
-def test_a_seed_chooses_faults_of_all_systems_and_of_the_water() -> None:
+def test_a_seed_chooses_faults_of_all_systems_and_of_the_acoustic_channel() -> None:
     network = load_network(SHIPPED)
     found = random_network_schedule(network, 3, 20_000.0)
     assert found == random_network_schedule(network, 3, 20_000.0) != random_network_schedule(network, 4, 20_000.0)
@@ -109,7 +109,7 @@ def test_a_seed_chooses_faults_of_all_systems_and_of_the_water() -> None:
         assert spec.until_s <= 20_000 - CALM_S
 
 
-def test_many_seeds_are_run_and_the_ledger_leaves_out_what_it_has(tmp_path: Path) -> None:
+def test_many_seeds_run_and_the_ledger_skips_its_entries(tmp_path: Path) -> None:
     words = ("--for", "3s", "--seeds", "1..2", "--ledger", str(tmp_path / "l"), "--commands", "none", "--json")
     first = json.loads(on_the_command_line(tmp_path, *words).stdout)
     assert [one["seed"] for one in first["results"]] == [1, 2]
@@ -120,7 +120,7 @@ def test_many_seeds_are_run_and_the_ledger_leaves_out_what_it_has(tmp_path: Path
     assert isinstance(again.exception, UsageError)
 
 
-def test_what_a_failing_seed_takes_is_left_and_is_a_scenario_of_the_network(
+def test_the_minimal_faults_of_a_failing_seed_become_a_scenario_of_the_network(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Wrong bits on Modbus TCP, which has no checksum: they cannot be detected, and the published values are wrong."""
@@ -137,7 +137,7 @@ def test_what_a_failing_seed_takes_is_left_and_is_a_scenario_of_the_network(
     assert "published values were never held by their device" in again.reason
 
 
-def test_faults_of_a_system_and_of_the_water_are_put_in_where_they_are_aimed(tmp_path: Path) -> None:
+def test_faults_of_a_system_and_of_the_acoustic_channel_affect_their_targets(tmp_path: Path) -> None:
     path = tmp_path / "x.scenario.yaml"
     path.write_text(
         "scenario: x\nsystem: ocean_network\nseed: 5\nsteps:\n"

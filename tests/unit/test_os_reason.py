@@ -23,5 +23,5 @@ from fieldtwin.gateway.core.errors import os_reason
         (OSError(), "OSError"),
     ],
 )  # fmt: skip
-def test_the_address_that_says_most_speaks_for_a_name(error: OSError, said: str) -> None:
+def test_the_most_informative_address_error_represents_a_name(error: OSError, said: str) -> None:
     assert os_reason(error) == said

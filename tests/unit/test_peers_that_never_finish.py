@@ -271,7 +271,9 @@ async def control_port(token: str) -> AsyncIterator[int]:
 
 
 @pytest.mark.parametrize("piece", [b"", b"{"], ids=["says nothing", "drips"])
-def test_strangers_cannot_keep_the_places_of_a_control_channel(monkeypatch: pytest.MonkeyPatch, piece: bytes) -> None:
+def test_silent_clients_cannot_occupy_the_places_of_a_control_channel(
+    monkeypatch: pytest.MonkeyPatch, piece: bytes
+) -> None:
     monkeypatch.setattr(control, "LINE_WITHIN_S", 0.5)
     monkeypatch.setattr(control, "MAX_CLIENTS", 8)
 
@@ -377,7 +379,7 @@ def test_answers_without_an_end_do_not_prolong_a_call() -> None:
 # -- CAN ---------------------------------------------------------------------------------------------------------------
 
 
-def test_a_client_that_drips_its_hello_is_turned_away_and_the_bus_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_client_with_a_slow_hello_is_refused_and_the_bus_continues(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bus_server, "HELLO_TIMEOUT_S", 0.4)
 
     async def main() -> None:

@@ -173,7 +173,7 @@ def test_ctud_reset_over_load_over_counting_and_rises_cancel() -> None:
 
 
 @given(st.lists(st.tuples(*[st.booleans()] * 4, st.integers(-3, 5)), max_size=40), st.sampled_from([0, 32766, -32767]))
-def test_ctud_is_what_the_standards_body_says(rows: list[tuple[bool, bool, bool, bool, int]], begin: int) -> None:
+def test_ctud_equals_the_body_in_the_standard(rows: list[tuple[bool, bool, bool, bool, int]], begin: int) -> None:
     """IEC 61131-3, Table 45, CTUD, with its edges taken from the previous calls."""
     c = CTUD()
     c.CV = cv = begin
@@ -193,7 +193,7 @@ def test_ctud_is_what_the_standards_body_says(rows: list[tuple[bool, bool, bool,
         assert (c.CV, c.QU, c.QD) == (cv, cv >= pv, cv <= 0)
 
 
-def test_every_block_declares_what_it_has() -> None:
+def test_every_block_declares_its_variables() -> None:
     for name, block in BLOCKS.items():
         made = block()
         for variable in block.inputs | block.outputs:

@@ -35,7 +35,7 @@ def test_ramp_never_exceeds_its_rates_nor_its_target(rows: list[tuple[int, float
         before = ramp.XOUT
 
 
-def test_ramp_holds_on_what_is_no_number_and_follows_when_it_does_not_run() -> None:
+def test_ramp_holds_on_nan_and_follows_when_it_does_not_run() -> None:
     ramp = RAMP()
     assert ramp(0, RUN=False, X=3.0, UP=1, DOWN=1).XOUT == 3.0
     assert ramp(SECOND, RUN=True, X=math.nan, UP=1, DOWN=1).XOUT == 3.0
@@ -78,7 +78,7 @@ def test_pid_derivative_acts_on_the_measurement_only() -> None:
     assert pid(20 * MS, PV=1.0, SP=10.0, **quiet).XOUT < 9.0 - 5.0
 
 
-def test_pid_holds_on_what_is_no_number_and_recovers() -> None:
+def test_pid_holds_on_nan_and_recovers() -> None:
     pid = PID()
     pid(0, AUTO=True, PV=1.0, SP=2.0, KP=1.0, TR=SECOND)
     held = pid.XOUT

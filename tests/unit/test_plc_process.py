@@ -152,7 +152,7 @@ async def got(client: ControlClient, condition: Callable[[dict[str, Any]], bool]
     return last
 
 
-def test_commands_become_outputs_and_samples_responses_until_told_to_stop(tmp_path: Path) -> None:
+def test_commands_become_outputs_and_samples_responses_until_the_stop(tmp_path: Path) -> None:
     async def main() -> None:
         async with plc_running(config_in(tmp_path, RELAY)) as (child, gateway, client):
             beating = asyncio.create_task(gateway.alive())
@@ -206,7 +206,7 @@ def test_a_gateway_that_dies_turns_inputs_bad_and_sigterm_ends_it_within_a_secon
     run(main())
 
 
-def test_a_killed_plc_leaves_a_whole_image_and_its_successor_goes_on(tmp_path: Path) -> None:
+def test_a_killed_plc_leaves_a_consistent_image_and_its_successor_continues(tmp_path: Path) -> None:
     async def main() -> None:
         config = config_in(tmp_path, RELAY, cycle_ms=1)
         async with plc_running(config) as (child, gateway, _):

@@ -81,7 +81,7 @@ def test_log_data_needs_a_positive_period(period_s: int) -> None:
 
 
 @pytest.mark.parametrize("data", [b"", b"\1", b"\0\1\2"])
-def test_a_command_that_is_none_changes_nothing_and_is_counted(data: bytes) -> None:
+def test_an_invalid_command_changes_nothing_and_is_counted(data: bytes) -> None:
     logic, commands, _ = logic_with_ears()
     for item in (encode_period(3), COMMAND(data), encode_period(4)):
         logic.transmitter.observe(item)
@@ -91,7 +91,7 @@ def test_a_command_that_is_none_changes_nothing_and_is_counted(data: bytes) -> N
     assert [e.kind for e in logic.data_log] == ["command", "bad command", "command"]
 
 
-def test_the_log_is_bounded_keeps_duplicates_and_counts_what_it_drops() -> None:
+def test_the_log_is_bounded_keeps_duplicates_and_counts_dropped_entries() -> None:
     log = DataLog(3)
     for n in range(5):
         log.append(LogEntry(n, "command", b"same"))
@@ -137,7 +137,7 @@ def test_a_full_mailbox_means_wait_counted_then_everything_in_order() -> None:
     assert (relay.waiting, relay.dropped, relay.responses) == (0, 0, 5)
 
 
-def test_what_no_queue_can_hold_is_dropped_oldest_first_and_counted() -> None:
+def test_messages_beyond_the_queue_are_dropped_oldest_first_and_counted() -> None:
     relay = Relay()
     relay.response.outstanding = relay.response.depth
     total = QUEUE_CAPACITY + 44
@@ -178,7 +178,7 @@ def test_the_log_leaves_as_messages_once_each_and_waits_for_room() -> None:
     assert relay.logged == 5
 
 
-def test_log_entries_that_nobody_took_in_time_are_counted() -> None:
+def test_log_entries_that_were_not_taken_in_time_are_counted() -> None:
     relay = Relay()
     relay.log.outstanding = relay.log.depth
     relay.command = (command(1, 1),)

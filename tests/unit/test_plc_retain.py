@@ -46,7 +46,7 @@ def scan(program: Program, times: int = 1) -> None:
         program.execute(ScanInfo(number, number, number == 1))
 
 
-def test_a_warm_start_goes_on_and_a_cold_one_begins_anew(tmp_path: Path) -> None:
+def test_a_warm_start_continues_and_a_cold_one_starts_fresh(tmp_path: Path) -> None:
     path = tmp_path / "retain"
     first = Counter()
     kept = Retained(bound(first), path)
@@ -77,7 +77,7 @@ def test_another_program_begins_cold_and_the_old_file_is_kept(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("damage", [b"", b"short", b"x" * 100_000])
-def test_a_file_that_is_none_is_put_aside(tmp_path: Path, damage: bytes) -> None:
+def test_an_invalid_file_is_set_aside(tmp_path: Path, damage: bytes) -> None:
     path = tmp_path / "retain"
     path.write_bytes(damage)
     begun = Retained(bound(Counter()), path)
@@ -103,7 +103,7 @@ def test_a_damaged_slot_gives_the_one_before(tmp_path_factory: pytest.TempPathFa
     assert kept["pad"] == "xy"[kept["n"] - 1] * 200
 
 
-def test_what_grows_beyond_its_file_is_an_error_and_the_last_whole_save_stays(tmp_path: Path) -> None:
+def test_data_larger_than_the_file_is_an_error_and_the_last_complete_save_stays(tmp_path: Path) -> None:
     file, _, _ = RetainFile.open(tmp_path / "f", b"h" * 32, 20)
     file.save({"s": "small"})
     with pytest.raises(RetainFull, match="4096 bytes"):

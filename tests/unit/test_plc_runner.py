@@ -172,7 +172,7 @@ def test_the_watchdog_stops_then_restarts_warm_at_most_so_often(tmp_path: Path) 
     assert (rig.runner.running, rig.runner.restarts, rig.runner.stop_reason) == (False, 2, StopReason.WATCHDOG)
 
 
-def test_paused_tasks_hold_their_outputs_and_step_when_told(tmp_path: Path) -> None:
+def test_paused_tasks_hold_their_outputs_and_step_on_request(tmp_path: Path) -> None:
     rig = Rig(tmp_path, (TaskSpec("fast", 10),), ("Fast",))
     rig.runner.start()
     rig.until(20)

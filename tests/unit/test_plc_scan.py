@@ -194,7 +194,7 @@ def test_a_silent_gateway_turns_every_input_bad_and_a_living_one_good_again() ->
     assert rig.program.tag("x").good
 
 
-def test_a_gateway_that_says_stopped_is_dead_at_once() -> None:
+def test_a_gateway_with_status_stopped_is_dead_at_once() -> None:
     rig = Rig()
     rig.feed(10)
     rig.writer.publish([NEVER] * 5, 11 * MS, None, RegionFlag.STOPPED)
@@ -214,7 +214,7 @@ def test_messages_pass_exactly_once_and_are_acknowledged_when_consumed() -> None
     assert rig.program.box[0].t_ns == 4 * MS
 
 
-def test_messages_never_overrun_a_taker_that_is_behind() -> None:
+def test_messages_never_overrun_a_slow_taker() -> None:
     rig = Rig()
     for n in range(10):
         rig.feed(n + 1, messages=(bytes([n]),))
@@ -351,7 +351,7 @@ def test_an_integer_tag_widens_into_a_real_input() -> None:
         "python: json:loads",
     ],
 )
-def test_sources_that_are_no_program_are_refused(source: str) -> None:
+def test_sources_that_are_not_programs_are_refused(source: str) -> None:
     with pytest.raises(FileInvalid):
         load_program(source)
 
@@ -369,7 +369,7 @@ def force(rig: Rig, tag: str, value: Scalar) -> None:
     rig.scan.output_image.forces.force(spec, value, is_input, 5, "test")
 
 
-def test_a_forced_input_is_what_the_logic_sees_whatever_the_plant_says() -> None:
+def test_the_logic_sees_a_forced_input_whatever_the_plant_reports() -> None:
     rig = Rig(n="trip")
     rig.feed(10, x=1.5, n=3)
     force(rig, "d.real", 7)
@@ -436,7 +436,7 @@ def test_why_a_tag_changed_is_known() -> None:
     assert changes[-1].inputs["box"] == f"0001, 616263, {'78' * 16}"
 
 
-def test_outputs_first_publishes_at_the_cycles_start_what_the_scan_before_computed() -> None:
+def test_outputs_first_publishes_at_the_cycles_start_the_results_of_the_scan_before() -> None:
     rig = Rig()
     scan = Scan(rig.image, [rig.bound], 100, outputs_first=True)
     published: list[object] = []
@@ -449,7 +449,7 @@ def test_outputs_first_publishes_at_the_cycles_start_what_the_scan_before_comput
     assert published == [None, 10.0, 20.0]
 
 
-def test_a_paused_task_keeps_publishing_what_it_had() -> None:
+def test_a_paused_task_keeps_publishing_its_last_outputs() -> None:
     rig = Rig()
     rig.feed(10, x=1.5)
     rig.execute(11)

@@ -176,7 +176,7 @@ def test_the_first_scan_is_the_first_that_the_program_executes(tmp_path: Path) -
     assert (rig.out("fan.first"), rig.out("fan.scans")) == (1, 10)
 
 
-def test_the_status_says_which_inputs_are_missing_and_why(tmp_path: Path) -> None:
+def test_the_status_lists_missing_inputs_with_reasons(tmp_path: Path) -> None:
     rig = Rig(tmp_path, fan())
     rig.inputs["sensor.temperature"] = TagValue(None, Quality.BAD, Reason.TIMEOUT)
     rig.until(2_000)
@@ -214,7 +214,7 @@ def test_an_input_has_to_be_good_once_and_not_at_the_same_time_as_the_others(tmp
     assert rig.status["state"] == "running"
 
 
-def test_after_the_timeout_the_program_goes_on_waiting_and_says_so(tmp_path: Path) -> None:
+def test_after_the_timeout_the_program_continues_to_wait_and_reports_it(tmp_path: Path) -> None:
     rig = Rig(tmp_path, fan(timeout_ms=1_000.0))
     rig.until(3_000)
     status = rig.status
@@ -226,7 +226,7 @@ def test_after_the_timeout_the_program_goes_on_waiting_and_says_so(tmp_path: Pat
     assert (rig.status["state"], rig.status["error"], rig.out("fan.mode")) == ("running", "", 2)
 
 
-def test_after_the_timeout_the_program_starts_anyway_where_the_policy_says_so(tmp_path: Path) -> None:
+def test_after_the_timeout_the_program_starts_anyway_if_the_policy_allows(tmp_path: Path) -> None:
     rig = Rig(tmp_path, fan("fan.st", timeout_ms=1_000.0, at_timeout="start_anyway"))
     rig.until(1_000)
     assert rig.out("fan.mode") is None
@@ -241,7 +241,7 @@ def test_a_timeout_of_zero_does_not_wait(tmp_path: Path) -> None:
     assert rig.out("fan.mode") == 1
 
 
-def test_after_the_timeout_the_plc_stops_where_the_policy_says_so(tmp_path: Path) -> None:
+def test_after_the_timeout_the_plc_stops_if_the_policy_requires(tmp_path: Path) -> None:
     rig = Rig(tmp_path, fan(timeout_ms=1_000.0, at_timeout="stop"))
     rig.until(3_000)
     status = rig.status

@@ -141,7 +141,7 @@ def test_in_a_diagram_no_label_hides_a_state_or_another_label(table: StateTable)
             assert x >= ox + ow or ox >= x + w or y >= oy + oh or oy >= y + h
 
 
-def test_the_relays_diagram_says_what_its_machine_does() -> None:
+def test_the_relays_diagram_matches_its_machine() -> None:
     for period_s in (PERIOD_MIN, -1, 0, 1, PERIOD_MAX):
         for state in STATES:
             held = [
@@ -163,14 +163,14 @@ PUMP_PROOF = Proof(
 )
 
 
-def test_what_holds_is_proved_over_states_inputs_quality_and_timer_phase() -> None:
+def test_true_properties_are_proved_over_states_inputs_quality_and_timer_phase() -> None:
     result = prove(PUMP_PROOF)
     assert result.proved
     assert result.states >= 8
     assert result.transitions == result.states * 24  # every state with every possible input, and the initial one
 
 
-def test_what_does_not_hold_comes_with_a_shortest_way_to_it() -> None:
+def test_a_false_property_has_a_shortest_counterexample() -> None:
     wrong = replace(PUMP_PROOF, invariants={"never a fault": lambda p: p.state_name != "FAULT"})
     result = prove(wrong)
     assert (result.proved, result.broken) == (False, "never a fault")
@@ -196,7 +196,7 @@ class Gullible(Wary):
     trusts = (Quality.GOOD, Quality.UNCERTAIN)
 
 
-def test_the_quality_of_an_input_is_part_of_what_is_proved() -> None:
+def test_the_quality_of_an_input_is_part_of_the_proof() -> None:
     old = TagValue(15.0, Quality.UNCERTAIN, Reason.TIMEOUT)
     proof = replace(
         PUMP_PROOF,

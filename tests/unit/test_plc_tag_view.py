@@ -66,7 +66,7 @@ class Rig:
         return {r["tag"]: r for r in self.view.describe(names, self.now_ns + later_ms * MS, UTC_NS)}
 
 
-def test_every_tag_has_what_an_engineer_asks_for(tmp_path: Path) -> None:
+def test_every_tag_has_the_details_for_an_engineer(tmp_path: Path) -> None:
     rig = Rig(tmp_path)
     rig.scan(TagValue(1.5, Quality.GOOD, t_ns=4 * MS))
     rows = rig.rows(later_ms=2)
@@ -101,7 +101,7 @@ def test_patterns() -> None:
         (2.5, {"pump.level": {"value": 2.5, "quality": "substituted"}}),
     ],
 )
-def test_what_programs_see_of_a_bad_input_stands_beside_it(
+def test_the_programs_value_of_a_bad_input_is_shown_next_to_it(
     tmp_path: Path, if_bad: str | float, seen: dict[str, object]
 ) -> None:
     rig = Rig(tmp_path, if_bad)
@@ -111,7 +111,7 @@ def test_what_programs_see_of_a_bad_input_stands_beside_it(
     assert (row["value"], row["quality"], row["reason"], row["seen"]) == (1.5, "bad", "timeout", seen)
 
 
-def test_a_forced_tag_is_simulated_and_says_by_whom_and_since_when(tmp_path: Path) -> None:
+def test_a_forced_tag_is_simulated_and_names_user_and_time(tmp_path: Path) -> None:
     rig = Rig(tmp_path, if_bad=2.5)
     rig.scan(TagValue(1.5, Quality.GOOD, t_ns=4 * MS))
     rig.runner.force("tank.level", 9.0, "ada")  # beyond its limits, to see how the logic reacts to such a sensor value
@@ -140,7 +140,7 @@ def test_a_machine_is_forced_into_states_that_it_has() -> None:
         Door().check("state", 2)
 
 
-def test_what_people_do_is_on_record_before_it_is_done(tmp_path: Path) -> None:
+def test_operator_actions_are_recorded_before_they_are_executed(tmp_path: Path) -> None:
     path = tmp_path / "audit.jsonl"
     path.write_text('{"by":"gateway"}\n')
     acts = Acts(str(path))

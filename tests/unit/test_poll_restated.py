@@ -57,7 +57,7 @@ def test_no_poll_is_lost_or_doubled(old: int, new: int, phase: int, now_ms: int)
 
 @settings(max_examples=60)
 @given(old=PERIODS, new=PERIODS, phase=st.integers(0, 4999), now_ms=st.integers(6000, 20_000))
-def test_a_stated_phase_is_gone_to_within_half_a_period(old: int, new: int, phase: int, now_ms: int) -> None:
+def test_a_stated_phase_is_reached_within_half_a_period(old: int, new: int, phase: int, now_ms: int) -> None:
     schedule = PollSchedule({"a": rate(old)}, ())
     schedule.anchor(0)
     schedule.start(0)
@@ -93,7 +93,7 @@ def test_a_bus_is_spread_as_if_it_had_begun_so(before: list[int], after: int, no
     assert not any(schedule.missed.values())
 
 
-def test_who_is_late_goes_no_sooner() -> None:
+def test_a_late_group_is_not_polled_earlier() -> None:
     schedule = PollSchedule({"a": rate(800)}, ())
     schedule.anchor(0)
     schedule.start(0)
@@ -109,7 +109,7 @@ def test_who_is_late_goes_no_sooner() -> None:
     assert schedule.due_ns["a"] == 2800 * NS_PER_MS
 
 
-def test_what_is_overdue_stays_due_and_what_is_new_is_read_at_once() -> None:
+def test_an_overdue_group_stays_due_and_a_new_one_is_read_at_once() -> None:
     schedule = PollSchedule({"a": rate(1000)}, ())
     schedule.anchor(0)
     schedule.start(0)

@@ -48,18 +48,18 @@ def test_addresses_as_printed_and_as_sent(text: int | str, expected: RegisterRan
 @pytest.mark.parametrize(
     "text", [20001, 50001, 40000, 465537, "holding:65536", "holding:-1", "register:5", "five", 7, "holding:x", ""]
 )
-def test_addresses_that_are_none(text: int | str) -> None:
+def test_invalid_addresses(text: int | str) -> None:
     with pytest.raises(ValueError):
         resolve_address(text, "printed")
 
 
 @given(st.sampled_from(["coil", "discrete", "input", "holding"]), st.integers(0, 65535))
-def test_what_is_shown_can_be_typed(table: str, address: int) -> None:
+def test_a_displayed_address_can_be_typed(table: str, address: int) -> None:
     found = resolve_address(f"{table}:{address}", "sent")
     assert resolve_address(str(found).split(" ", 1)[0], "printed") == found
 
 
-def test_names_that_count_stand_one_behind_the_other() -> None:
+def test_names_with_numbers_are_consecutive() -> None:
     tags = read("protocol: modbus\ntags:\n  voltage_l1..3: {at: 30001, type: float32}\n").tags
     assert [(t.name, t.registers.address) for t in tags.values()] == [
         ("voltage_l1", 0),
@@ -68,7 +68,7 @@ def test_names_that_count_stand_one_behind_the_other() -> None:
     ]
 
 
-def test_the_command_list_is_what_the_profile_says_and_follows_from_it() -> None:
+def test_the_command_list_follows_from_the_profile() -> None:
     profile = load_profile(PROFILES / "ctd-reference.yaml")
     assert profile.command_list == {"read_values", "read_status", "read_identity", "set_period"}
     assert profile.command_for("sample_period_s") == "set_period"
@@ -119,7 +119,7 @@ def test_contradictions_are_found_when_the_file_is_read(text: str, line: int, to
     assert error.value.path == "p.yaml"
 
 
-def test_the_hash_is_of_what_is_said_and_not_of_how() -> None:
+def test_the_hash_depends_on_the_content_and_not_on_the_notation() -> None:
     plain = read("protocol: modbus\ntags:\n  a: {at: 40001}\n")
     styled = read("# a comment\nprotocol: modbus\ntags:\n  a:\n    at: 40001\n")
     other = read("protocol: modbus\ntags:\n  a: {at: 40002}\n")

@@ -50,14 +50,14 @@ def device(name: str, **identity: str) -> RecordedDevice:
         ("aqualabo-c4e", "03 0001 0001", "83 02"),
     ],
 )
-def test_what_nobody_recorded_is_as_the_profile_says(name: str, request_hex: str, reply_hex: str) -> None:
+def test_unrecorded_requests_follow_the_profile(name: str, request_hex: str, reply_hex: str) -> None:
     unit = device(name)
     assert unit.respond(bytes.fromhex(request_hex), 0) == bytes.fromhex(reply_hex)
     assert unit.counters.requests == unit.counters.replies == 1
     assert unit.counters.exceptions == (bytes.fromhex(reply_hex)[0] >= 0x80)
 
 
-def test_what_is_written_reads_back_and_was_held() -> None:
+def test_written_values_read_back_and_were_held() -> None:
     unit = device("delta-vfd-e")
     unit.respond(bytes.fromhex("06 2001 1388"), 5)
     assert unit.respond(bytes.fromhex("03 2001 0001"), 6) == bytes.fromhex("03 02 1388")
@@ -65,12 +65,12 @@ def test_what_is_written_reads_back_and_was_held() -> None:
     assert unit.emulator.executed["set_frequency"] == 1
 
 
-def test_an_identity_of_its_own() -> None:
+def test_a_separate_identity() -> None:
     unit = device("renogy-rover", model="ROVER-7")
     assert unit.respond(bytes.fromhex("03 000C 0008"), 0) == bytes.fromhex("03 10") + b"ROVER-7".ljust(16, b"\0")
 
 
-def test_what_was_recorded_goes_before_the_profile() -> None:
+def test_recorded_answers_precede_the_profile() -> None:
     profile = load_profile(ROOT / "profiles" / "devices" / "eastron-sdm630.yaml")
     odd, reply = bytes.fromhex("04 0000 0001"), bytes.fromhex("04 02 4366")
     replay = ExchangeReplay([Exchange(0.0, 1, odd, reply, 0.02)])

@@ -62,7 +62,7 @@ def written(folder: Path, node: int, **listen: str) -> tuple[System, Prototype]:
     return system, load_prototype(system)
 
 
-def test_buses_of_their_own_are_nobody_elses(tmp_path: Path) -> None:
+def test_private_buses_are_not_shared(tmp_path: Path) -> None:
     written(tmp_path, 5)
     written(tmp_path, 6, CAN0=BUS, CAN1=BUS)
 

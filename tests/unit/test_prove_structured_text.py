@@ -73,7 +73,7 @@ def test_no_key_makes_a_timer_stand_still(key: Any) -> None:
     assert not prove(replace(NEVER, key=key)).proved
 
 
-def test_what_holds_is_proved_without_a_key() -> None:
+def test_true_properties_are_proved_without_a_key() -> None:
     text = MOTOR.replace("motor := delay.Q;", "motor := delay.Q AND NOT start;")
     result = prove(replace(NEVER, make=lambda: program(text)))
     assert (result.proved, result.broken, result.reason) == (True, "", "")
@@ -93,7 +93,7 @@ def test_the_quality_of_an_input_can_be_asked_for() -> None:
     assert prove(gullible).broken  # an input that was never read is 0.0
 
 
-def test_the_first_scan_is_a_state_of_its_own() -> None:
+def test_the_first_scan_is_a_separate_state() -> None:
     text = """PROGRAM P VAR_INPUT go : BOOL; END_VAR VAR_OUTPUT hit : BOOL; END_VAR
       hit := go AND NOT FIRST_SCAN(); END_PROGRAM"""
     proof = Proof(lambda: program(text), {"go": [False, True]}, {"never hit": lambda p: not p.hit})
@@ -114,7 +114,7 @@ def test_global_variables_and_blocks_inside_blocks_are_part_of_the_state() -> No
     assert prove(bounded).proved
 
 
-def test_what_cannot_be_decided_is_not_proved() -> None:
+def test_undecidable_properties_are_not_proved() -> None:
     counting = """PROGRAM P VAR_INPUT go : BOOL; END_VAR VAR_OUTPUT hit : BOOL; END_VAR VAR n : DINT; END_VAR
       IF go THEN n := n + 1; END_IF hit := n = 100000; END_PROGRAM"""
     proof = Proof(lambda: program(counting), {"go": [False, True]}, {"never hit": lambda p: not p.hit})
@@ -125,7 +125,7 @@ def test_what_cannot_be_decided_is_not_proved() -> None:
     assert not result.proved  # the time itself decides, and it is unbounded
 
 
-def test_a_key_that_leaves_out_what_decides_proves_nothing() -> None:
+def test_a_key_that_omits_a_deciding_variable_proves_nothing() -> None:
     text = """PROGRAM P VAR_INPUT go : BOOL; END_VAR VAR_OUTPUT hit : BOOL; END_VAR VAR n : INT; END_VAR
       n := SEL(go, 0, MIN(n + 1, 9)); hit := n >= 4; END_PROGRAM"""
     proof = Proof(lambda: program(text), {"go": [False, True]}, {"never hit": lambda p: not p.hit}, key=lambda p: p.hit)
@@ -149,7 +149,7 @@ class Delayed(Program):
         self.motor = self.delay(scan.now_ns, IN=self.start, PT=50 * MS).Q
 
 
-def test_a_block_of_a_program_in_python_counts_whatever_the_key_says() -> None:
+def test_a_block_of_a_python_program_counts_whatever_the_key_contains() -> None:
     result = prove(replace(NEVER, make=Delayed, key=lambda p: p.motor))
     assert result.broken == "motor never on"
     assert len(result.way) == 6
@@ -157,7 +157,7 @@ def test_a_block_of_a_program_in_python_counts_whatever_the_key_says() -> None:
         prove(replace(NEVER, make=Delayed))
 
 
-def test_a_domain_names_every_input_and_nothing_else() -> None:
+def test_a_domain_names_exactly_the_inputs() -> None:
     for domain in ({}, {"start": [True], "stop": [True]}, {"begin": [True]}):
         with pytest.raises(UsageError, match="names the program's inputs"):
             prove(replace(NEVER, domain=domain))
@@ -172,7 +172,9 @@ BODIES = (
 
 @settings(deadline=None, max_examples=25)
 @given(st.lists(st.sampled_from(BODIES), min_size=1, max_size=3), st.lists(st.tuples(st.booleans(), st.booleans())))
-def test_what_a_random_run_shows_is_never_disproved(bodies: list[str], inputs: list[tuple[bool, bool]]) -> None:
+def test_a_behaviour_seen_in_a_random_run_is_never_disproved(
+    bodies: list[str], inputs: list[tuple[bool, bool]]
+) -> None:
     """Every run of the program itself is one of the paths that the prover examines."""
     text = f"""PROGRAM P VAR_INPUT a, b : BOOL; END_VAR VAR_OUTPUT q : BOOL; END_VAR
       VAR t : TON; f : TOF; p : TP; r : R_TRIG; c : CTU; s : SR; n : INT; any_ : BOOL; END_VAR

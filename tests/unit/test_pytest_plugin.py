@@ -72,13 +72,13 @@ def test_seed_and_target_go_to_the_scenario(pytester: pytest.Pytester, fake: str
     pytester.runpytest_inprocess(*LOADED, *options, "test_one.py").assert_outcomes(passed=1)
 
 
-def test_scenarios_can_be_left_alone(pytester: pytest.Pytester, fake: str) -> None:
+def test_scenarios_can_be_excluded(pytester: pytest.Pytester, fake: str) -> None:
     pytester.makeini("[pytest]\nfieldtwin_scenarios = false\n")
     result = pytester.runpytest_inprocess(*LOADED)
     assert result.ret == pytest.ExitCode.NO_TESTS_COLLECTED
 
 
-def test_what_cannot_run_says_so_in_a_line(pytester: pytest.Pytester) -> None:
+def test_an_impossible_run_is_explained_in_a_line(pytester: pytest.Pytester) -> None:
     pytester.makepyfile(
         """
         import pytest

@@ -114,7 +114,7 @@ async def _hangs_up_at_100(tell: Callable[[str], None], stop: asyncio.Event) -> 
     server.close()
 
 
-def test_what_was_read_before_the_connection_was_lost_is_printed() -> None:
+def test_items_read_before_the_loss_of_the_connection_are_printed() -> None:
     with on_its_own_loop(_hangs_up_at_100) as url:
         result = read(url, "holding:0", "holding:100", "holding:200", "--json")
         table = read(url, "holding:0", "holding:100", "holding:200")

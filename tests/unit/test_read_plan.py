@@ -112,7 +112,7 @@ def test_a_device_with_holes_is_read_whole_with_the_fewest_requests(
 
 
 @given(layout=layouts, most=st.integers(4, 60))
-def test_a_device_that_takes_less_than_its_profile_says_has_borders_and_no_gaps(
+def test_a_device_that_accepts_less_than_its_profile_states_has_limits_and_no_gaps(
     layout: list[tuple[int, str]], most: int
 ) -> None:
     profile = profile_of(layout, read_registers=125, max_gap=4)
@@ -160,7 +160,7 @@ def test_a_device_that_has_nothing_yet_is_asked_for_one_value_until_it_has_all()
     assert [(r.range.address, r.range.count) for r in plan.reads] == [(0, 8)]
 
 
-def test_pairs_are_asked_for_whole_where_the_device_knows_nothing_else() -> None:
+def test_pairs_are_requested_whole_if_the_device_knows_nothing_else() -> None:
     """Eastron: an odd count is refused with 03, an odd address with 02."""
     text = 'device: test/pairs\nsource: "a test"\nprotocol: modbus\nlimits: {even_only: true, max_gap: 0, read_registers: 6}\n'
     tags = 'tags: {a: {at: "holding:1"}, b: {at: "holding:2"}, c: {at: "holding:4"}, d: {at: "holding:7"}}\n'
@@ -185,7 +185,7 @@ def test_a_gap_is_written_as_it_is_read(table: Table, first: int, more: int) -> 
 
 
 @pytest.mark.parametrize("text", ["holding:9..5", "30001..40001", "holding:5..", "..5", "30001..", "coil:1..65536", ""])
-def test_a_range_that_is_none_is_refused(text: str) -> None:
+def test_an_invalid_range_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match=r"."):
         resolve_gap(text, "printed")
 

@@ -48,7 +48,7 @@ def test_a_device_is_at_most_forty_lines_and_cites_its_source(name: str) -> None
 
 
 @pytest.mark.parametrize("name", DEVICES)
-def test_the_shipped_recording_is_what_the_script_makes_and_says_synthetic(name: str, tmp_path: Path) -> None:
+def test_the_shipped_recording_is_the_output_of_the_script_and_marked_synthetic(name: str, tmp_path: Path) -> None:
     make_device_recordings.make(name, tmp_path, make_device_recordings.DEFAULT_SEED)
     assert (tmp_path / f"{name}.jsonl").read_bytes() == (ROOT / "recordings" / f"{name}.jsonl").read_bytes()
     with RecordingReader(ROOT / "recordings" / f"{name}.jsonl") as reader:
@@ -57,7 +57,7 @@ def test_the_shipped_recording_is_what_the_script_makes_and_says_synthetic(name:
 
 
 @pytest.mark.parametrize("name", DEVICES)
-def test_the_driver_reads_what_the_device_was_recorded_with(name: str) -> None:
+def test_the_driver_reads_the_recorded_values_of_the_device(name: str) -> None:
     profile = shipped(name)
     unit = profile.form.factory.unit
 

@@ -177,7 +177,7 @@ HEADERS = {
 
 
 @pytest.mark.parametrize(("text", "says"), HEADERS.values(), ids=HEADERS)
-def test_a_file_that_is_no_recording_is_refused(tmp_path: Path, text: bytes, says: str) -> None:
+def test_a_file_that_is_not_a_recording_is_refused(tmp_path: Path, text: bytes, says: str) -> None:
     path = tmp_path / "r.jsonl"
     path.write_bytes(text)
     with pytest.raises(FileInvalid, match=says) as caught:
@@ -185,7 +185,7 @@ def test_a_file_that_is_no_recording_is_refused(tmp_path: Path, text: bytes, say
     assert (caught.value.path, caught.value.line, caught.value.exit_code) == (str(path), 1, 3)
 
 
-def test_a_missing_file_and_the_wrong_kind_are_said_plainly(tmp_path: Path) -> None:
+def test_a_missing_file_and_the_wrong_kind_are_reported_clearly(tmp_path: Path) -> None:
     with pytest.raises(FileInvalid, match="No such file"):
         RecordingReader(tmp_path / "nothing.jsonl")
     with RecordingWriter(tmp_path / "r.jsonl", EXCHANGES):
@@ -204,7 +204,7 @@ def test_a_recording_is_never_overwritten(tmp_path: Path) -> None:
     assert path.read_bytes() == before
 
 
-def test_writing_what_the_reader_would_refuse_is_a_bug(tmp_path: Path) -> None:
+def test_writing_an_unreadable_record_is_a_bug(tmp_path: Path) -> None:
     with RecordingWriter(tmp_path / "r.jsonl", SIGNALS) as writer:
         with pytest.raises(Bug):
             writer.row(0.0, [1.0])
@@ -293,7 +293,7 @@ def test_reading_needs_memory_for_one_line_only(tmp_path: Path) -> None:
         ('"source":"measured","prototype":true', "tank.jsonl (measured, of an emulator)"),
     ],
 )
-def test_where_it_comes_from_is_said(tmp_path: Path, said: str, told: str) -> None:
+def test_the_source_is_named(tmp_path: Path, said: str, told: str) -> None:
     path = tmp_path / "tank.jsonl"
     path.write_text(f'{{"fieldtwin_recording":1,"device":"mysite/tank","kind":"exchanges",{said}}}\n', encoding="utf-8")
     assert shown(path) == told

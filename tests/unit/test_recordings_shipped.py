@@ -33,7 +33,7 @@ def test_the_script_makes_the_committed_bytes_and_another_seed_others(tmp_path: 
 
 
 @pytest.mark.parametrize("name", SHIPPED)
-def test_shipped_recordings_are_small_and_say_that_they_are_synthetic(name: str) -> None:
+def test_shipped_recordings_are_small_and_marked_synthetic(name: str) -> None:
     path = ROOT / "recordings" / name
     assert path.stat().st_size < 400_000
     with RecordingReader(path) as reader:

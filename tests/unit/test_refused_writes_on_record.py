@@ -39,7 +39,7 @@ def test_a_clients_write_to_a_bad_device_is_on_record(tmp_path: Path) -> None:
     run(main())
 
 
-def test_a_clients_write_to_no_tag_or_with_no_leave_is_on_record(tmp_path: Path) -> None:
+def test_a_clients_write_to_a_missing_tag_or_without_permission_is_recorded(tmp_path: Path) -> None:
     """The server itself refuses these: they concern no device and no tag."""
 
     async def main() -> None:
@@ -52,7 +52,7 @@ def test_a_clients_write_to_no_tag_or_with_no_leave_is_on_record(tmp_path: Path)
     run(main())
 
 
-def test_an_output_that_waits_for_a_device_is_told_once_and_written_when_it_is_back(tmp_path: Path) -> None:
+def test_an_output_that_waits_for_a_device_is_reported_once_and_written_when_it_returns(tmp_path: Path) -> None:
     async def main() -> None:
         async with rig(tmp_path / "a") as r:
             r.bus.field.unplug()

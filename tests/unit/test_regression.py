@@ -62,7 +62,7 @@ def kinds(verdict: Verdict) -> list[tuple[str, str]]:
 RELAY = [state(1, "relay.state", "STANDBY"), state(10, "relay.state", "ACTIVE"), state(50, "relay.state", "STANDBY")]
 
 
-def test_moments_and_bytes_that_nobody_notices_are_no_difference() -> None:
+def test_irrelevant_times_and_bytes_are_not_a_difference() -> None:
     later = [state(e.t_ns / S + 0.4, e.where, e.data["value"]) for e in RELAY]
     values = [tag(t, "ctd.pressure", 10.0 + t / 1000) for t in range(5, 90, 5)]
     other = [tag(t + 0.7, "ctd.pressure", 10.001 + t / 1000) for t in range(5, 90, 5)]
@@ -100,11 +100,11 @@ def test_values_and_qualities_are_the_same_all_the_time(new: list[Event], found:
     assert kinds(judge(new, [tag(5, "ctd.pressure", 10.0)])) == [(found, "ctd.pressure")]
 
 
-def test_what_a_bad_value_last_was_does_not_matter() -> None:
+def test_the_last_value_of_a_bad_tag_does_not_matter() -> None:
     assert judge([tag(5, "ctd.pressure", 10.0, "bad")], [tag(5, "ctd.pressure", None, "bad")]).same
 
 
-def test_tolerance_window_and_what_is_ignored() -> None:
+def test_tolerance_window_and_ignored_items() -> None:
     old, new = [tag(5, "ctd.pressure", 10.0)], [tag(8, "ctd.pressure", 10.4)]
     assert not judge(old, new).same
     assert not judge(old, new, Allowed(share=0.05)).same

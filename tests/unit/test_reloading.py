@@ -102,7 +102,7 @@ def edit(path: Path, *changes: tuple[str, str]) -> None:
         ("remote: remote", "remote: remote\ncommands: {per_minute: 6}", "commands.per_minute: 60 -> 6"),
     ],
 )
-def test_what_can_be_taken_over(plant: Path, old: str, new: str, says: str | None) -> None:
+def test_reloadable_changes(plant: Path, old: str, new: str, says: str | None) -> None:
     before = load_system(str(plant))
     edit(plant, (old, new))
     if says is None:
@@ -131,7 +131,7 @@ def test_what_can_be_taken_over(plant: Path, old: str, new: str, says: str | Non
         ("tank", "unit: m", "unit: cm", "7:41", "test/tank: tags.level.unit"),
     ],
 )
-def test_what_needs_a_restart_is_named_with_its_place(
+def test_changes_that_need_a_restart_are_named_with_their_place(
     plant: Path, file: str, old: str, new: str, where: str, what: str
 ) -> None:
     before = load_system(str(plant))
@@ -143,7 +143,7 @@ def test_what_needs_a_restart_is_named_with_its_place(
     assert (stuck[0].where, stuck[0].what) == (f"{changed}:{where}", what)
 
 
-def test_what_the_files_name_is_not_forgotten(plant: Path) -> None:
+def test_the_files_named_in_the_system_file_are_compared_too(plant: Path) -> None:
     """No reloadable key explains the change: the same profile text in a different file is no difference, a different text is."""
     before = load_system(str(plant))
     (plant.parent / "copy.yaml").write_text(TANK, encoding="utf-8")
@@ -151,7 +151,7 @@ def test_what_the_files_name_is_not_forgotten(plant: Path) -> None:
     assert [c.live for c in compare(before, load_system(str(plant)))] == [False]
 
 
-def test_profiles_are_compared_and_limits_are_told_to_the_plc(plant: Path) -> None:
+def test_profiles_are_compared_and_limits_are_sent_to_the_plc(plant: Path) -> None:
     before = load_system(str(plant))
     edit(plant.with_name("tank.yaml"), ("range: [0, 50]", "range: [0, 20]"), ("volume: {", "volume: {range: [0, 1], "))
     new = load_system(str(plant))
@@ -266,7 +266,7 @@ def test_a_node_is_polled_at_its_new_period(plant: Path, loop: VirtualLoop) -> N
     running(plant, loop, scenario)
 
 
-def test_scaling_counts_at_once_also_for_what_is_read_only_once(plant: Path, loop: VirtualLoop) -> None:
+def test_scaling_applies_at_once_also_to_values_that_are_read_only_once(plant: Path, loop: VirtualLoop) -> None:
     async def scenario(p: Running) -> None:
         assert p.value("tank.level").value == pytest.approx(7.5)
         assert p.value("tank.size").value == 8
@@ -287,7 +287,7 @@ def test_scaling_counts_at_once_also_for_what_is_read_only_once(plant: Path, loo
     running(plant, loop, scenario)
 
 
-def test_outputs_are_written_anew_as_the_new_scaling_has_them(plant: Path, loop: VirtualLoop) -> None:
+def test_outputs_are_written_again_according_to_the_new_scaling(plant: Path, loop: VirtualLoop) -> None:
     async def scenario(p: Running) -> None:
         def held() -> int:
             return p.run.field.devices["tank"].unit.bank.read("holding", 1, 1, loop.now_ns)[0]  # type: ignore[union-attr]
@@ -309,7 +309,7 @@ def test_outputs_are_written_anew_as_the_new_scaling_has_them(plant: Path, loop:
     running(plant, loop, scenario)
 
 
-def test_a_value_that_the_new_limits_forbid_is_a_refused_output_and_the_gateway_goes_on(
+def test_a_value_that_the_new_limits_forbid_is_a_refused_output_and_the_gateway_continues(
     plant: Path, loop: VirtualLoop
 ) -> None:
     """Defect: the comparison of the held value with the device raised `NotAllowed`, the gateway died, and the safe value was
@@ -345,7 +345,7 @@ def test_limits_hold_for_forces_and_for_writes(plant: Path, loop: VirtualLoop) -
     running(plant, loop, scenario)
 
 
-def test_what_is_fresh_is_not_made_stale_by_a_shorter_limit(plant: Path, loop: VirtualLoop) -> None:
+def test_a_fresh_value_is_not_made_stale_by_a_shorter_limit(plant: Path, loop: VirtualLoop) -> None:
     async def scenario(p: Running) -> None:
         stale: list[str] = []
         p.run.gateway.tags.on_put = lambda name, value: stale.append(name) if not value.good else None

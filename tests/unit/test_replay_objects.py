@@ -48,7 +48,7 @@ def recorded(policy: WhenUsedUp = WhenUsedUp.HOLD) -> tuple[Rig, RecordedObjects
     return Rig(RICH, NodeContext(source=objects, factory=objects.initial)), objects
 
 
-def test_what_was_read_and_what_pdos_carried() -> None:
+def test_read_values_and_values_in_pdos() -> None:
     rig, objects = recorded()
     assert objects.duration_s == pytest.approx(0.4)
     assert rig.read(0x1018, 4) == 0xDEADBEEF
@@ -62,7 +62,7 @@ def test_what_was_read_and_what_pdos_carried() -> None:
     assert rig.read(0x2002) == 0x789A, "holds"
 
 
-def test_what_the_recorded_master_wrote_is_a_setting() -> None:
+def test_a_write_of_the_recorded_master_is_a_setting() -> None:
     rig, _ = recorded()
     assert rig.read(0x2006) == 0x63, "as it was before it was written"
     assert rig.write(0x2006, 0, 7, 2) == ""
@@ -82,14 +82,14 @@ def answered(values: str, policy: WhenUsedUp = WhenUsedUp.HOLD) -> Rig:
 
 
 @pytest.mark.parametrize(("policy", "then"), [(WhenUsedUp.HOLD, [3, 3]), (WhenUsedUp.LOOP, [1, 2])])
-def test_what_was_asked_for_answers_read_by_read_however_fast(policy: WhenUsedUp, then: list[int]) -> None:
+def test_requested_values_answer_read_by_read_at_any_rate(policy: WhenUsedUp, then: list[int]) -> None:
     rig = answered("01 02 02 03", policy)
     assert [rig.read(0x2002) for _ in range(4)] == [1, 2, 2, 3], "all at one instant"
     assert rig.read(0x2006) == 0x63, "each object on its own"
     assert [rig.read(0x2002) for _ in range(2)] == then
 
 
-def test_what_was_asked_for_is_used_up() -> None:
+def test_requested_values_are_used_up() -> None:
     rig = answered("01 02", WhenUsedUp.ERROR)
     rig.advance(100)
     assert [rig.read(0x2002), rig.read(0x2002)] == [1, 2]
@@ -97,7 +97,7 @@ def test_what_was_asked_for_is_used_up() -> None:
         rig.read(0x2002)
 
 
-def test_what_was_only_ever_aborted_is_aborted_again() -> None:
+def test_a_request_that_was_always_aborted_is_aborted_again() -> None:
     aborted = ["(1.0) can0 605#4002200000000000", "(1.1) can0 585#8002200000000606"]
     at_times = ["(2.0) can0 605#4006200000000000", "(2.1) can0 585#8006200022000008", *aborted]
     log = [*LOG.splitlines()[:4], *at_times]

@@ -51,7 +51,7 @@ def test_a_download_and_its_abort() -> None:
     assert (found.abort, found.problem, found.value, found.access) == (0x06090030, "abort", 500, "write")
 
 
-def test_a_transfer_that_nobody_answers() -> None:
+def test_an_unanswered_transfer() -> None:
     found = exchanges(observatory(), [can(1, "605#4018100400000000"), can(500, "605#4018100400000000")])
     assert [(e.t_ns // MS, e.problem, e.value) for e in found] == [(1, "no reply", None), (500, "no reply", None)]
 
@@ -71,7 +71,7 @@ def write(t_ms: float, index: int, sub: int, value: int) -> list[Event]:
     ]
 
 
-def test_a_mapping_is_learnt_from_what_is_written() -> None:
+def test_a_mapping_is_learned_from_writes() -> None:
     """TPDO1 is moved to a different identifier with one of its two objects, as a configuration tool would do."""
     moved = [*write(0, 0x1800, 1, 0x8000_0185), *write(2, 0x1A00, 0, 0), *write(4, 0x1A00, 1, 0x6020_0010)]
     moved += [*write(6, 0x1A00, 0, 1), *write(8, 0x1800, 1, 0x0000_01A5)]
@@ -92,7 +92,7 @@ def test_a_mapping_that_was_refused_is_not_learnt() -> None:
     assert exchanges(observatory(), [*refused, can(10, "185#9E013500")])[-1].tags["slope_long"] == 4.14
 
 
-def test_a_pdo_that_is_too_short_says_nothing() -> None:
+def test_a_too_short_pdo_gives_no_values() -> None:
     found = only([can(1, "185#9E01")])
     assert (found.problem, found.tags) == ("malformed", {})
 
@@ -118,7 +118,7 @@ def test_messages(frame: str, service: str, text: str, value: object) -> None:
     assert (found.service, found.text, found.value, found.ok) == (service, text, value, True)
 
 
-def test_frames_that_are_no_canopen() -> None:
+def test_frames_outside_canopen() -> None:
     odd = [can(0, "18DA00F1#01", ext=True), can(1, "000#", err=True), can(2, "705#", rtr=True), can(3, "6E1#00")]
     odd += [
         note(4, Kind.FRAME, "can0", id=1 << 31, bytes="00", dir="sent"),
@@ -212,7 +212,7 @@ def test_any_frames_are_described(frames: list[tuple[int, bytes]]) -> None:
     exchanges(observatory(), events)
 
 
-def test_what_is_no_frame_has_words_too() -> None:
+def test_invalid_frames_are_described_too() -> None:
     events = [
         note(0, Kind.TAG, "ctd.pressure", value=12.5, quality="good", reason="none"),
         note(0, Kind.TAG, "ctd.status", value=1, quality="bad", reason="timeout"),
@@ -245,7 +245,7 @@ def test_a_segment_that_was_lost_comes_again() -> None:
     assert bytes(done.data) == b"abcdefghijklmnopqrstu"
 
 
-def test_secrets_have_no_value_in_words_nor_in_json() -> None:
+def test_secrets_have_no_value_in_text_nor_in_json() -> None:
     system = observatory()
     tags = system.devices["inclinometer"].profile.tags
     hidden = {name: replace(tag, secret=name in ("serial", "slope_lateral")) for name, tag in tags.items()}

@@ -34,7 +34,7 @@ def texts(events: list[Event]) -> list[str]:
     return [decoder.decode(e).text for e in events]
 
 
-def test_a_read_in_words_and_values() -> None:
+def test_a_read_as_text_and_values() -> None:
     events = [ask(10, READ_CTD), answer(25, CTD_VALUES)]
     assert texts(events) == [
         "ctd: read input registers 30001 (input:0) x 10",
@@ -60,7 +60,7 @@ def test_a_write_has_the_values_it_wrote() -> None:
     assert found.text == "ctd: write registers 40002 (holding:1): sample_period_s -1 s"
 
 
-def test_values_have_the_words_of_the_profile() -> None:
+def test_values_use_the_texts_of_the_profile() -> None:
     assert texts([ask(0, "03 0000 0001"), answer(5, "03 02 0001")])[1] == "ctd: status 1 (sampling)"
 
 
@@ -109,13 +109,13 @@ def test_a_reply_that_comes_twice_is_a_stray() -> None:
     assert [e.problem for e in found] == ["", "stray"]
 
 
-def test_a_reply_to_something_else_is_malformed() -> None:
+def test_a_reply_to_a_different_request_is_malformed() -> None:
     found = only([ask(0, "06 0001 0005"), answer(5, "06 0001 0006")])
     assert found.problem == "malformed"
     assert "acknowledges something else" in found.reply_text
 
 
-def test_tcp_replies_are_told_by_their_transaction() -> None:
+def test_tcp_replies_are_matched_by_their_transaction() -> None:
     first, second = adu(1, "03 0022 0001"), adu(2, "03 0022 0001")
     late = adu(1, "03 02 0009") + adu(2, "03 02 0008")
     events = [chunk(0, True, first, "lan"), chunk(50, True, second, "lan"), chunk(60, False, late, "lan")]
@@ -140,7 +140,7 @@ def test_a_header_that_cannot_be_right_is_noise() -> None:
     assert decoded.text == "8 bytes of noise (a header that cannot be right)"
 
 
-def test_an_echo_is_no_reply() -> None:
+def test_an_echo_is_not_a_reply() -> None:
     wire = ModbusWire("line1", "rtu", {1: Unit("ctd", TagMap(observatory().devices["ctd"].profile))}, echo=True)
     asked = with_crc(bytes.fromhex("01 06 0001 0005"))  # a write's reply looks like its echo
     assert wire.feed(True, asked, 0)[1] == []
@@ -150,7 +150,7 @@ def test_an_echo_is_no_reply() -> None:
     assert done[0].ok
 
 
-def test_a_served_wire_is_asked_by_the_far_end() -> None:
+def test_a_served_wire_is_requested_by_the_remote_side() -> None:
     wire = ModbusWire("hmi", "mbap", {}, served=True)
     request = adu(5, "04 0000 0002", unit=255)
     assert wire.feed(False, request[:4], 0) == (["4 bytes of a request"], [])
@@ -188,7 +188,7 @@ def test_ascii() -> None:
         ("2B 0E 01 00", []),
     ],
 )
-def test_what_requests_touch(pdu: str, spans: list[Span]) -> None:
+def test_the_addresses_of_requests(pdu: str, spans: list[Span]) -> None:
     asked = parse_request(bytes.fromhex(pdu))
     assert (list(asked.spans), asked.problem) == (spans, "")
 
@@ -232,7 +232,7 @@ def test_chunk_borders_mean_nothing(data: st.DataObject) -> None:
     st.sampled_from(["rtu", "ascii", "mbap"]), st.lists(st.tuples(st.booleans(), st.binary(max_size=40)), max_size=12)
 )
 @settings(max_examples=60)
-def test_any_bytes_are_described_and_none_is_lost(framing: str, chunks: list[tuple[bool, bytes]]) -> None:
+def test_any_bytes_are_described_completely(framing: str, chunks: list[tuple[bool, bytes]]) -> None:
     wire = ModbusWire("line1", framing, {1: Unit("ctd", TagMap(observatory().devices["ctd"].profile))})
     for t_ns, (sent, data) in enumerate(chunks):
         said, _ = wire.feed(sent, data, t_ns)
@@ -244,7 +244,7 @@ def test_any_bytes_are_described_and_none_is_lost(framing: str, chunks: list[tup
     assert [f.t_ns for f in frames] == sorted(f.t_ns for f in frames)
 
 
-def test_on_tcp_an_answer_ends_what_was_asked_before() -> None:
+def test_on_tcp_an_answer_ends_earlier_requests() -> None:
     """One request at a time: the next answer shows that the first request was given up, and its own comes too late."""
     events = [chunk(0, True, adu(1, "03 0022 0001"), "lan"), chunk(50, True, adu(2, "03 0022 0001"), "lan")]
     decoder = Decoder(observatory())
@@ -281,7 +281,7 @@ def test_an_answer_in_pieces_over_the_next_request_is_whole() -> None:
     assert [e.tags["inbox_ack"] for e in found] == ["0009", "0008"]
 
 
-def test_secrets_have_no_value_in_words() -> None:
+def test_secrets_have_no_value_in_text() -> None:
     wire = ModbusWire("line1", "rtu", {1: Unit("meter", TagMap(load_profile(METER)))})
     words = wire.feed(True, with_crc(bytes.fromhex("01 10 000E 0002 04 447A0000")), 0)[0]
     assert words == ["meter: write registers 40015 (holding:14) x 2: password (secret)"]

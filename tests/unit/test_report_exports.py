@@ -52,7 +52,7 @@ def test_junit_counts_and_properties() -> None:
     assert (facts["target"], facts["seed"], facts["reproduce"]) == ("virtual", "7", "fieldtwin test a.yaml")
 
 
-def test_junit_tells_a_failure_and_how_to_run_it_again() -> None:
+def test_junit_describes_a_failure_and_how_to_repeat_it() -> None:
     (case,) = cases(result(Verdict.FAILED, reproduce="fieldtwin test a.yaml --seed 7", requirements=("R-1", "R-2")))
     assert (case.get("name"), case.get("classname")) == ("a & b [seed 7]", "observatory.virtual")
     assert case.get("time") == "0.500"
@@ -65,7 +65,7 @@ def test_junit_tells_a_failure_and_how_to_run_it_again() -> None:
     assert [p.get("value") for p in case.findall("./properties/property")] == ["a.yaml:12", "R-1", "R-2"]
 
 
-def test_junit_never_passes_what_was_not_judged() -> None:
+def test_junit_never_passes_a_missing_verdict() -> None:
     skipped, inconclusive, passed = cases(
         result(Verdict.SKIPPED), result(Verdict.INCONCLUSIVE, reason="late"), result(Verdict.PASSED)
     )
@@ -180,7 +180,7 @@ def test_a_place_that_cannot_be_written(tmp_path: Path) -> None:
         write_junit(Report("x", []), tmp_path)
 
 
-def test_what_pytest_s_own_reader_wants(tmp_path: Path) -> None:
+def test_junit_satisfies_pytests_own_reader(tmp_path: Path) -> None:
     """The attributes and order that pytest's xunit2 writes: properties first, then the verdict, then the output."""
     (case,) = cases(result(Verdict.FAILED, requirements=("R-1",)))
     assert [child.tag for child in case] == ["properties", "failure", "system-out"]

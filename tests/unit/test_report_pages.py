@@ -95,7 +95,7 @@ def page(of: Report) -> Page:
     return found
 
 
-def test_a_failure_is_told_with_all_that_is_around_it() -> None:
+def test_a_failure_is_reported_with_its_context() -> None:
     said = page(
         report(scenario(), requirements={"R-1": "replies are asked for again", "R-2": "the plant is safe"})
     ).said
@@ -109,7 +109,7 @@ def test_a_failure_is_told_with_all_that_is_around_it() -> None:
         assert words in said, words
 
 
-def test_coverage_says_what_is_missing() -> None:
+def test_coverage_lists_missing_items() -> None:
     said = page(report(scenario())).said
     assert "7 of 8 read" in said
     assert "Never: sample_period_s (written) serial (read)" in said
@@ -166,7 +166,7 @@ def test_a_failure_without_a_trace() -> None:
     assert "There is no trace of it" in page(report(scenario(checks=(never,)))).said
 
 
-def test_what_a_full_trace_lost_is_said() -> None:
+def test_losses_of_a_full_trace_are_reported() -> None:
     late = [e for e in TRACE if e.t_ns > 12_500 * MS]
     assert "no longer holds the beginning" in page(report(scenario(trace=late, dropped=500))).said
 
@@ -259,7 +259,7 @@ def test_a_place_that_cannot_be_written(tmp_path: Path) -> None:
         write_html(report(), tmp_path / "new" / "r.html" / "r.html")
 
 
-def test_what_is_thinned_still_reaches_the_failure() -> None:
+def test_a_thinned_drawing_still_reaches_the_failure() -> None:
     """However much happens in a window, its end is drawn, because the failure is there."""
     crowd: list[Event] = []
     for n in range(5000):
@@ -274,7 +274,7 @@ def test_what_is_thinned_still_reaches_the_failure() -> None:
     assert "bad" in {s.quality for s in window.tags["ctd.pressure"]}
 
 
-def test_a_tag_that_was_never_published_has_a_lane_that_says_so() -> None:
+def test_a_tag_that_was_never_published_has_a_lane_with_that_remark() -> None:
     check = replace(FAILED, names=("ctd.conductivity", "ctd.pressure"))
     said = page(report(scenario(checks=(check,)))).said
     assert "ctd.conductivity never published" in said.replace("ctd.conductivity ctd.conductivity", "ctd.conductivity")
@@ -291,7 +291,7 @@ def test_secrets_are_not_in_the_page() -> None:
     assert "44 7a" not in html.lower()
 
 
-def test_what_was_refused_is_not_covered() -> None:
+def test_refused_registers_are_not_covered() -> None:
     counts = Collector(observatory())
     counts.feed(ask(0, "03 0064 0004"))
     counts.feed(answer(5, "83 02"))
@@ -300,7 +300,7 @@ def test_what_was_refused_is_not_covered() -> None:
     assert (serial.read, serial.refused, serial.missing) == (0, 1, ["read"])
 
 
-def test_a_wire_of_no_system_is_decoded_as_what_is_spoken_there() -> None:
+def test_a_wire_without_a_system_is_decoded_by_its_protocol() -> None:
     """Conformance: a third-party client sends requests."""
     events = [chunk(13_000, False, adu(1, "03 0000 0001"), "listen"), chunk(13_020, True, adu(1, "83 06"), "listen")]
     judged = scenario(trace=events, requirements=())

@@ -36,7 +36,7 @@ def shown(*args: str | Path) -> list[str]:
     return result.stdout.splitlines()
 
 
-def test_words(trace: Path) -> None:
+def test_trace_as_text(trace: Path) -> None:
     assert shown(trace, "observatory", "--only", "ctd", "--from", "12.3s", "--to", "12.42s") == [
         "   12.303000  tag         ctd.pressure none dbar, bad: timeout",
         "   12.403000  line1 →     ctd: read holding registers 40001 (holding:0) x 2",
@@ -75,7 +75,7 @@ def test_a_capture(tmp_path: Path) -> None:
     ]
 
 
-def test_files_that_are_none(tmp_path: Path) -> None:
+def test_invalid_files(tmp_path: Path) -> None:
     path = tmp_path / "a.jsonl"
     good = msgspec.json.encode((1, "note", "run", {"text": "began"}))
     for bad in (b"nonsense", b'[1,"sound","x",{}]', b'[1,"note","x"]', b'["1","note","x",{}]'):

@@ -11,7 +11,7 @@ from fieldtwin.gateway.core.errors import Unreachable
 
 
 @pytest.mark.parametrize("lines", [0, 1])
-def test_only_what_holds_something_is_left_by_an_error(tmp_path: Path, lines: int) -> None:
+def test_an_error_leaves_only_files_with_content(tmp_path: Path, lines: int) -> None:
     path = tmp_path / "meter.jsonl"
 
     def record() -> None:
@@ -31,7 +31,7 @@ def test_an_empty_recording_that_was_wanted_stays(tmp_path: Path) -> None:
     assert (tmp_path / "quiet.log").exists()
 
 
-def test_a_file_of_somebody_else_stays(tmp_path: Path) -> None:
+def test_a_foreign_file_stays(tmp_path: Path) -> None:
     (tmp_path / "meter.jsonl").write_text("mine")
     with pytest.raises(Exception, match="exists already"), RotatingFile(tmp_path / "meter.jsonl"):
         pass

@@ -21,7 +21,7 @@ def counts(
     return row | {"unanswered_at_stop": unanswered_at_stop(row, devices)}
 
 
-def test_reply_under_way_when_the_gateway_stops_is_no_error() -> None:
+def test_reply_in_transit_when_the_gateway_stops_is_not_an_error() -> None:
     assert exchange_checks({"can0": counts(236, 235, 236)}) == []
 
 

@@ -54,7 +54,7 @@ def test_hash_and_sink_have_every_event_in_order(count: int) -> None:
     assert trace.hexdigest() == digest
 
 
-def test_what_is_pending_is_in_the_sink_once_that_is_closed() -> None:
+def test_pending_events_are_in_the_sink_after_closing() -> None:
     sink = _Kept()
     trace = Trace(sink=sink)
     for event in some(3):

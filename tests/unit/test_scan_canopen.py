@@ -50,7 +50,7 @@ def test_a_silent_bus_is_asked_and_nothing_but_reads_is_sent() -> None:
     run_virtually(main())
 
 
-def test_traffic_is_listened_to_and_not_answered_without_leave() -> None:
+def test_with_traffic_a_scan_only_listens_without_permission() -> None:
     async def main() -> None:
         nodes = [PeerNode(3, WHOLE, heartbeat_s=0.5), PeerNode(9, WHOLE)]
         peers = PeerBus(nodes)
@@ -69,7 +69,7 @@ def test_traffic_is_listened_to_and_not_answered_without_leave() -> None:
     run_virtually(main())
 
 
-def test_a_node_that_another_master_speaks_to_is_left_alone() -> None:
+def test_a_node_that_another_master_uses_is_not_asked() -> None:
     async def main() -> None:
         nodes = [PeerNode(3, WHOLE), PeerNode(9, WHOLE)]
         peers = PeerBus(nodes)

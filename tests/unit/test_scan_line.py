@@ -40,7 +40,7 @@ async def scan(line: UartLine, url: str = PORT, **options: object) -> ModbusScan
 
 @given(st.binary(max_size=20), st.sampled_from(LIKELY))
 @settings(max_examples=30, deadline=None)
-def test_the_model_gives_back_what_was_sent_at_the_same_settings(data: bytes, line: SerialSettings) -> None:
+def test_the_model_returns_the_sent_bytes_at_the_same_settings(data: bytes, line: SerialSettings) -> None:
     got = sampled(levels(data, line), line, line)
     assert (got.data, got.parity, got.frame) == (data, 0, 0)
 
@@ -65,7 +65,7 @@ def test_a_silent_line_gives_up_its_settings_to_the_quick_pass(hidden: str) -> N
 
 @pytest.mark.parametrize("counts", [True, False])
 @pytest.mark.parametrize("hidden", ["9600 8N1", "19200 8E1", "38400 8O1", "57600 8E1", "4800 8N1"])
-def test_traffic_tells_settings_and_units_and_nothing_is_sent(hidden: str, counts: bool) -> None:
+def test_traffic_reveals_settings_and_units_and_nothing_is_sent(hidden: str, counts: bool) -> None:
     async def main() -> None:
         baudrate, frame = hidden.split()
         talk = (exchange(5, 1234), exchange(9, 99), (exchange(30, 0)[0], None))
@@ -109,7 +109,7 @@ def test_listening_only_sends_nothing_on_a_silent_line_either() -> None:
     run_virtually(main())
 
 
-def test_noise_is_no_modbus() -> None:
+def test_noise_is_not_modbus() -> None:
     async def main() -> None:
         line = UartLine({}, counts=True, chatter=((bytes(range(1, 60)), None), (b"$GPGGA,120000*47\r\n", None)))
         found = await scan(line, share_bus=True)
@@ -119,7 +119,7 @@ def test_noise_is_no_modbus() -> None:
     run_virtually(main())
 
 
-def test_every_unit_is_asked_within_the_time_that_theory_says() -> None:
+def test_every_unit_is_asked_within_the_theoretical_time() -> None:
     async def main() -> None:
         line = UartLine({17: meter()})
         found = await scan(line, f"{PORT}?baudrate=9600&frame=8N1", timeout_s=0.05, per_s=1000, listen_s=0)
@@ -163,7 +163,7 @@ def test_damaged_answers_are_asked_for_again_and_reported() -> None:
     run_virtually(main())
 
 
-def test_an_exception_is_a_presence_and_an_echo_is_none() -> None:
+def test_an_exception_proves_presence_and_an_echo_does_not() -> None:
     async def main() -> None:
         line = UartLine({1: unit(bank([Span("input", 5, 1)]))}, echo=True)
         found = await scan(line, f"{PORT}?baudrate=9600&frame=8N1", units=(1, 2), listen_s=0)
@@ -173,7 +173,7 @@ def test_an_exception_is_a_presence_and_an_echo_is_none() -> None:
     run_virtually(main())
 
 
-def test_stopping_keeps_what_was_found() -> None:
+def test_stopping_keeps_the_results() -> None:
     async def main() -> None:
         line = UartLine({n: meter() for n in range(1, 200)})
         seen: list[Progress] = []
@@ -213,7 +213,7 @@ def test_listening_to_anything_counts_it_and_never_fails(chunks: list[bytes]) ->
     assert 0 <= heard.good_bytes <= heard.bytes
 
 
-def test_quick_ends_with_the_quick_pass_where_somebody_answers_too() -> None:
+def test_quick_ends_with_the_quick_pass_also_with_results() -> None:
     async def main() -> None:
         found = await scan(UartLine({1: meter(), 200: meter()}), quick_only=True)
         assert [f.answer.unit for f in found.units] == [1]
@@ -237,7 +237,7 @@ def test_the_quick_pass_takes_30_s_and_tries_likely_settings_with_likely_units()
 
 
 @pytest.mark.parametrize("said", ["baudrate=14400", "frame=8E1"])
-def test_what_is_said_of_the_settings_is_kept_and_the_rest_is_tried(said: str) -> None:
+def test_given_settings_are_kept_and_the_rest_is_tried(said: str) -> None:
     async def main() -> None:
         line = UartLine({2: meter()}, SerialSettings(14400 if "14400" in said else 4800, "8E1"))
         found = await scan(line, f"{PORT}?{said}", listen_s=0)
@@ -264,7 +264,7 @@ def test_a_master_that_was_silent_for_long_ends_the_asking() -> None:
     run_virtually(main())
 
 
-def test_unproved_settings_are_not_sent_at_unless_they_are_said() -> None:
+def test_unproved_settings_are_not_used_for_sending_unless_given() -> None:
     async def main() -> None:
         line = UartLine({7: meter()}, SerialSettings(9600, "8E1"), chatter=(exchange(5, 1), exchange(6, 2)))
         found = await scan(line, share_bus=True, units=(7,))

@@ -62,7 +62,7 @@ def value(number: int) -> bytes:
     return bytes([3, 2, 0, number])
 
 
-def test_units_behind_a_gateway_are_told_from_those_that_it_says_are_missing() -> None:
+def test_units_of_a_gateway_are_distinguished_from_missing_ones() -> None:
     async def main() -> None:
         host = Host(lambda u: value(u) if u in (3, 7) else b"\x83\x02" if u == 9 else b"\x83\x0b")
         found = await scan(host)
@@ -116,7 +116,7 @@ def test_four_new_meters_that_read_zero_are_not_called_one() -> None:
     run_virtually(main())
 
 
-def test_a_unit_at_which_the_host_hangs_up_is_told_and_the_others_are_asked() -> None:
+def test_a_unit_at_which_the_host_disconnects_is_reported_and_the_others_are_asked() -> None:
     async def main() -> None:
         host = Host(lambda u: b"" if u == 2 else value(u))
         found = await scan(host, units=(1, 2, 3))
@@ -148,7 +148,7 @@ def test_a_real_server_of_ours_is_found() -> None:
 
 @given(st.lists(st.binary(max_size=30), max_size=12), st.sampled_from(["rtu", "ascii", "mbap", "udp"]))
 @settings(max_examples=80, deadline=None)
-def test_a_sweep_ends_whatever_arrives_and_finds_only_whom_it_asked(chunks: list[bytes], framing: str) -> None:
+def test_a_sweep_ends_for_any_input_and_finds_only_requested_units(chunks: list[bytes], framing: str) -> None:
     units = (1, 2, 3)
     sweep = UnitSweep(framing, units, timeout_ns=50_000_000)  # type: ignore[arg-type]
     now_ns, sends = 0, 0

@@ -86,7 +86,7 @@ def test_co030_nothing_at_all_is_one_empty_segment() -> None:
 
 
 @pytest.mark.parametrize("size", [0, 128, 255])
-def test_co014_a_block_size_that_is_none(size: int) -> None:
+def test_co014_an_invalid_block_size(size: int) -> None:
     transfer = SdoBlockDownload(5, 0x2000, 0, TIMEOUT, bytes(20))
     transfer.start(0)
     refused(feed(transfer, f"A4 00 20 00 {size:02X} 00 00 00"), 0x0504_0002)
@@ -98,7 +98,7 @@ def test_co014_a_block_size_that_is_none(size: int) -> None:
 
 
 @pytest.mark.parametrize(("block", "switch"), [(0, 0), (128, 0), (63, 256), (63, -1)])
-def test_what_no_block_upload_can_be_is_the_callers_fault(block: int, switch: int) -> None:
+def test_an_impossible_block_upload_is_an_error_of_the_caller(block: int, switch: int) -> None:
     with pytest.raises(UsageError):
         SdoBlockUpload(5, 0x2000, 0, TIMEOUT, block=block, switch_bytes=switch)
 
@@ -219,7 +219,7 @@ DELAYS = st.lists(st.sampled_from([0, 0, 0, 1, 5, 300, 700]), max_size=40)
 
 @settings(max_examples=150, deadline=None)
 @given(value=st.binary(max_size=150), block=st.integers(1, 9), fates=FATES, delays=DELAYS, sized=st.booleans())
-def test_an_upload_over_any_wire_is_right_or_none(
+def test_an_upload_over_any_wire_is_right_or_fails(
     value: bytes, block: int, fates: list[int], delays: list[int], sized: bool
 ) -> None:
     server = BlockServer({MUX: value}, sized=sized)
@@ -232,7 +232,7 @@ def test_an_upload_over_any_wire_is_right_or_none(
 
 @settings(max_examples=150, deadline=None)
 @given(value=st.binary(max_size=150), block=st.integers(1, 9), fates=FATES, delays=DELAYS, early=st.booleans())
-def test_a_download_over_any_wire_is_right_or_none(
+def test_a_download_over_any_wire_is_right_or_fails(
     value: bytes, block: int, fates: list[int], delays: list[int], early: bool
 ) -> None:
     server = BlockServer({}, block=block, early=early)

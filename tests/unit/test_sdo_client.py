@@ -208,7 +208,7 @@ def test_co022_the_time_out_starts_again_with_each_segment_and_not_with_garbage(
         "C1 08 10 00 01 02 03 04",
     ],
 )
-def test_co005_co023_co024_co026_what_is_no_reply_is_passed_over(stray: str) -> None:
+def test_co005_co023_co024_co026_foreign_replies_are_ignored(stray: str) -> None:
     transfer = upload()
     assert isinstance(feed(transfer, stray), Stray)
     assert feed(transfer, "4F 08 10 00 2A 00 00 00") == Done(b"\x2a")

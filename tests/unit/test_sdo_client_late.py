@@ -25,21 +25,21 @@ def drained(end: MemoryEnd) -> list[CanFrame]:
     return frames
 
 
-def test_what_nothing_is_outstanding_for_is_asked_at_once() -> None:
+def test_an_object_without_an_outstanding_reply_is_requested_at_once() -> None:
     late = LateReplies()
     late.unanswered(M)
     assert late.is_ambiguous(M)
     assert not late.is_ambiguous(N)
 
 
-def test_a_reply_settles_what_was_asked_before_it() -> None:
+def test_a_reply_settles_earlier_requests() -> None:
     late = LateReplies()
     late.unanswered(M)
     late.answered(N)
     assert not late.is_ambiguous(M)
 
 
-def test_a_reply_that_may_be_the_late_one_settles_only_what_is_older() -> None:
+def test_a_reply_that_may_be_the_late_one_settles_only_older_requests() -> None:
     late = LateReplies()
     for request in (M, N, PROBES[0], PROBES[0]):
         late.unanswered(request)
@@ -59,7 +59,7 @@ def test_a_boot_up_settles_all() -> None:
     assert not late.is_ambiguous(M)
 
 
-def test_probes_differ_from_what_is_outstanding_while_they_can_and_the_record_is_bounded() -> None:
+def test_probes_differ_from_outstanding_requests_while_possible_and_the_record_is_bounded() -> None:
     late = LateReplies()
     asked = []
     for _ in range(2 * MAX_OUTSTANDING):

@@ -105,13 +105,13 @@ def test_the_brokers_password_may_stand_in_a_file(tmp_path: Path, monkeypatch: p
     assert WORD not in f"{place}{carrier._broker!r}"  # type: ignore[attr-defined]
 
 
-def test_what_is_shown_of_the_options_has_no_token() -> None:
+def test_displayed_options_contain_no_token() -> None:
     assert WORD not in repr(RunOptions("observatory", True, token=WORD))
 
 
 @settings(max_examples=40)
 @given(user=TEXT, password=TEXT, host=st.sampled_from(["db", "127.0.0.1:5432", "[::1]:1883"]))
-def test_no_password_is_left_in_what_is_told(user: str, password: str, host: str) -> None:
+def test_no_password_remains_in_messages(user: str, password: str, host: str) -> None:
     for url in (f"postgresql://{user}:{password}@{host}/x", f"mqtt://{host}/a/b?password={password}&host=c"):
         assert has_password(url)
         told = without_password(url)

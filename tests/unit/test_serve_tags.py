@@ -125,7 +125,7 @@ def test_a_bad_value_never_looks_good() -> None:
     run(main())
 
 
-def test_not_a_number_where_the_file_says_so() -> None:
+def test_nan_is_served_if_the_file_specifies_it() -> None:
     async def main() -> None:
         async with served("nan") as s:
             s.put("pressure", 1.5, Quality.BAD, Reason.STALE)
@@ -138,7 +138,7 @@ def test_not_a_number_where_the_file_says_so() -> None:
     run(main())
 
 
-def test_uncertain_values_only_where_a_quality_register_says_so() -> None:
+def test_uncertain_values_are_served_only_with_a_quality_register() -> None:
     async def main() -> None:
         async with served() as s:
             for name in ("pressure", "depth"):
@@ -170,7 +170,7 @@ def test_half_a_value_and_gaps_do_not_exist() -> None:
     run(main())
 
 
-def test_a_write_is_passed_on_with_who_asked() -> None:
+def test_a_write_is_passed_on_with_its_requester() -> None:
     async def main() -> None:
         async with served() as s:
             await s.client.write_register(1, 0, 0xFFFF)
@@ -188,7 +188,7 @@ def test_a_write_is_passed_on_with_who_asked() -> None:
     run(main())
 
 
-def test_what_cannot_be_written_is_refused_and_asked_of_nobody() -> None:
+def test_an_impossible_write_is_refused_and_not_passed_on() -> None:
     async def main() -> None:
         async with served() as s:
             assert await s.code(lambda c: c.write_register(1, 1, 5)) == 2  # served, not writable
@@ -206,7 +206,7 @@ def test_what_cannot_be_written_is_refused_and_asked_of_nobody() -> None:
 @pytest.mark.parametrize(
     ("error", "code"), [(NotAllowed("limits"), 3), (EndpointBusy("twice"), 6), (Unreachable("away"), 4)]
 )
-def test_how_a_write_ended_is_what_the_client_is_told(error: FieldtwinError, code: int) -> None:
+def test_the_client_gets_the_result_of_its_write(error: FieldtwinError, code: int) -> None:
     async def main() -> None:
         async with served() as s:
             s.writes.error = error
@@ -220,7 +220,7 @@ def test_how_a_write_ended_is_what_the_client_is_told(error: FieldtwinError, cod
     order=st.sampled_from(["ABCD", "CDAB", "BADC", "DCBA"]),
     value=st.one_of(st.floats(), st.integers(-(2**70), 2**70), st.booleans(), st.none(), st.text(max_size=3)),
 )
-def test_what_is_served_is_the_value_or_nothing(kind: str, order: str, value: Scalar | None) -> None:
+def test_a_served_value_is_the_tags_value_or_none(kind: str, order: str, value: Scalar | None) -> None:
     data = pack(kind, order, value)
     if data is None:
         return

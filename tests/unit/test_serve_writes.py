@@ -107,7 +107,7 @@ def test_a_write_reaches_the_device_and_the_record_once(tmp_path: Path) -> None:
     run(main())
 
 
-def test_limits_leave_and_spacing_are_kept(tmp_path: Path) -> None:
+def test_limits_permissions_and_spacing_are_observed(tmp_path: Path) -> None:
     async def main() -> None:
         async with rig(tmp_path / "a") as r:
             assert await r.refused(0, 101) == 3  # over the profile's range
@@ -161,7 +161,7 @@ def test_the_safe_state_is_stronger_than_a_client(tmp_path: Path) -> None:
     run(main())
 
 
-def test_what_cannot_be_put_on_record_is_not_written(tmp_path: Path) -> None:
+def test_an_unrecordable_write_is_not_made(tmp_path: Path) -> None:
     async def main() -> None:
         async with rig(Path("/dev/full")) as r:
             assert await r.refused(0, 5) == 4

@@ -29,11 +29,11 @@ def quiet(**changed: Any) -> Any:
     return seen(gateway=gateway, plc={**plc_status(), "error": ""}, **changed)
 
 
-def test_nothing_changed_is_no_event() -> None:
+def test_no_change_gives_no_event() -> None:
     assert changes(quiet(), quiet()) == []
 
 
-def test_what_changes_is_told_once() -> None:
+def test_a_change_is_reported_once() -> None:
     before, after = quiet(), quiet()
     assert after.gateway is not None
     assert after.plc is not None
@@ -139,7 +139,7 @@ def systemd(tmp_path: Path) -> Any:
         yield listening
 
 
-def test_systemd_is_told(systemd: socket.socket) -> None:
+def test_systemd_is_notified(systemd: socket.socket) -> None:
     environment = {"NOTIFY_SOCKET": systemd.getsockname(), "WATCHDOG_USEC": "3000000", "WATCHDOG_PID": str(os.getpid())}
     notifier = Notifier.from_environment(environment)
     assert environment == {}  # no child process sends notifications in our name
@@ -163,7 +163,7 @@ def test_systemd_is_told(systemd: socket.socket) -> None:
     "environment",
     [{}, {"NOTIFY_SOCKET": "vsock:2:1"}, {"WATCHDOG_USEC": "3000000"}],
 )
-def test_without_systemd_nothing_is_said(environment: dict[str, str]) -> None:
+def test_without_systemd_nothing_is_sent(environment: dict[str, str]) -> None:
     notifier = Notifier.from_environment(environment)
     assert not notifier.wanted
     notifier.ready("up")

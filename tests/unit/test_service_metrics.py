@@ -104,7 +104,7 @@ def value(samples: dict[Any, float], name: str, /, **labels: str) -> float:
     return samples[f"fieldtwin_{name}", frozenset(labels.items())]
 
 
-def test_what_a_maintainer_wants_is_there() -> None:
+def test_metrics_for_maintainers_exist() -> None:
     got = scraped(render(families(seen())))
     assert value(got, "up", process="gateway") == 1
     assert value(got, "bus_events_total", bus="line1", event="requests") == 9
@@ -141,7 +141,7 @@ def test_no_value_and_no_name_of_a_tag_is_in_it() -> None:
     assert "pressure" not in text
 
 
-def test_a_process_that_does_not_answer_is_down_and_its_numbers_are_gone() -> None:
+def test_a_process_that_does_not_answer_is_down_and_has_no_metrics() -> None:
     got = scraped(render(families(seen(gateway=None, plc=None, children={"gateway": True, "plc": False}))))
     assert value(got, "up", process="gateway") == 0
     assert value(got, "up", process="plc") == 0

@@ -43,7 +43,7 @@ def test_two_rows_of_one_time_are_a_step() -> None:
     assert [step.at(t, "x") for t in (0.999, 1.0, 1.5)] == [1.0, 2.0, 2.0]
 
 
-def test_next_to_a_missing_value_there_is_none() -> None:
+def test_next_to_a_missing_value_there_is_no_interpolation() -> None:
     gap = track((0.0, 1.0), (1.0, math.nan), (2.0, 3.0), (3.0, 5.0))
     assert gap.at(0.0, "x") == 1.0
     assert all(math.isnan(gap.at(t, "x")) for t in (0.001, 0.5, 1.0, 1.5, 1.999))
@@ -72,7 +72,7 @@ def test_hold_loop_and_error_after_the_end() -> None:
     assert [loop.ended(START_NS + t * NS_PER_S) for t in (10, 11)] == [False, True]
 
 
-def test_a_loop_that_starts_late_repeats_what_was_recorded_only() -> None:
+def test_a_loop_that_starts_late_repeats_only_recorded_samples() -> None:
     loop = SignalPlayer(track((3.0, 0.0), (10.0, 70.0)), START_NS, at_end=WhenUsedUp.LOOP)
     assert [at(loop, t) for t in (0, 3, 5, 12, 19)] == pytest.approx([0.0, 0.0, 20.0, 20.0, 20.0])
 
@@ -121,7 +121,7 @@ LAYOUTS = {"ABCD": [0x0102, 0x0304], "CDAB": [0x0304, 0x0102], "BADC": [0x0201, 
 
 
 @pytest.mark.parametrize("order", ORDERS)
-def test_each_order_puts_the_bytes_where_its_name_says(order: str) -> None:
+def test_each_order_puts_the_bytes_according_to_its_name(order: str) -> None:
     assert encode(0x01020304, "uint32", order) == LAYOUTS[order]
     assert decode(LAYOUTS[order], "uint32", order) == 0x01020304
 
@@ -144,7 +144,7 @@ def test_every_float32_survives(value: float, order: str) -> None:
     assert back == value or (math.isnan(back) and math.isnan(value))
 
 
-def test_what_does_not_fit_is_held_at_the_limit() -> None:
+def test_a_value_that_does_not_fit_is_limited() -> None:
     assert encode(1e300, "float32") == [0x7F80, 0]
     assert encode(3.4028235e38, "float32") == [0x7F7F, 0xFFFF]
     assert (encode(40_000, "int16"), encode(-40_000, "int16")) == ([0x7FFF], [0x8000])
@@ -172,7 +172,7 @@ def test_strings_are_padded_cut_and_never_reversed() -> None:
         lambda: decode([0x10000], "int16"),
     ],
 )
-def test_what_no_profile_can_ask_for_is_a_bug(wrong: object) -> None:
+def test_a_request_that_no_profile_can_make_is_a_bug(wrong: object) -> None:
     assert callable(wrong)
     with pytest.raises(Bug):
         wrong()

@@ -29,7 +29,7 @@ def simulation(formulas: dict[str, str], inputs: tuple[str, ...] = (), **start: 
     return Simulation(step, begin, inputs, START, STEP)
 
 
-def test_a_tank_fills_by_what_flows_in() -> None:
+def test_a_tank_fills_by_its_inflow() -> None:
     tank = simulation({"level": "level + inflow * dt", "twice": "2 * level"}, ("inflow",), level=1.0)
     assert tank.values(START)["level"] == 1.0
     tank.put("inflow", 2.0, at(1.05))
@@ -49,7 +49,7 @@ def test_formulas_see_new_values_of_those_above_and_old_ones_of_those_below() ->
     st.lists(st.integers(0, 3_000), max_size=20),
     st.lists(st.tuples(st.integers(0, 3_000), st.floats(-5, 5)), max_size=5),
 )
-def test_when_somebody_looks_changes_nothing(looks_ms: list[int], writes: list[tuple[int, float]]) -> None:
+def test_reading_changes_nothing(looks_ms: list[int], writes: list[tuple[int, float]]) -> None:
     """The same writes at the same times give the same values, independent of other reads."""
 
     def run(looks: list[int]) -> float:
@@ -73,7 +73,7 @@ def test_after_long_silence_old_steps_are_left_out_and_counted() -> None:
     assert made.values(at(0.1 * (MAX_STEPS + 50)))["n"] == MAX_STEPS + 1
 
 
-def test_names_and_inputs_that_are_none() -> None:
+def test_invalid_names_and_inputs() -> None:
     with pytest.raises(UsageError, match="nothing computes 'y'"):
         simulation({"x": "1"}, y=1.0)
     with pytest.raises(UsageError, match="no name for a value"):
@@ -82,7 +82,7 @@ def test_names_and_inputs_that_are_none() -> None:
         simulation({"x": "u"}, ("u",)).put("v", 1.0, START)
 
 
-def test_what_a_device_plays_of_it() -> None:
+def test_the_replayed_values_of_a_device() -> None:
     signals = SimulatedSignals(simulation({"x": "t", "y": "-t"}), {"depth": "x"}, "p.yaml")
     assert signals.names == ("depth",)
     assert signals.values(at(1.5)) == {"depth": pytest.approx(1.5)}
@@ -152,14 +152,14 @@ def test_a_python_model_that_fails_is_its_files_fault(tmp_path: Path, name: str,
         model(tmp_path, name).values(at(3))
 
 
-def test_a_file_that_is_no_python(tmp_path: Path) -> None:
+def test_a_file_that_is_not_python(tmp_path: Path) -> None:
     with pytest.raises(FileInvalid, match="cannot be imported: SyntaxError"):
         model(tmp_path, "Tank", text="class")
     with pytest.raises(FileInvalid, match="no Python file"):
         PythonModel(tmp_path / "none.py", "Tank", {})
 
 
-def test_a_journal_tells_its_watcher_of_changes_only() -> None:
+def test_a_journal_notifies_its_watcher_of_changes_only() -> None:
     journal, seen = HeldJournal(), []
     journal.note("x", b"\0", 1)
     journal.watch("x", lambda raw, t_ns: seen.append((raw, t_ns)))

@@ -80,7 +80,7 @@ def changed(tmp_path: Path, old: str, new: str) -> Path:
         ("heading: turned", "dt: turned", r"'dt' means something already"),
     ],
 )
-def test_what_is_wrong_is_told_with_its_place(tmp_path: Path, old: str, new: str, message: str) -> None:
+def test_errors_are_reported_with_their_place(tmp_path: Path, old: str, new: str, message: str) -> None:
     with pytest.raises(FileInvalid, match=message):
         load_prototype(load_system(changed(tmp_path, old, new)))
 

@@ -59,7 +59,7 @@ def test_functions_of_time(text: str, t: float, expected: float) -> None:
 @pytest.mark.parametrize(
     "text", ["1 / x", "sqrt(-1)", "log(0)", "x % 0", "9 ** 9 ** 9", "exp(1e9)", "sine(1, 1, 0)", "0 ** -1"]
 )
-def test_what_cannot_be_computed_is_no_value(text: str) -> None:
+def test_an_impossible_computation_gives_no_value(text: str) -> None:
     assert math.isnan(value(text, x=0.0))
 
 
@@ -92,7 +92,7 @@ def test_noise_is_of_its_seed() -> None:
         ("9" * 400, "too large", ""),
     ],
 )
-def test_what_is_no_formula_is_refused(text: str, message: str, hint: str) -> None:
+def test_an_invalid_formula_is_refused(text: str, message: str, hint: str) -> None:
     with pytest.raises(UsageError, match=message) as e:
         value(text, level=1.0)
     assert hint in str(e.value)

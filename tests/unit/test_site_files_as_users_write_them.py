@@ -79,7 +79,7 @@ def test_a_safe_value_of_a_coil_may_be_false(site: Path) -> None:
     assert type(safe["run"]) is int
 
 
-def test_true_is_no_safe_value_of_a_number(site: Path) -> None:
+def test_true_is_not_a_safe_value_of_a_number(site: Path) -> None:
     site.write_text(SYSTEM.replace("mode: OFF", "mode: true"))
     with pytest.raises(FileInvalid, match="expected a number or OFF or SLOW or FAST; got true"):
         load_system(str(site))

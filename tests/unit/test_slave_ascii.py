@@ -48,7 +48,7 @@ def test_the_delimiter_can_be_changed() -> None:
     assert slave.feed(READ[:-1] + b";", 3) == [READ_REPLY[:-1] + b";"]
 
 
-def test_every_unit_of_a_line_counts_what_was_damaged() -> None:
+def test_every_unit_of_a_line_counts_damaged_frames() -> None:
     slave = AsciiSlave(make_units(1, 2))
     slave.feed(READ[:-4] + b"00\r\n" + READ, 0)
     assert [u.counters.bus_errors for u in slave.units.values()] == [1, 1]

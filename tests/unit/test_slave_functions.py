@@ -37,7 +37,7 @@ def test_exception_status() -> None:
     assert ask(unit, "07 00") == "87 03"
 
 
-def test_event_counter_counts_what_was_carried_out() -> None:
+def test_event_counter_counts_executed_requests() -> None:
     unit = make_unit()
     for request in ("03 0000 0001", "06 0000 0001", "03 0000 0000", "41", "0B", "0C"):
         ask(unit, request)
@@ -49,7 +49,7 @@ def test_event_counter_counts_what_was_carried_out() -> None:
     assert unit.counters.completed == 3, "the evidence is not"
 
 
-def test_event_log_tells_the_story_youngest_first() -> None:
+def test_event_log_lists_the_youngest_event_first() -> None:
     unit = make_unit()
     ask(unit, "08 0001 FF00")
     unit.heard(messages=5, errors=1)
@@ -78,7 +78,7 @@ def test_event_log_holds_64_and_can_be_cleared() -> None:
     assert unit.diagnostics.log.content == b"\x40\x00", "the restart and its response"
 
 
-def test_a_busy_unit_says_so_and_can_be_asked_why() -> None:
+def test_a_busy_unit_reports_it_and_can_be_asked_for_the_reason() -> None:
     unit = make_unit()
     unit.be_busy(until_ns=100)
     assert ask(unit, "06 0000 0001", 99) == "86 06"

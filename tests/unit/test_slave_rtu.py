@@ -65,7 +65,7 @@ class Line:
         return self
 
 
-def test_check_sums_of_others() -> None:
+def test_checksums_from_other_sources() -> None:
     """Frames from other sources: the two examples in every Modbus manual."""
     assert crc("01 03 0000 000A") == bytes.fromhex("01 03 0000 000A C5CD")
     assert crc("11 03 006B 0003") == bytes.fromhex("11 03 006B 0003 7687")
@@ -162,7 +162,7 @@ def test_mb_004_a_pause_too_short_to_be_seen_costs_no_more_than_the_gap() -> Non
     assert line.pause().replies == [READ_REPLY]
 
 
-def test_a_frame_that_pauses_longer_than_the_gap_is_none() -> None:
+def test_a_frame_with_a_pause_longer_than_the_gap_is_dropped() -> None:
     line = Line(make_slave()).whole(READ[:4]).pause().whole(READ[4:]).pause()
     assert line.replies == []
     assert line.slave.counters.noise_bytes == 8

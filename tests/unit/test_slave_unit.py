@@ -266,7 +266,7 @@ def test_counters_add_up() -> None:
     assert (counters.busy, counters.replies) == (1, 4)
 
 
-def test_bank_refuses_what_cannot_be() -> None:
+def test_bank_refuses_impossible_values() -> None:
     with pytest.raises(UsageError, match="same cell"):
         MapBank([Span("coil", 0, 2), Span("coil", 1, 1)])
     with pytest.raises(UsageError, match="addresses"):

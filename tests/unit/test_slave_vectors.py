@@ -167,7 +167,7 @@ def test_with_trailing_garbage(vector: dict[str, Any], number: int) -> None:
 
 
 @pytest.mark.parametrize("vector", [v for v in VECTORS if v.get("wire") == "mbap" and not v.get("closed")], ids=ids)
-def test_with_half_an_adu_behind(vector: dict[str, Any]) -> None:
+def test_with_half_an_adu_after_it(vector: dict[str, Any]) -> None:
     """In a TCP stream garbage cannot be distinguished; the following bytes are the next request, delivered completely later."""
     following = bytes.fromhex("0099 0000 0006 01 01 0000 0001")
     for cut in range(1, len(following)):

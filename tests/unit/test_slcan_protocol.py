@@ -107,7 +107,7 @@ def test_commands_while_closed(commands: bytes, answer: bytes) -> None:
     assert Adapter(opened=False).say(commands) == answer
 
 
-def test_what_is_received() -> None:
+def test_received_frames() -> None:
     adapter = Adapter(opened=False)
     frame = CanFrame(0x185, b"\x01\xab", t_ns=61_234 * 10**6)
     assert adapter.session.received(frame) == b""
@@ -156,7 +156,7 @@ def test_whatever_comes_is_answered_line_by_line(chunks: list[bytes]) -> None:
 
 
 @given(st.integers(0, 0x1FFFFFFF), st.binary(max_size=8), st.booleans(), st.booleans())
-def test_what_one_is_told_another_can_send(can_id: int, data: bytes, extended: bool, remote: bool) -> None:
+def test_each_side_can_send_the_messages_of_the_other(can_id: int, data: bytes, extended: bool, remote: bool) -> None:
     can_id = can_id if extended else can_id & 0x7FF
     frame = CanFrame(can_id, b"" if remote else data, extended=extended, remote=remote, dlc=len(data))
     one, other = Adapter(), Adapter()

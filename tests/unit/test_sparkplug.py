@@ -86,7 +86,7 @@ def test_another_implementation_reads_ours_and_we_read_its(metrics: list[Metric]
     assert decode_payload(theirs.SerializeToString()) == Payload(7, tuple(metrics), seq)
 
 
-def test_numbers_of_others_are_read_with_their_sign() -> None:
+def test_foreign_numbers_are_read_with_their_sign() -> None:
     protobuf = pytest.importorskip("pysparkplug._protobuf", reason="no pysparkplug here")
     theirs = protobuf.Payload()
     for name, datatype, field, sent in (
@@ -126,7 +126,7 @@ def over(messages: list[Message], to: EdgeNode | HostApplication) -> list[Frame]
 
 
 @given(events=st.lists(EVENTS, min_size=1, max_size=20), first=st.integers(1, 1 << 40))
-def test_what_was_logged_arrives_bit_by_bit_in_both_directions(events: list[Event], first: int) -> None:
+def test_logged_values_arrive_bit_by_bit_in_both_directions(events: list[Event], first: int) -> None:
     edge, host = sides()
     assert over(edge.messages(HELLO, 5), host) == [HELLO]
     data = Data(HELLO.tag, tuple(e._replace(sequence=n) for n, e in enumerate(events, first)))
@@ -141,14 +141,14 @@ def test_what_was_logged_arrives_bit_by_bit_in_both_directions(events: list[Even
 @pytest.mark.parametrize(
     "frame", [Ack(HELLO.tag, 7, ((1, 2),)), Lost(HELLO.tag, 1, 5), Refused(HELLO.tag, b"abcd"), Ask(HELLO.tag)]
 )
-def test_what_two_threads_tell_each_other_gets_through(frame: Frame) -> None:
+def test_messages_of_two_threads_arrive(frame: Frame) -> None:
     edge, host = sides()
     over(edge.messages(HELLO, 5), host)
     assert over(edge.messages(frame, 5), host) == [frame]
     assert over(host.messages(frame, 5), edge) == [frame]
 
 
-def test_a_birth_announces_every_tag_with_its_type_and_begins_the_count_anew() -> None:
+def test_a_birth_announces_every_tag_with_its_type_and_restarts_the_count() -> None:
     edge, _ = sides()
     birth, data = edge.messages(HELLO, 5)[0], edge.messages(Ack(HELLO.tag, 1), 6)[0]
     payload = decode_payload(birth.payload)
@@ -160,7 +160,7 @@ def test_a_birth_announces_every_tag_with_its_type_and_begins_the_count_anew() -
     assert decode_payload(edge.messages(HELLO, 5)[0].payload).seq == 0
 
 
-def test_data_has_aliases_times_quality_and_says_what_is_old() -> None:
+def test_data_has_aliases_times_quality_and_marks_historical_values() -> None:
     edge, host = sides()
     over(edge.messages(HELLO, 5), host)
     now = 1_790_000_000_000
@@ -187,7 +187,7 @@ def test_a_host_that_has_not_heard_the_birth_asks_for_it() -> None:
     assert decode_payload(rebirth.payload).metrics[0].name == REBIRTH
 
 
-def test_a_host_that_comes_online_is_told_at_once() -> None:
+def test_a_host_that_comes_online_is_informed_at_once() -> None:
     edge, host = sides()
     assert over(host.hello()[:1], edge) == [], "nothing was born yet"
     edge.messages(HELLO, 5)
@@ -224,7 +224,7 @@ def test_missing_messages_are_counted() -> None:
     assert host.missed == 1
 
 
-def test_commands_of_others_are_not_taken() -> None:
+def test_third_party_commands_are_not_taken() -> None:
     edge, _ = sides()
     edge.messages(HELLO, 5)
     write = encode_payload(Payload(5, (Metric("ctd.sample_period_s", None, 5, DataType.INT64, 1),)))
@@ -232,7 +232,7 @@ def test_commands_of_others_are_not_taken() -> None:
     assert edge.not_taken == 1
 
 
-def test_over_a_broker_a_shadow_puts_acknowledgements_and_rebirths_and_nothing_else() -> None:
+def test_over_a_broker_a_shadow_sends_only_acknowledgements_and_rebirths() -> None:
     _, host = sides()
     for frame in (Ack(HELLO.tag, 7), Ask(HELLO.tag), Refused(HELLO.tag, b"abcd")):
         for message in host.messages(frame, 5):

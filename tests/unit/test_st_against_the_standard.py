@@ -343,7 +343,9 @@ STEPS = st.lists(
 
 @settings(deadline=None, max_examples=80)
 @given(STEPS, st.sampled_from([0, 10, 25, 30]), st.integers(-1, 3))
-def test_blocks_do_what_the_standard_draws(steps: list[tuple[bool, bool, bool, bool, int]], pt: int, pv: int) -> None:
+def test_blocks_follow_the_diagrams_of_the_standard(
+    steps: list[tuple[bool, bool, bool, bool, int]], pt: int, pv: int
+) -> None:
     made = program(BLOCKS)
     body = made.st_body
     body.v_pt, body.v_pv = pt * 1_000_000, pv

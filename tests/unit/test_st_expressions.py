@@ -162,7 +162,7 @@ def test_types_widen_and_never_narrow_unasked() -> None:
         ("INT", "INT_TO_NOTHING(1)", "not declared"),
     ],
 )
-def test_what_makes_no_sense_is_refused_with_its_place(kind: str, expression: str, told: str) -> None:
+def test_invalid_programs_are_refused_with_their_place(kind: str, expression: str, told: str) -> None:
     with pytest.raises(FileInvalid, match=r"test\.st:3:") as e:
         value(kind, expression, "d : DINT; i : INT; b : BOOL; s : STRING; length : INT;")
     assert told in str(e.value)
@@ -180,7 +180,7 @@ def test_what_makes_no_sense_is_refused_with_its_place(kind: str, expression: st
         ("TRUNC(SQRT(-1.0 * i))", "no value here"),
     ],
 )
-def test_what_has_no_result_is_an_error_of_the_logic(expression: str, told: str) -> None:
+def test_an_undefined_result_is_an_error_of_the_logic(expression: str, told: str) -> None:
     target = "result : LINT; i : INT := 1; z : INT; a : ARRAY[0..3] OF INT;"
     with pytest.raises(LogicError, match=told):
         run(target, f"result := {expression};")

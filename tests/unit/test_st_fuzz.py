@@ -233,7 +233,7 @@ HUGE = {
 
 
 @pytest.mark.parametrize("what", HUGE)
-def test_what_is_huge_is_refused_or_runs(what: str) -> None:
+def test_huge_programs_are_refused_or_run(what: str) -> None:
     text, expected = HUGE[what]
     assert survives(text + ("" if text.endswith("(*") else "\nEND_PROGRAM")) == expected
 

@@ -107,7 +107,7 @@ def test_other_variables_and_later_loops_are_free() -> None:
 
 
 @pytest.mark.parametrize("variable", ["a[1]", "t.IN", "a[i]"])
-def test_an_element_of_an_array_or_a_blocks_input_is_no_control_variable(variable: str) -> None:
+def test_an_element_of_an_array_or_a_blocks_input_is_not_a_control_variable(variable: str) -> None:
     with pytest.raises(FileInvalid, match="the variable of FOR"):
         run("a : ARRAY[1..3] OF INT; i : INT; t : TON;", f"FOR {variable} := 1 TO 3 DO ; END_FOR")
 
@@ -174,7 +174,7 @@ def test_a_shorter_string_keeps_its_length() -> None:
     assert (got["s"].m_t, got["t"]) == ("abx", "abxyz")
 
 
-def test_a_structure_assigned_as_a_whole_reaches_what_stands_for_a_part_of_it() -> None:
+def test_a_structure_assigned_as_a_whole_changes_a_reference_to_its_part() -> None:
     before = (
         HANDED
         + """FUNCTION whole : INT VAR_IN_OUT s : S; a : ARRAY[1..2] OF INT; END_VAR VAR new : S; END_VAR

@@ -95,7 +95,7 @@ def test_errors_name_lines_of_the_export(tmp_path: Path) -> None:
         (('name="kept"', 'name="a b"'), "without a usable name"),
     ],
 )  # fmt: skip
-def test_what_is_no_export_of_structured_text_is_refused(change: tuple[str, str], told: str) -> None:
+def test_a_file_that_is_not_an_export_of_structured_text_is_refused(change: tuple[str, str], told: str) -> None:
     with pytest.raises(FileInvalid) as e:
         to_st(EXPORT.replace(*change), "plant.xml")
     assert told in str(e.value)

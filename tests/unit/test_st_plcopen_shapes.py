@@ -27,7 +27,7 @@ def roles(made: StProgram) -> dict[str, Role]:
     return {v.name: v.role for v in made.variables.values()}
 
 
-def test_codesys_qualified_globals_and_enumerations_behind_the_vendors_additions() -> None:
+def test_codesys_qualified_globals_and_enumerations_despite_the_vendors_additions() -> None:
     made = loaded("codesys")
     assert roles(made) == {"level": Role.INPUT, "valve": Role.OUTPUT, "eMode": Role.LOCAL}
     made.level = 1.0

@@ -61,7 +61,7 @@ CALLS = """FUNCTION f : BOOL VAR_INPUT x : BOOL; END_VAR VAR_IN_OUT n : INT; END
         ("f(FALSE, n := n) AND_THEN f(TRUE, n := n)", False, 1),
     ],
 )
-def test_what_and_then_and_or_else_do_not_look_at_is_not_run(condition: str, result: bool, calls: int) -> None:
+def test_operands_skipped_by_and_then_and_or_else_are_not_evaluated(condition: str, result: bool, calls: int) -> None:
     got = run("r : BOOL; n, o : INT;", f"r := {condition};", CALLS)
     assert (got["r"], got["n"]) == (result, calls)
 
@@ -86,7 +86,7 @@ def test_leaving_loops() -> None:
     assert run("i, s : INT;", body)["i"] == 3  # CONTINUE goes to the condition, not past it
 
 
-def test_a_subrange_holds_what_is_inside_it() -> None:
+def test_a_subrange_holds_only_values_inside_it() -> None:
     assert run("level : INT(0..100); i : INT := 100;", "level := i;")["level"] == 100
     for i in (101, -1):
         with pytest.raises(LogicError, match="0 to 100"):
@@ -253,6 +253,6 @@ def test_values_at_the_edges(kind: str, expression: str, expected: object) -> No
         ("TIME_TO_INT(T#1s * r * r)", "does not fit"),
     ],
 )  # fmt: skip
-def test_what_has_no_value_stops_the_task(expression: str, told: str) -> None:
+def test_a_missing_value_stops_the_task(expression: str, told: str) -> None:
     with pytest.raises(LogicError, match=told):
         value("INT", expression, "i : INT := 5; r : REAL := 1e30; r0 : REAL;")

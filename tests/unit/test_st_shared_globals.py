@@ -85,7 +85,7 @@ def test_a_restart_begins_with_the_initial_values(tmp_path: Path) -> None:
     assert (seen["a.mine"], seen["b.seen"]) == (2, 2)
 
 
-def test_two_plcs_in_one_process_have_globals_of_their_own(tmp_path: Path) -> None:
+def test_two_plcs_in_one_process_have_separate_globals(tmp_path: Path) -> None:
     one, now = plc(tmp_path, (TaskSpec("main", 10),), {"a": "main", "b": "main"})
     other, then = plc(tmp_path, (TaskSpec("main", 10),), {"a": "main", "b": "main"})
     one.start()
@@ -95,7 +95,7 @@ def test_two_plcs_in_one_process_have_globals_of_their_own(tmp_path: Path) -> No
     assert one.outputs.last()["b.seen"] == 5
 
 
-def test_a_copy_of_a_program_has_globals_of_its_own(tmp_path: Path) -> None:
+def test_a_copy_of_a_program_has_separate_globals(tmp_path: Path) -> None:
     (tmp_path / "two.st").write_text(TEXT)
     together: dict[Any, Any] = {}
     a, b = (load_program(f"two.st:{name}", (str(tmp_path),), together) for name in "ab")

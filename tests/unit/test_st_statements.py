@@ -140,7 +140,7 @@ def test_globals_constants_and_first_scan() -> None:
     assert other.st_body.v_r == 8  # each program has globals of its own
 
 
-def test_inputs_keep_their_last_value_and_is_good_tells() -> None:
+def test_inputs_keep_their_last_value_and_is_good_shows_it() -> None:
     made = program(
         "PROGRAM p VAR_INPUT x : REAL := 2.5; END_VAR VAR_OUTPUT y : REAL; g : BOOL; END_VAR y := x; g := IS_GOOD(x); END_PROGRAM"
     )
@@ -200,7 +200,7 @@ def test_every_block_can_be_retained(block: str) -> None:
     scan(again, 1, ms=1)
 
 
-def test_an_alarm_outlives_a_restart_and_its_delay_counts_anew() -> None:
+def test_an_alarm_outlives_a_restart_and_its_delay_starts_again() -> None:
     text = "PROGRAM p VAR RETAIN a : ALARM; END_VAR a(X := 5.0, H := 3.0, DELAY := T#30ms); END_PROGRAM"
     made, again = program(text), program(text)
     for number in range(1, 3):
@@ -259,7 +259,7 @@ def test_mistakes_are_refused_with_line_column_and_reason(text: str, line: int, 
     assert e.value.column >= 1
 
 
-def test_what_stands_at_an_address_is_an_input_or_an_output() -> None:
+def test_a_variable_at_an_address_is_an_input_or_an_output() -> None:
     made = program(
         "PROGRAM p VAR go AT %IX0.0 : BOOL; n : INT; lamp AT %QX0.1 : BOOL; horn at %q* : BOOL; m AT %MW3 : INT := 4; END_VAR\n"
         "lamp := go; m := m + 1; n := m; END_PROGRAM"

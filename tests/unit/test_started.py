@@ -51,7 +51,7 @@ def test_it_stops_first_and_ends_in_the_reverse_order() -> None:
         ("stop", ["begin a", "begin b", "begin c", "end c", "end b", "end a"]),
     ],
 )
-def test_what_was_begun_is_ended_whatever_failed(fails: str, done: list[str]) -> None:
+def test_started_parts_are_ended_whatever_failed(fails: str, done: list[str]) -> None:
     parts = Parts(fails)
 
     async def main() -> None:

@@ -108,7 +108,7 @@ def ask(unit: ModbusUnit, request: str, now_ns: int = 0) -> str:
         ("65", "e501"),
     ],
 )
-def test_a_device_that_nobody_recorded(tmp_path: Path, request_hex: str, reply_hex: str) -> None:
+def test_a_device_without_a_recording(tmp_path: Path, request_hex: str, reply_hex: str) -> None:
     assert ask(stated(tmp_path), request_hex) == reply_hex
 
 
@@ -133,7 +133,7 @@ def test_side_effects_of_registers(tmp_path: Path) -> None:
     ]
 
 
-def test_a_recorded_device_does_what_its_profile_states(tmp_path: Path) -> None:
+def test_a_recorded_device_behaves_as_its_profile_states(tmp_path: Path) -> None:
     recorded = [
         ("0300000003", "0306000027100000"),
         ("03000a0001", "03020003"),
@@ -244,7 +244,7 @@ def system(folder: Path, prototype: str) -> str:
     return str(folder / "pump.yaml")
 
 
-def test_a_prototype_of_a_device_that_nobody_recorded(tmp_path: Path) -> None:
+def test_a_prototype_of_a_device_without_a_recording(tmp_path: Path) -> None:
     run = VirtualRun(VirtualOptions(system(tmp_path, PROTOTYPE), 10.0))
     run.run()
     summary = run.summary()

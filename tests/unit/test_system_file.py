@@ -21,7 +21,7 @@ from fieldtwin.twin.site.data_files import data_root, find, find_recording
 from fieldtwin.twin.site.system import load_system
 
 
-def test_the_observatory_is_what_the_paper_says() -> None:
+def test_the_observatory_matches_the_paper() -> None:
     system = load_system("observatory")
     assert {n: str(b.endpoint) for n, b in system.buses.items()} == {
         "line1": "rtu:/dev/ttyS0?baudrate=19200&frame=8E1", "can0": "can:socketcan/can0", "lan": "tcp://modem:502",
@@ -99,7 +99,7 @@ def test_an_instance_runs_once_and_leaves_its_name_free(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["", "a/b", "..", "-x", "a" * 41, "a b", "ä"])
-def test_names_that_are_none(name: str, tmp_path: Path) -> None:
+def test_invalid_names(name: str, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="instance name"):
         Instance(name, tmp_path)
 
@@ -116,7 +116,7 @@ def test_where_instances_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) ->
         Instance("x", tmp_path / ("y" * 100))
 
 
-def test_the_mapping_keeps_what_the_plant_says_of_its_line() -> None:
+def test_the_mapping_keeps_the_plants_line_settings() -> None:
     plant = Endpoint.parse("rtu:/dev/ttyS0?baudrate=9600&frame=8N2")
     target = mapped_endpoint(plant, Endpoint.parse("pty:/run/x/line1"))
     assert str(target) == "rtu:/run/x/line1?baudrate=9600&frame=8N2"

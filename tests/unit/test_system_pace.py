@@ -44,7 +44,7 @@ def system(
     return load_system(str(folder / "pace.yaml"))
 
 
-def test_what_nobody_states_is_as_it_was(tmp_path: Path) -> None:
+def test_unstated_settings_keep_their_defaults(tmp_path: Path) -> None:
     s = system(tmp_path)
     bus, meter = s.buses["line1"], s.devices["meter"]
     assert (bus.timeout_s, bus.spacing_s, bus.turnaround_s, bus.connect_pause_s, bus.probe_share) == (
@@ -100,7 +100,7 @@ def test_everything_that_a_bus_may_state(tmp_path: Path) -> None:
         ({"timing": "timing: {timeout_ms: 0}"}, "timeout_ms"),
     ],
 )
-def test_what_cannot_be_is_told_with_its_place(tmp_path: Path, stated: dict[str, str], where: str) -> None:
+def test_impossible_settings_are_reported_with_their_place(tmp_path: Path, stated: dict[str, str], where: str) -> None:
     with pytest.raises(FileInvalid, match=where) as caught:
         system(tmp_path, **stated)
     assert caught.value.line > 1

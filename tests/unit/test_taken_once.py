@@ -124,7 +124,7 @@ def test_a_command_that_was_consumed_is_not_handed_on_again(tmp_path: Path, kept
     run(main())
 
 
-def test_a_command_that_nobody_consumed_is_handed_on(tmp_path: Path) -> None:
+def test_an_unconsumed_command_is_passed_on(tmp_path: Path) -> None:
     async def main() -> None:
         modems = modem_pair()
         await command(modems, b"\0\7")
@@ -140,7 +140,7 @@ def test_a_command_that_nobody_consumed_is_handed_on(tmp_path: Path) -> None:
     run(main())
 
 
-def test_what_was_taken_from_a_modem_that_began_anew_is_of_no_account(tmp_path: Path) -> None:
+def test_commands_taken_from_a_restarted_modem_do_not_count(tmp_path: Path) -> None:
     """Its first message has the number and the content of the first one before: it is a new command."""
 
     async def main() -> None:
@@ -162,7 +162,7 @@ def test_what_was_taken_from_a_modem_that_began_anew_is_of_no_account(tmp_path: 
 
 
 @pytest.mark.parametrize("text", ["", "[]", '{"modem": 3}', '{"modem": "xy"}', "\x00"])
-def test_a_file_that_is_none_of_ours_is_as_good_as_none(tmp_path: Path, text: str) -> None:
+def test_a_foreign_file_counts_as_missing(tmp_path: Path, text: str) -> None:
     (tmp_path / "taken.json").write_text(text)
     file = TakenFile(tmp_path / "taken.json")
     assert file.of("modem") == b""
@@ -171,7 +171,7 @@ def test_a_file_that_is_none_of_ours_is_as_good_as_none(tmp_path: Path, text: st
     assert (tmp_path / "taken.json").stat().st_mode & 0o777 == 0o600
 
 
-def test_a_disk_that_refuses_is_said(tmp_path: Path) -> None:
+def test_a_disk_that_refuses_is_reported(tmp_path: Path) -> None:
     file = TakenFile(tmp_path / "nowhere" / "taken.json")
     with pytest.raises(Unreachable, match="cannot write what was taken"):
         file.note("modem", b"\1")

@@ -65,7 +65,7 @@ def test_the_same_files_give_the_same_bytes_whenever_and_in_whatever_order(dam: 
     assert (tmp_path / "folder" / MANIFEST).read_bytes() == first.to_json()
 
 
-def test_from_a_template_alone_a_prototype_runs_on_a_machine_that_has_none_of_it(dam: Path, tmp_path: Path) -> None:
+def test_from_a_template_alone_a_prototype_runs_on_a_machine_without_its_files(dam: Path, tmp_path: Path) -> None:
     packed(dam, tmp_path / "T.zip")
     shutil.rmtree(dam.parent.parent)
     empty = tmp_path / "empty"
@@ -85,7 +85,7 @@ def test_the_shipped_observatory_makes_a_whole_template(tmp_path: Path, monkeypa
     assert Path(system_file(str(tmp_path / "T.zip"), no)).name == "observatory.yaml"
 
 
-def test_what_is_on_this_computer_alone_is_refused(dam: Path, tmp_path: Path) -> None:
+def test_files_that_exist_only_on_this_computer_are_refused(dam: Path, tmp_path: Path) -> None:
     outside = tmp_path / "tilt.yaml"
     shutil.copy(dam.parent.parent / "devices" / "tilt.yaml", outside)
     shutil.copy(dam.parent.parent / "devices" / "tilt.eds", tmp_path / "tilt.eds")
@@ -113,7 +113,7 @@ def test_a_wheel_of_other_software_is_refused(dam: Path, tmp_path: Path) -> None
         packed(dam, tmp_path / "T.zip", Extras(wheel=wheel))
 
 
-def test_a_wheel_has_the_hash_of_what_it_installs(tmp_path: Path) -> None:
+def test_a_wheel_has_the_hash_of_the_installed_files(tmp_path: Path) -> None:
     wheel = tmp_path / "fieldtwin-9.9-py3-none-any.whl"
     (tmp_path / "x" / "fieldtwin" / "plc" / "__pycache__").mkdir(parents=True)
     (tmp_path / "x" / "fieldtwin" / "plc" / "a.py").write_text("a = 1\n")
@@ -130,14 +130,14 @@ def test_pack_unpack_and_pack_again_are_the_same(good: Path, tmp_path: Path) -> 
     assert (tmp_path / "again.zip").read_bytes() == good.read_bytes()
 
 
-def test_a_folder_in_use_is_left_alone(good: Path, tmp_path: Path) -> None:
+def test_a_folder_in_use_is_not_changed(good: Path, tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "mine").touch()
     with pytest.raises(UsageError, match="the folder is not empty"):
         unpack_zip(good, tmp_path / "out")
 
 
-def test_a_full_disk_is_said_before_anything_is_written(
+def test_a_full_disk_is_reported_before_anything_is_written(
     good: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     usage = shutil.disk_usage(tmp_path)._replace(free=10)
@@ -211,7 +211,7 @@ def test_diff_does_not_follow_links_out_of_a_folder(good: Path, tmp_path: Path) 
     assert "a template has no links" in done.stderr
 
 
-def test_the_zip_says_what_it_is_made_of(good: Path) -> None:
+def test_the_zip_lists_its_sources(good: Path) -> None:
     with ZipPackage(good) as package:
         assert json.loads(package.text("model.json"))["initial"] == {"state": "STANDBY", "period_s": 0}
 

@@ -119,7 +119,7 @@ def test_a_scenario_of_a_template_is_asked_about_wherever_it_lies(site: Site, wh
     assert not site.ran()
 
 
-def test_a_probe_of_a_strangers_scenario_is_named(site: Site) -> None:
+def test_a_probe_of_an_untrusted_scenario_is_named(site: Site) -> None:
     probe = "probes:\n  crane: {endpoint: 'tcp://192.0.2.7:502', unit: 1, registers: {height: {at: 30001}}}\n"
     site.inside.write_text(SCENARIO.replace("SYSTEM", "observatory") + probe)
     told: list[Stranger] = []
@@ -137,7 +137,7 @@ def test_a_probe_of_a_strangers_scenario_is_named(site: Site) -> None:
     assert not told, "one's own"
 
 
-def test_a_yes_beforehand_lets_each_of_them_go_on(site: Site) -> None:
+def test_a_yes_beforehand_lets_each_of_them_run(site: Site) -> None:
     prototype = site.system.with_name("dam.prototype.yaml")
     prototype.write_text(prototype.read_text().replace("can:socketcan/can0", "can:fieldtwin/127.0.0.1:0"))
     assert fieldtwin("run", site.system, "--prototype", "--virtual", "--for", "1s", "--trust").exit_code == 0
@@ -147,7 +147,7 @@ def test_a_yes_beforehand_lets_each_of_them_go_on(site: Site) -> None:
     assert "no program has a proof" in str(unproved.exception), "it was looked for"
 
 
-def test_a_network_with_a_strangers_system_is_asked_about(site: Site) -> None:
+def test_a_network_with_an_untrusted_system_is_asked_about(site: Site) -> None:
     observatory = load_system("observatory")
     packed(observatory.path, site.folder.with_name("O"))
     site.network.write_text(
@@ -166,9 +166,7 @@ def test_a_network_with_a_strangers_system_is_asked_about(site: Site) -> None:
     assert "systems/evil.py" in done.stderr
 
 
-def test_what_lies_deeper_or_is_found_by_name_or_is_only_the_prototype_is_a_strangers_too(
-    site: Site, tmp_path: Path
-) -> None:
+def test_nested_searched_and_prototype_only_files_are_untrusted_too(site: Site, tmp_path: Path) -> None:
     told: list[Stranger] = []
 
     def asked(template: Stranger) -> bool:
@@ -212,7 +210,7 @@ def test_code_from_elsewhere_that_an_unpacked_template_names_is_asked_about(site
     assert told.pop().code == ("the module site_logic", str(tmp_path / "hill.py"))
 
 
-def test_nothing_is_asked_by_what_runs_and_opens_nothing(site: Site) -> None:
+def test_commands_that_run_and_open_nothing_do_not_ask(site: Site) -> None:
     drawn = fieldtwin("draw", site.zip, "--prototype", "--json")
     assert drawn.exit_code == 0, drawn.exception
     assert json.loads(drawn.stdout)
@@ -222,7 +220,7 @@ def test_nothing_is_asked_by_what_runs_and_opens_nothing(site: Site) -> None:
 
 
 @pytest.mark.parametrize("verb", ["system", "program"])
-def test_a_test_run_has_nobody_to_ask_and_is_told_beforehand(site: Site, verb: str) -> None:
+def test_a_test_run_has_no_user_to_ask_and_needs_an_option(site: Site, verb: str) -> None:
     args = {"system": str(site.system), "source": "count", "folders": [str(site.system.parent)]}
     with pytest.raises(NotAllowed, match="nothing of this template was run"):
         asyncio.run(Host().verbs()[verb](args))

@@ -36,7 +36,7 @@ def test_python_is_named_and_runs_after_a_yes_only(dam: Path, tmp_path: Path, mo
     assert not marker.exists(), "asking, unpacking and examining run nothing"
 
 
-def test_without_a_terminal_the_answer_is_no_and_trust_says_yes(dam: Path, tmp_path: Path) -> None:
+def test_without_a_terminal_the_answer_is_no_and_trust_answers_yes(dam: Path, tmp_path: Path) -> None:
     marker = tmp_path / "it ran"
     with_python(dam, marker)
     packed(dam, tmp_path / "T.zip")
@@ -81,7 +81,7 @@ def test_left_over_byte_code_in_a_folder_counts_as_code(dam: Path, tmp_path: Pat
     assert FolderPackage(tmp_path / "T").code == ("systems/__pycache__/plc.cpython-311.pyc",)
 
 
-def test_a_program_that_says_that_it_is_a_document_is_asked_about_all_the_same(dam: Path, tmp_path: Path) -> None:
+def test_a_program_declared_as_a_document_is_asked_about_nevertheless(dam: Path, tmp_path: Path) -> None:
     with_python(dam, tmp_path / "it ran")
     packed(dam, tmp_path / "T.zip")
 
@@ -129,7 +129,7 @@ def test_a_prototype_that_does_not_keep_to_itself_is_asked_about(
     assert system_file(str(dam), asked) == str(dam), "one's own files are no stranger's"
 
 
-def test_links_and_servers_of_a_prototype_are_told_of(dam: Path, tmp_path: Path) -> None:
+def test_links_and_servers_of_a_prototype_are_reported(dam: Path, tmp_path: Path) -> None:
     text = (SHIPPED / "systems" / "observatory.yaml").read_text().replace("tcp://127.0.0.1:1502", "tcp://0.0.0.0:1502")
     (tmp_path / "observatory.yaml").write_text(text)
     shutil.copy(SHIPPED / "systems" / "relay.st", tmp_path)
@@ -148,7 +148,7 @@ def test_links_and_servers_of_a_prototype_are_told_of(dam: Path, tmp_path: Path)
     assert reach(shipped, load_prototype(shipped)) == ()
 
 
-def test_without_a_terminal_no_port_is_opened_and_it_is_said_which_one(dam: Path, tmp_path: Path) -> None:
+def test_without_a_terminal_no_port_is_opened_and_the_message_names_it(dam: Path, tmp_path: Path) -> None:
     prototype = dam.with_name("dam.prototype.yaml")
     prototype.write_text(prototype.read_text().replace("{listen: 'can:fieldtwin/127.0.0.1:0'}", "plant"))
     packed(dam, tmp_path / "T.zip")

@@ -168,7 +168,7 @@ def test_a_directory_of_millions_of_entries_is_not_even_read(good: Path, tmp_pat
         ({"software": {"version": "1\x1b[2J", "modules_sha256": "0"}}, r"the version of the software.* got 1\\x1b\[2J"),
     ],
 )
-def test_a_manifest_that_is_none_is_refused(good: Path, tmp_path: Path, change: dict[str, object], says: str) -> None:
+def test_an_invalid_manifest_is_refused(good: Path, tmp_path: Path, change: dict[str, object], says: str) -> None:
     with open_package(good) as package:
         text = package.manifest.to_json()
     with pytest.raises(FileInvalid, match=says):
@@ -179,14 +179,14 @@ def test_a_manifest_that_is_none_is_refused(good: Path, tmp_path: Path, change: 
     text=st.binary(max_size=200)
     | st.recursive(st.none() | st.integers() | st.text(), st.lists).map(msgspec.json.encode)
 )
-def test_no_bytes_are_a_manifest_or_else_a_clear_error(text: bytes) -> None:
+def test_any_bytes_are_a_manifest_or_give_a_clear_error(text: bytes) -> None:
     with pytest.raises(FileInvalid):
         parse_manifest(text, "here")
 
 
 @given(cut=st.integers(0, 20_000), flips=st.lists(st.tuples(st.integers(0, 20_000), st.integers(1, 255)), max_size=4))
 @example(cut=0, flips=[(29, 35)])  # the length of the manifest's local header: zipfile raises EOFError
-def test_a_damaged_zip_is_refused_or_is_what_was_packed(
+def test_a_damaged_zip_is_refused_or_equals_the_packed_content(
     tmp_path_factory: pytest.TempPathFactory, cut: int, flips: list[tuple[int, int]]
 ) -> None:
     place = tmp_path_factory.getbasetemp()
@@ -207,7 +207,7 @@ def test_a_damaged_zip_is_refused_or_is_what_was_packed(
         pass
 
 
-def test_a_template_that_counts_on_what_this_computer_has_is_not_whole(dam: Path, tmp_path: Path) -> None:
+def test_a_template_that_depends_on_files_of_this_computer_is_incomplete(dam: Path, tmp_path: Path) -> None:
     dam.write_text(dam.read_text().replace("../devices/tilt.yaml", "inclinometer-cia410"))
     manifest = packed(dam, tmp_path / "T")
     assert examine(tmp_path / "T", manifest).name == "dam"
@@ -226,7 +226,7 @@ def test_another_model_than_the_systems_is_found(dam: Path, tmp_path: Path) -> N
         examine(tmp_path / "T", manifest)
 
 
-def test_a_template_means_its_own_files_whatever_else_there_is(
+def test_a_template_uses_its_own_files_whatever_else_exists(
     dam: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A bare name in a template is not looked up in FIELDTWIN_PROFILES, in the working directory, or among the shipped files."""

@@ -165,7 +165,7 @@ def test_over_the_modems_of_the_reference_system_both_logs_are_equal(tmp_path: P
 
 
 @pytest.mark.parametrize("over", ["tcp", "modems"])
-def test_another_twin_with_an_empty_store_is_given_what_the_first_one_had(tmp_path: Path, over: str) -> None:
+def test_a_new_twin_with_an_empty_store_gets_the_events_of_the_first_one(tmp_path: Path, over: str) -> None:
     """Over TCP there is a new link; the plant's modem does not know that a different program listens at the other end."""
 
     async def main(loop: VirtualLoop, clock: VirtualClock, net: MemoryNet) -> None:
@@ -192,9 +192,7 @@ def test_another_twin_with_an_empty_store_is_given_what_the_first_one_had(tmp_pa
 
 
 @pytest.mark.parametrize("over", ["tcp", "modems"])
-def test_towards_the_plant_a_shadow_puts_acknowledgements_and_questions_and_nothing_else(
-    tmp_path: Path, over: str
-) -> None:
+def test_towards_the_plant_a_shadow_sends_only_acknowledgements_and_requests(tmp_path: Path, over: str) -> None:
     """SPEC ruling 16: a capture holds no COMMAND and nothing of DTtoPT, despite losses and deaths."""
 
     async def main(loop: VirtualLoop, clock: VirtualClock, net: MemoryNet) -> None:
@@ -250,7 +248,7 @@ def test_an_hour_without_a_carrier_costs_nothing(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "other", [Schema(("something.else",)), Schema(SCHEMA.names, "another plant, built alike")], ids=["tags", "system"]
 )
-def test_a_schema_that_the_other_side_does_not_have_is_said_on_both(tmp_path: Path, other: Schema) -> None:
+def test_a_schema_that_the_other_side_lacks_is_reported_on_both(tmp_path: Path, other: Schema) -> None:
     async def main(loop: VirtualLoop, clock: VirtualClock, net: MemoryNet) -> None:
         plant = Twin("plant", tmp_path, clock, lambda: LateListening(net))
         shore = Twin("shore", tmp_path, clock, lambda: TcpDialler(ADDRESS, net, [other]), other)
@@ -293,7 +291,7 @@ def test_a_store_that_refuses_is_not_acknowledged_to_and_catches_up(tmp_path: Pa
     virtually(main)
 
 
-def test_a_full_store_of_the_sender_gives_up_what_the_other_side_has_and_nothing_else(tmp_path: Path) -> None:
+def test_a_full_store_of_the_sender_deletes_only_acknowledged_events(tmp_path: Path) -> None:
     async def main(loop: VirtualLoop, clock: VirtualClock, net: MemoryNet) -> None:
         plant = Twin("plant", tmp_path, clock, lambda: LateListening(net))
         shore = Twin("shore", tmp_path, clock, lambda: TcpDialler(ADDRESS, net, [SCHEMA]))

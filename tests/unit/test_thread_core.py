@@ -287,7 +287,7 @@ def test_a_perfect_link_sends_nothing_twice_and_falls_silent() -> None:
     assert sent < 600 / 6 + 60
 
 
-def test_what_the_log_has_no_more_is_told_and_no_gap() -> None:
+def test_events_no_longer_in_the_log_are_reported_and_not_a_gap() -> None:
     net = Net(4, loss=0.3)
     plant = net.sides[0]
     for n in range(50):
@@ -312,7 +312,7 @@ def test_what_the_log_has_no_more_is_told_and_no_gap() -> None:
     assert 151 in shore.logs["plant:1"]
 
 
-def test_an_unknown_schema_is_told_on_both_sides_and_nothing_is_lost_until_it_is_known() -> None:
+def test_an_unknown_schema_is_reported_on_both_sides_and_nothing_is_lost_until_it_is_known() -> None:
     net = Net(5)
     plant, shore = net.sides
     shore.codec = FrameCodec([], 64)
@@ -344,7 +344,7 @@ def test_a_store_that_went_back_in_time_is_noticed() -> None:
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_who_comes_with_an_empty_store_is_given_everything_from_the_first(seed: int) -> None:
+def test_a_follower_with_an_empty_store_gets_everything_from_the_first(seed: int) -> None:
     """A different twin on the same thread, or one that lost its disk, despite late ACKs of the earlier one."""
     net = Net(seed, loss=0.2, repeat=0.2, delay_ms=3000 if seed % 2 else 20)
     plant, shore = net.sides
@@ -374,7 +374,7 @@ def test_large_events_go_in_pieces_through_loss(seed: int) -> None:
     net.until_equal(within_s=2000)
 
 
-def test_on_a_slow_carrier_events_wait_for_company_and_what_is_urgent_does_not() -> None:
+def test_on_a_slow_carrier_events_wait_for_others_and_urgent_ones_do_not() -> None:
     net = Net(1, delay_ms=2)
     plant, shore = net.sides
     plant.out.linger_ns = 500 * NS_PER_MS

@@ -118,7 +118,7 @@ def test_one_that_does_not_answer_any_more_gives_its_place_up(tmp_path: Path) ->
     played(tmp_path, main)
 
 
-def test_a_stranger_that_says_nothing_takes_nobodys_place(tmp_path: Path) -> None:
+def test_a_silent_unknown_client_takes_no_place(tmp_path: Path) -> None:
     async def main(place: Place) -> None:
         first = place.follower("first")
         await first.start()
@@ -145,7 +145,7 @@ def test_a_follower_that_need_not_wait_ends_with_the_reason(tmp_path: Path) -> N
     played(tmp_path, main)
 
 
-def test_a_listener_that_says_nothing_is_taken_for_one_all_the_same(tmp_path: Path) -> None:
+def test_a_silent_listener_counts_as_one_nevertheless(tmp_path: Path) -> None:
     """Messages may be lost on a bad link, like frames."""
 
     async def main(place: Place) -> None:

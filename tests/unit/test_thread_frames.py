@@ -29,7 +29,7 @@ from fieldtwin.twin.thread.frames import (
     events=st.lists(EVENTS, min_size=1, max_size=20), first=st.integers(1, 1 << 40), mtu=st.sampled_from([32, 64, 1400])
 )
 @settings(max_examples=80)
-def test_what_was_logged_arrives_bit_by_bit_in_frames_of_any_size(events: list[Event], first: int, mtu: int) -> None:
+def test_logged_values_arrive_bit_by_bit_in_frames_of_any_size(events: list[Event], first: int, mtu: int) -> None:
     one, two = FrameCodec([SCHEMA], mtu), FrameCodec([SCHEMA], mtu)
     there(one, two, Hello("p:1", SCHEMA.id, 1, 9, True))
     tag = tag_of("p:1", SCHEMA.id)

@@ -178,7 +178,7 @@ def test_commands_that_are_sent_again_over_a_broker_are_obeyed_once(tmp_path: Pa
 
 
 @pytest.mark.parametrize("through", [40, 41, 1 << 40], ids=["all of it", "one too many", "far too many"])
-def test_a_forged_acknowledgement_takes_nothing_from_the_next_one_who_follows(tmp_path: Path, through: int) -> None:
+def test_a_forged_acknowledgement_loses_nothing_for_the_next_follower(tmp_path: Path, through: int) -> None:
     async def main() -> None:
         place = Place()
         plant = await started(place, tmp_path)

@@ -72,7 +72,7 @@ def test_over_a_broker_with_loss_deaths_and_a_broker_that_restarts_both_logs_are
     run(main(), timeout_s=40)
 
 
-def test_a_broker_that_refuses_or_is_not_there_is_said(tmp_path: Path) -> None:
+def test_a_broker_that_refuses_or_is_missing_is_reported(tmp_path: Path) -> None:
     async def main() -> None:
         (tmp_path / "nobody").write_text("")
         with broker(tmp_path, "allow_anonymous false", f"password_file {tmp_path / 'nobody'}") as here:
@@ -92,7 +92,7 @@ def test_a_broker_that_refuses_or_is_not_there_is_said(tmp_path: Path) -> None:
     run(main())
 
 
-def test_a_host_of_others_sees_births_data_and_deaths(tmp_path: Path) -> None:
+def test_a_third_party_host_sees_births_data_and_deaths(tmp_path: Path) -> None:
     """The traffic on the broker, for a client that knows Sparkplug but no thread."""
     import aiomqtt
 

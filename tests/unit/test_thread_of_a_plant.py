@@ -74,7 +74,7 @@ class Watched:
         return [e for e in shared if e.name in ("ctd.pressure", "ctd.sample")]
 
 
-def test_every_change_is_shared_and_what_stays_every_ten_seconds() -> None:
+def test_every_change_is_shared_and_constant_values_every_ten_seconds() -> None:
     watched = Watched()
     assert [e.value for e in watched.look(1.0, 0)] == [1.0]
     assert [e.value for e in watched.look(2.0, 50)] == [2.0]
@@ -94,7 +94,7 @@ def test_a_thread_that_is_thinned_out_has_a_value_a_second_and_whatever_matters_
     assert (message.kind, message.value) == (Kind.PAYLOAD, b"sample")
 
 
-def test_a_state_is_told_when_it_changes_and_again_to_whom_was_refused() -> None:
+def test_a_state_is_reported_when_it_changes_and_again_after_a_refusal() -> None:
     """A twin's model is ahead of the plant with every command that it sends; a refusal takes it back."""
     layout = image_layout(OBSERVATORY)
     memory = memoryview(bytearray(layout.size))
@@ -116,7 +116,7 @@ def test_a_state_is_told_when_it_changes_and_again_to_whom_was_refused() -> None
     assert [len(states()) for _ in range(2)] == [1, 0]
 
 
-def test_what_a_dead_gateway_read_last_is_not_told_as_good() -> None:
+def test_the_last_values_of_a_dead_gateway_are_not_reported_as_good() -> None:
     """It may be dead for any time: the image still holds its publications."""
     watched = Watched()
     (told,) = watched.look(1.0, 0)
@@ -148,7 +148,7 @@ def test_the_gateway_leaves_a_lent_mailbox_alone() -> None:
     assert gateway_config(OBSERVATORY, allow_writes=True).devices["modem"].poll == {"inbox": 200, "status": 2000}
 
 
-def test_a_plant_lends_its_modem_only_where_it_may_be_written_to_and_nobody_else_commands() -> None:
+def test_a_plant_assigns_its_modem_only_if_it_is_writable_and_unused() -> None:
     def lent(*, prototype: bool, **more: object) -> str:
         return RunSession(RunOptions(str(PROFILES / "observatory.yaml"), prototype, thread="modem:", **more)).lent  # type: ignore[arg-type]
 

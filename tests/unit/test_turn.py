@@ -15,7 +15,7 @@ from fieldtwin.gateway.core.concurrency.timeout import alarm, ring
 
 @given(st.lists(st.tuples(st.integers(0, 5), st.integers(0, 4), st.booleans()), max_size=12))
 @settings(max_examples=60)
-def test_one_at_a_time_in_the_order_of_asking_whoever_is_cancelled(users: list[tuple[int, int, bool]]) -> None:
+def test_one_at_a_time_in_the_order_of_requests_despite_cancellations(users: list[tuple[int, int, bool]]) -> None:
     """Each arrives at a time, works for a while, and may be cancelled half a unit after its arrival."""
     turn, began, spans = Turn(), [], []
 

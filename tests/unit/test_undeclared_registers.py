@@ -73,7 +73,7 @@ def test_only_a_device_that_holds_takes_writes_of_undeclared_registers() -> None
     assert asked(unit, "06 0000 1234") == "86 02"  # declared, and read-only
 
 
-def test_another_word_is_refused_with_its_line() -> None:
+def test_an_unknown_value_is_refused_with_its_line() -> None:
     with pytest.raises(FileInvalid, match="undeclared"):
         profile("nothing")
 
@@ -94,6 +94,6 @@ def test_the_shipped_meter_answers_a_read_of_its_first_80_registers() -> None:
     assert asked(unit, "10 0024 0002 04 3F800000") == "90 02"
 
 
-def test_a_device_without_the_option_still_refuses_what_was_not_recorded() -> None:
+def test_a_device_without_the_option_still_refuses_unrecorded_registers() -> None:
     unit = recorded("renogy-rover")
     assert asked(unit, "03 0200 0001") == "83 02"

@@ -34,14 +34,14 @@ def ended(folder: Path, *args: str, unread: str) -> subprocess.CompletedProcess[
 
 
 @pytest.mark.parametrize("unread", ["stdout", "stderr"])
-def test_a_verdict_is_the_same_whoever_listens(tmp_path: Path, unread: str) -> None:
+def test_a_verdict_is_the_same_with_any_reader(tmp_path: Path, unread: str) -> None:
     done = ended(tmp_path, "test", "x.scenario.yaml", unread=unread)
     assert done.returncode == 1, done
     assert ("1 failed\n" in (done.stdout or "")) is (unread == "stderr")
     assert not done.stderr
 
 
-def test_a_listing_is_over_when_its_reader_has_what_it_wanted(tmp_path: Path) -> None:
+def test_a_listing_ends_when_its_reader_closes_the_pipe(tmp_path: Path) -> None:
     done = ended(tmp_path, "faults", unread="stdout")
     assert (done.returncode, done.stderr) == (0, "")
 
@@ -49,6 +49,6 @@ def test_a_listing_is_over_when_its_reader_has_what_it_wanted(tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("args", "code"), [(("run", "nowhere", "--prototype"), 2), (("rnu",), 2), (("doctr", "-x"), 2)]
 )
-def test_an_error_that_nobody_hears_keeps_its_code(tmp_path: Path, args: tuple[str, ...], code: int) -> None:
+def test_an_error_into_a_broken_pipe_keeps_its_code(tmp_path: Path, args: tuple[str, ...], code: int) -> None:
     done = ended(tmp_path, *args, unread="stderr")
     assert (done.returncode, done.stdout) == (code, "")

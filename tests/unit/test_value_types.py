@@ -60,7 +60,7 @@ def test_raw_and_value(form: str, raw: str, value: object) -> None:
         ("type: int16, range: [0, 100]", "0065", Quality.UNCERTAIN, Reason.OUT_OF_RANGE),
     ],
 )
-def test_what_is_no_good_value(form: str, raw: str, quality: Quality, reason: Reason) -> None:
+def test_invalid_values(form: str, raw: str, quality: Quality, reason: Reason) -> None:
     got = decode(tag(form), bytes.fromhex(raw), 7)
     assert (got.quality, got.reason) == (quality, reason)
     assert quality is not Quality.BAD or got.value is None
@@ -110,7 +110,7 @@ def test_bcd_comes_back(number: int, order: str) -> None:
         ("type: uint16, access: rw, bits: [0, 3]", 1),
     ],
 )
-def test_what_cannot_be_written(form: str, value: float) -> None:
+def test_unwritable_values(form: str, value: float) -> None:
     with pytest.raises(NotAllowed):
         encode(tag(form), value)
 

@@ -101,7 +101,7 @@ def test_a_second_one_does_not_wait_for_a_callback_that_may_never_end(loop: Virt
     assert done == ["once"]
 
 
-def test_a_handler_that_only_notes_it_lets_the_run_go_on(loop: VirtualLoop) -> None:
+def test_a_handler_that_only_records_the_signal_lets_the_run_continue(loop: VirtualLoop) -> None:
     noted: list[int] = []
     before = signal.signal(signal.SIGTERM, lambda number, frame: noted.append(number))
     try:

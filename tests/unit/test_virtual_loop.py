@@ -60,7 +60,7 @@ def test_timers_run_in_order_of_time_and_then_of_asking(delays_ms: list[int]) ->
     assert len(ran) == len(delays_ms)
 
 
-def test_what_is_ready_runs_before_time_goes_on() -> None:
+def test_ready_callbacks_run_before_time_advances() -> None:
     seen: list[str] = []
 
     async def main(loop: VirtualLoop) -> None:
@@ -107,7 +107,7 @@ def test_timeouts_and_waits_of_asyncio_work() -> None:
     assert run(main) == (True, 9_500_000_000)
 
 
-def test_a_deadlock_says_who_waits_for_what() -> None:
+def test_a_deadlock_names_the_waiting_tasks() -> None:
     """Each task by its name, with the line in its author's code and the awaited object, not with asyncio's innermost line."""
 
     async def takes(first: asyncio.Lock, second: asyncio.Lock) -> None:
@@ -264,7 +264,7 @@ def test_every_way_out_names_the_culprit(way: Callable[[VirtualLoop], Coroutine[
     assert "test_virtual_loop.py" in e.value.where
 
 
-def test_dates_are_what_they_were() -> None:
+def test_dates_are_unchanged() -> None:
     """Only the current time is unavailable: the rest of `datetime` works, and creates objects of the real types."""
     real, before = datetime.datetime, datetime.datetime(2026, 11, 21, tzinfo=UTC)
 
@@ -312,7 +312,7 @@ def test_other_threads_and_later_code_keep_their_clocks() -> None:
     assert isinstance(time.time(), float)
 
 
-def test_what_nobody_caught_is_kept() -> None:
+def test_an_uncaught_error_is_kept() -> None:
     async def fails() -> None:
         raise ValueError("lost")
 
@@ -386,7 +386,7 @@ def test_a_task_that_will_not_end_keeps_no_loop_open() -> None:
     assert loop.is_closed()
 
 
-def test_the_chance_of_everybody_is_the_seed_s_while_a_run_lasts() -> None:
+def test_global_random_generators_have_the_runs_seed_while_it_lasts() -> None:
     numpy = pytest.importorskip("numpy")
     random.seed(99)
     before = random.getstate()

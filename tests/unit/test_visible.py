@@ -19,7 +19,7 @@ from fieldtwin.gateway.core.escaping import visible
         ("\u202egnp.exe\x9b", "\\u202egnp.exe\\x9b"),
     ],
 )
-def test_what_cannot_be_seen_is_written_out(text: str, shown: str) -> None:
+def test_invisible_characters_are_escaped(text: str, shown: str) -> None:
     assert visible(text) == shown
     assert str(FileInvalid("a name", got=text)) == f"a name; got {shown}"
 

@@ -53,7 +53,7 @@ def test_the_timer_ends_a_wait_that_epoll_would_have_slept_on(monkeypatch: pytes
         assert time.monotonic() - began_s < 20
 
 
-def test_what_comes_while_the_end_of_a_wait_is_looked_away_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_event_at_the_end_of_a_wait_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(wallclock, "LEAD_SHARE", 1)
     monkeypatch.setattr(wallclock, "LEAD_NS", 20_000_000_000)
     here, there = socket.socketpair()
@@ -90,7 +90,7 @@ def test_nothing_spins_before_the_end_of_a_wait(monkeypatch: pytest.MonkeyPatch)
     assert len(asked) < 10
 
 
-def test_what_is_ready_is_told_beside_a_timer_that_ran_out() -> None:
+def test_a_ready_descriptor_is_reported_together_with_an_expired_timer() -> None:
     here, there = socket.socketpair()
     with selector() as subject, here, there:
         subject.register(here, selectors.EVENT_READ)

@@ -104,7 +104,7 @@ def test_a_request_has_no_reply_at_the_end_of_the_wait_or_of_the_connection(devi
     assert [e.problem for e in seen(device, problem="no reply")] == ["no reply"]
 
 
-def test_a_stray_frame_shows_what_it_is_and_is_no_request(device: Device) -> None:
+def test_a_stray_frame_is_shown_and_is_not_a_request(device: Device) -> None:
     with Client(device) as client, device.fault("duplicate"):
         client.ask(7)
         client.receive()
@@ -129,7 +129,7 @@ def test_exchanges_are_in_the_order_of_their_requests(device: Device) -> None:
     assert [e.problem for e in device.wire.exchanges()] == ["no reply", "", ""]
 
 
-def test_what_was_pending_before_clear_does_not_come_back(device: Device) -> None:
+def test_exchanges_pending_before_clear_do_not_return(device: Device) -> None:
     with Client(device) as client, device.fault("delay", by_ms=200):
         client.send(1)
         seen(device)
@@ -154,7 +154,7 @@ def test_expect_takes_bounds(device: Device) -> None:
         device.wire.expect(2, at_most=3)
 
 
-def test_an_asynchronous_driver_can_be_awaited_beside_expect(device: Device) -> None:
+def test_an_asynchronous_driver_can_be_awaited_during_expect(device: Device) -> None:
     async def drive() -> None:
         reader, writer = await asyncio.open_connection(device.host, device.port)
         writer.write(struct.pack(">HHHB", 1, 0, len(READ) + 1, device.unit) + READ)

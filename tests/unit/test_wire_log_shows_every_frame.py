@@ -56,7 +56,7 @@ def test_a_reply_with_a_wrong_unit_id_is_a_stray_of_the_device(device: Device) -
     assert device.wire.count() == 1
 
 
-def test_the_text_of_a_stray_says_why_its_bytes_are_hidden(device: Device) -> None:
+def test_the_text_of_a_stray_explains_why_its_bytes_are_hidden(device: Device) -> None:
     with device.fault("wrong-unit", unit_id=99):
         _ask(device)
     (stray,) = device.wire.expect(problem="stray", within_s=PATIENCE_S)
@@ -101,7 +101,7 @@ def test_an_rtu_reply_with_another_byte_count_and_a_right_check_sum_is_malformed
     assert _answers(long) == [("malformed", "8 bytes that answer something else")]
 
 
-def test_a_whole_reply_and_a_part_of_one_are_what_they_were() -> None:
+def test_a_whole_reply_and_a_part_of_one_are_unchanged() -> None:
     good = with_crc(bytes.fromhex("010404 43668000")).hex()
     assert [problem for problem, _ in _answers(good)] == [""]
     assert [problem for problem, _ in _answers(good[:14])] == ["pending"]

@@ -59,7 +59,7 @@ def test_scalars(scalar: str, value: object) -> None:
         ("a: \x00\n", 1, 0, "not YAML"),
     ],
 )
-def test_what_is_wrong_is_pointed_at(text: str, line: int, column: int, told: str) -> None:
+def test_errors_point_at_their_position(text: str, line: int, column: int, told: str) -> None:
     with pytest.raises(FileInvalid) as error:
         parse(text, "f.yaml")
     assert (error.value.line, error.value.column) == (line, column)
@@ -80,7 +80,7 @@ def test_what_is_wrong_is_pointed_at(text: str, line: int, column: int, told: st
         ("title: x\ninner: [1]\n", 2, 1, "inner"),
     ],
 )
-def test_a_model_says_what_it_wanted(text: str, line: int, column: int, told: str) -> None:
+def test_a_model_error_names_the_expected_type(text: str, line: int, column: int, told: str) -> None:
     file = parse(text, "f.yaml")
     with pytest.raises(FileInvalid) as error:
         validate(file, Outer)
@@ -103,13 +103,13 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
 
 
 @given(st.text(max_size=60))
-def test_no_text_raises_anything_else(text: str) -> None:
+def test_any_text_raises_only_file_invalid(text: str) -> None:
     with suppress(FileInvalid):
         validate(parse(text, "f"), Outer)
 
 
 @given(st.text(st.sampled_from("ab:[]{}-,&*!|>'\"%@`#?~ \n\t0.x"), max_size=40))
-def test_no_yaml_like_text_raises_anything_else(text: str) -> None:
+def test_any_yaml_like_text_raises_only_file_invalid(text: str) -> None:
     with suppress(FileInvalid):
         validate(parse(text, "f"), Outer)
 
@@ -132,6 +132,6 @@ def test_another_kind_of_file_is_named(tmp_path: Path, begins: bytes, told: str)
 
 
 @pytest.mark.parametrize("begins", [b"\xef\xbb\xbfa: 1\n", b"a: 1\r\nb: 2\r\n"])
-def test_what_editors_on_other_systems_write_is_read(tmp_path: Path, begins: bytes) -> None:
+def test_files_of_editors_on_other_systems_are_read(tmp_path: Path, begins: bytes) -> None:
     (tmp_path / "given").write_bytes(begins)
     assert load(tmp_path / "given").data["a"] == 1

@@ -40,14 +40,14 @@ def asked(period_s: int, **other: object) -> Asked:
     return Asked(system="observatory", period_s=period_s, **known, **form)  # type: ignore[arg-type]
 
 
-def test_a_command_that_keeps_what_is_required_has_no_objection_and_another_one_has() -> None:
+def test_a_command_that_keeps_the_requirements_has_no_objection_and_a_different_one_has() -> None:
     assert objection(asked(2)) == ""
     assert objection(asked(0)) == "\"relay.state == 'ACTIVE'\" does not hold 3 s from now; then relay.state: 'STANDBY'"
     at_the_end = objection(asked(2, require=(), finally_=("value(ctd.pressure) < 5",)))
     assert "does not hold 6 s from now; at the end ctd.pressure: 2" in at_the_end, "it went on from what was known"
 
 
-def test_what_cannot_be_asked_is_an_objection_too() -> None:
+def test_an_impossible_query_is_an_objection_too() -> None:
     assert "no tag or variable 'ctd.presure'" in objection(asked(2, require=("ctd.presure > 1",), only_check=True))
     assert "the horizon" in objection(asked(2, horizon_s=0.0, only_check=True))
     assert objection(asked(2, only_check=True)) == ""
@@ -66,13 +66,13 @@ def test_the_last_known_is_the_newest_of_each_name_and_nothing_that_turned_bad()
     assert known.unknown == ""
 
 
-def test_a_state_that_does_not_follow_from_its_period_is_taken_as_it_was_told() -> None:
+def test_a_state_that_does_not_follow_from_its_period_is_used_as_reported() -> None:
     known = LastKnown(OBSERVATORY)
     known.take([Event(1, 1, Kind.STATE, "relay", encode_status("OFF", 5).data)])
     assert known.state("").programs["relay"] == {"period": 5, "period_s": 5, "state": 2}
 
 
-def test_a_twin_asks_in_a_process_beside_it_and_what_gets_no_answer_is_refused() -> None:
+def test_a_twin_queries_in_a_separate_process_and_an_unanswered_command_is_refused() -> None:
     """Real processes: a forbidden command, an allowed one, and one without an answer in time."""
 
     async def main() -> tuple[list[str], list[bytes], list[int]]:
@@ -135,7 +135,7 @@ def test_nothing_is_forked_from_nothing() -> None:
 # -- rules ------------------------------------------------------------------------------------------------------------------
 
 
-def test_rules_say_what_is_asked(tmp_path: Path) -> None:
+def test_rules_define_the_query(tmp_path: Path) -> None:
     file = tmp_path / "rules.yaml"
     file.write_text(
         "what_if: {horizon: 30min, require: ['ctd.pressure < 900']}\n"
@@ -169,7 +169,7 @@ def _at(period_s: int) -> DigitalModel:
         ("true", "what_if"),
     ],
 )
-def test_what_is_wrong_with_a_question_is_said_with_its_line(tmp_path: Path, text: str, why: str) -> None:
+def test_errors_in_a_query_are_reported_with_their_line(tmp_path: Path, text: str, why: str) -> None:
     file = tmp_path / "rules.yaml"
     file.write_text(f"rules:\n  - {{when: bad, period_s: 0, what_if: {text}}}\n")
     with pytest.raises(FileInvalid, match=why) as caught:
@@ -177,7 +177,7 @@ def test_what_is_wrong_with_a_question_is_said_with_its_line(tmp_path: Path, tex
     assert ":2" in str(caught.value)
 
 
-def test_what_control_logic_prints_is_no_answer_and_what_it_dies_of_is_told(tmp_path: Path) -> None:
+def test_output_of_control_logic_is_not_an_answer_and_its_crash_is_reported(tmp_path: Path) -> None:
     """A custom system, whose program prints when it is imported, or ends the process."""
     (tmp_path / "loud.py").write_text(
         "import os, sys\nfrom fieldtwin.plc.program import Program\n\nprint('loud' * 100_000)\n"

@@ -33,7 +33,7 @@ OBSERVATORY = load_system("observatory")
 DEEP = KnownState({"ctd.pressure": 250.0, "ctd.temperature": 8.0}, {"relay": of_period(1)})
 
 
-def test_a_fork_goes_on_from_what_is_known() -> None:
+def test_a_fork_continues_from_the_known_state() -> None:
     """The relay is ACTIVE with its earlier period, and the sensor continues at its position in the cast."""
     outcome = answer(Fork("observatory", DEEP, 6.0, settle_s=3.0), Plan("go on", require=("relay.state == 'ACTIVE'",)))
     assert outcome.error == ""
@@ -48,7 +48,7 @@ def test_a_fork_goes_on_from_what_is_known() -> None:
     assert outcome.not_taken == []
 
 
-def test_a_mean_is_one_over_time_however_often_somebody_looked() -> None:
+def test_a_mean_is_over_time_and_independent_of_the_number_of_reads() -> None:
     """10 for ten seconds, reported each second; 20 for thirty, reported once; then bad for a minute; then 40 for ten."""
     seen = VariableOutcome()
     for second in range(10):
@@ -68,7 +68,7 @@ def test_a_mean_is_one_over_time_however_often_somebody_looked() -> None:
     assert "mean" not in words.described()
 
 
-def test_a_program_that_keeps_its_period_to_itself_is_commanded_what_is_known() -> None:
+def test_a_program_that_does_not_publish_its_period_gets_the_known_command() -> None:
     """For `adapt.st`, a store knows state and period, but not the period that it was ordered."""
     known = KnownState({}, {"adapt": of_period(10)})
     outcome = answer(Fork("ocean_west", known, 30.0), Plan("go on", require=("adapt.state == 'ACTIVE'",)))
@@ -113,21 +113,21 @@ def test_commands_and_faults_of_a_plan_and_the_same_again() -> None:
     assert {**again.described(), "took_s": 0} == {**off.described(), "took_s": 0}
 
 
-def test_somebody_listens_at_the_far_end() -> None:
+def test_messages_are_taken_at_the_remote_end() -> None:
     """Modems whose messages are not taken would become full, and the fork would predict losses that do not occur."""
     outcome = answer(Fork("observatory", DEEP, 40.0), Plan("go on", finally_=("relay.waiting < 3",)))
     assert outcome.met, outcome.described()
     assert outcome.variables["modem.link_sent"].last > 30
 
 
-def test_a_simulation_goes_on_from_its_values() -> None:
+def test_a_simulation_continues_from_its_values() -> None:
     known = KnownState({"localiser.x": 5.0, "localiser.heading": 0.0, "console.enable": 1, "console.speed": 1.0})
     outcome = answer(Fork("lab_vehicle", known, 4.0), Plan("drive", finally_=("localiser.x > 6",)))
     assert outcome.met, outcome.described()
     assert outcome.variables["localiser.x"].lowest >= 5.0
 
 
-def test_what_cannot_be() -> None:
+def test_impossible_plans() -> None:
     with pytest.raises(UsageError, match="the horizon"):
         answer(Fork("observatory", DEEP, 0.0), Plan("x"))
     with pytest.raises(UsageError, match="no tag or variable"):
@@ -143,7 +143,7 @@ def test_what_cannot_be() -> None:
 # -- where a state comes from ---------------------------------------------------------------------------------------------
 
 
-def test_a_state_file_says_what_it_was_given(tmp_path: Path) -> None:
+def test_a_state_file_reports_its_contents(tmp_path: Path) -> None:
     path = tmp_path / "now.json"
     path.write_text(DEEP.dump(OBSERVATORY), encoding="utf-8")
     again = read_state(path, OBSERVATORY)
@@ -245,7 +245,7 @@ def test_several_plans_by_command(tmp_path: Path) -> None:
         ([], "no commands"),
     ],
 )  # fmt: skip
-def test_a_plan_of_the_command_line_is_named_by_what_it_does(
+def test_a_plan_of_the_command_line_is_named_after_its_actions(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], name: str
 ) -> None:
     monkeypatch.chdir(tmp_path)

@@ -98,7 +98,7 @@ async def code(asking: Any) -> int:
     return caught.value.code
 
 
-def test_a_role_decides_what_a_bridge_s_client_may_do_and_is_on_record(pki: Pki, tmp_path: Path) -> None:
+def test_a_role_limits_a_bridges_client_and_is_recorded(pki: Pki, tmp_path: Path) -> None:
     rules = (
         AllowRule(roles=frozenset({"Viewer", "Operator"})),
         AllowRule(roles=frozenset({"Operator"}), functions=READ_FUNCTIONS | WRITE_FUNCTIONS),
@@ -124,7 +124,7 @@ def test_a_role_decides_what_a_bridge_s_client_may_do_and_is_on_record(pki: Pki,
     run(main())
 
 
-def test_who_has_no_certificate_of_ours_does_not_get_in(pki: Pki, tmp_path: Path) -> None:
+def test_a_client_without_our_certificate_is_refused(pki: Pki, tmp_path: Path) -> None:
     (tmp_path / "elsewhere").mkdir()
     foreign = make_pki(tmp_path / "elsewhere")
 
@@ -191,7 +191,7 @@ def test_served_tags_for_roles(pki: Pki) -> None:
     run(main())
 
 
-def test_pymodbus_behind_its_own_tls(pki: Pki, tmp_path: Path) -> None:
+def test_pymodbus_with_its_own_tls(pki: Pki, tmp_path: Path) -> None:
     async def main() -> None:
         context = ssl.create_default_context(cafile=pki.ca)
         context.check_hostname = False

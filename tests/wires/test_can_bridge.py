@@ -88,7 +88,7 @@ def test_every_kind_of_frame_crosses_once_and_nothing_comes_back() -> None:
     run(main())
 
 
-def test_both_ways_at_once_whole_and_in_order() -> None:
+def test_in_both_directions_at_once_complete_and_in_order() -> None:
     async def main() -> None:
         async with two_buses(paced=False) as (one, other, bridge):
             ends = [one.attach("a"), one.attach("b"), other.attach("c"), other.attach("d")]
@@ -126,7 +126,7 @@ def test_errors_stay_on_their_side() -> None:
     run(main())
 
 
-def test_a_bus_that_vanishes_ends_the_bridge_and_says_so() -> None:
+def test_a_bus_that_vanishes_ends_the_bridge_with_a_message() -> None:
     async def main() -> None:
         async with two_buses() as (one, other, bridge):
             await other.aclose()
@@ -234,7 +234,7 @@ def kernel_can() -> None:
 @pytest.mark.socketcan
 @pytest.mark.usefixtures("kernel_can")
 class TestVcan:
-    def test_the_command_joins_vcan0_both_ways_without_loops(self) -> None:
+    def test_the_command_joins_vcan0_in_both_directions_without_loops(self) -> None:
         async def main() -> None:
             async with command("--bitrate", "1000000", "--bridge", "vcan0") as (process, told):
                 soft = await open_can_end(Endpoint.parse(f"can:fieldtwin/{told['CAN bus']}"), 0)

@@ -49,7 +49,7 @@ async def heard(at: CanConnection, count: int) -> list[CanFrame]:
         return [CanFrame(frame.can_id, frame.data) for frame in [await at.recv() for _ in range(count)]]
 
 
-def test_what_no_fault_aims_at_passes_both_ways_in_order() -> None:
+def test_frames_without_a_fault_pass_in_both_directions_in_order() -> None:
     async def main() -> None:
         async with strangers({"name": "lost-frame", "cob_id": 0x705}) as (master, node, link):
             await master.send(ASK)
@@ -86,7 +86,7 @@ def test_a_request_is_lost_on_its_way_to_the_node() -> None:
     run(main())
 
 
-def test_what_is_late_comes_behind_what_follows_it() -> None:
+def test_a_delayed_frame_comes_after_its_followers() -> None:
     async def main() -> None:
         async with strangers({"name": "late-frame", "cob_id": 0x705, "by_ms": 30}) as (master, node, _):
             await node.send(BEAT)
@@ -96,7 +96,7 @@ def test_what_is_late_comes_behind_what_follows_it() -> None:
     run(main())
 
 
-def test_a_fault_of_its_own_speaks_for_the_node_that_it_names() -> None:
+def test_a_fault_that_sends_speaks_for_the_node_that_it_names() -> None:
     async def main() -> None:
         async with strangers({"name": "boot-storm", "unit": 9, "count": 3, "every_ms": 1}) as (master, _, link):
             assert await heard(master, 3) == [CanFrame(0x709, b"\0")] * 3
@@ -143,6 +143,6 @@ def test_whose_frame_it_is(frame: CanFrame, node: int) -> None:
         ({"name": "stuck", "device": "ctd", "register": "pressure"}, "expected one of a CAN bus"),
     ],
 )
-def test_what_a_link_of_buses_cannot_do(fault: dict[str, Any], told: str) -> None:
+def test_unsupported_faults_of_a_link_of_buses(fault: dict[str, Any], told: str) -> None:
     with pytest.raises(WrongAim, match=told):
         check_can_link(parse_fault(fault))

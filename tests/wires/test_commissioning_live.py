@@ -23,7 +23,7 @@ from fieldtwin.gateway.protocols.modbus.requests import ReadRegisters
 from fieldtwin.gateway.wallclock import WallClock
 
 
-def test_what_is_sent_is_in_the_log_when_the_reply_is_here(tmp_path: Path) -> None:
+def test_a_request_is_in_the_log_when_the_reply_arrives(tmp_path: Path) -> None:
     async def main() -> None:
         gone = asyncio.Event()
         bank = MapBank([Span("holding", 0, 10)])
@@ -55,7 +55,7 @@ def test_what_is_sent_is_in_the_log_when_the_reply_is_here(tmp_path: Path) -> No
     run(main())
 
 
-def test_a_log_goes_on_and_says_when_it_is_full(tmp_path: Path) -> None:
+def test_a_log_continues_and_reports_when_it_is_full(tmp_path: Path) -> None:
     path, endpoint = tmp_path / "sent.jsonl", Endpoint.parse("tcp://127.0.0.1:502")
     for _ in range(2):
         with WireLog(path, "x", max_bytes=250) as log:
@@ -70,7 +70,7 @@ def test_a_log_goes_on_and_says_when_it_is_full(tmp_path: Path) -> None:
         WireLog(tmp_path / "no" / "folder", "x")
 
 
-def test_a_url_of_the_wrong_kind_is_a_users_error_and_nobody_there_is_unreachable() -> None:
+def test_a_url_of_the_wrong_kind_is_a_users_error_and_a_missing_device_is_unreachable() -> None:
     async def main() -> None:
         with pytest.raises(UsageError, match="Modbus is not spoken"):
             async with modbus_at("can:fieldtwin/127.0.0.1:1"):

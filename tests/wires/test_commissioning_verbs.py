@@ -148,7 +148,7 @@ def test_a_node_on_the_software_bus(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_dump_that_was_killed_goes_on(tmp_path: Path) -> None:
+def test_a_dump_that_was_killed_continues(tmp_path: Path) -> None:
     """kill -9 in the middle of a dump from the command line; at most the last line is lost, and no request is repeated."""
     out = tmp_path / "d.jsonl"
 

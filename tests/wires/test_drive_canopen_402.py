@@ -64,7 +64,7 @@ def _until(condition: Callable[[], bool], within_s: float = 5.0) -> None:
         time.sleep(0.01)
 
 
-def test_a_stranger_s_state_machine_drives_the_drive() -> None:
+def test_a_third_party_state_machine_drives_the_drive() -> None:
     async def main() -> list[str]:
         server = await SoftBusServer.open(Endpoint.parse("can:fieldtwin/127.0.0.1:0"), 500_000)
         node = emulated_node(PROFILE, NODE, None, 0).node

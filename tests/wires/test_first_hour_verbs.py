@@ -83,7 +83,7 @@ def test_a_pty_with_a_hidden_baud_rate(tmp_path: Path) -> None:
     run(main(), timeout_s=40)
 
 
-def test_rtu_over_tcp_and_nobody_there() -> None:
+def test_rtu_over_tcp_and_a_missing_device() -> None:
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         device = slave()
         while data := await reader.read(256):
@@ -123,7 +123,7 @@ def test_a_drive_on_the_software_bus() -> None:
     run(main(), timeout_s=40)
 
 
-def test_an_interrupt_keeps_what_was_found_and_says_that_it_is_not_all(tmp_path: Path) -> None:
+def test_an_interrupt_keeps_the_results_and_marks_them_incomplete(tmp_path: Path) -> None:
     async def main() -> None:
         end = await PtyEnd.open(tmp_path / "line", Endpoint.parse("pty:line"))
         url = f"rtu:{tmp_path / 'line'}?baudrate=19200&frame=8N1"

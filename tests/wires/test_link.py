@@ -130,7 +130,7 @@ def test_an_emulated_connection_is_of_type_tcp_and_changes_nothing() -> None:
         EmulatedConnection(PROTOCOL.CAN)
 
 
-def test_every_byte_passes_both_ways_exactly_once(tmp_path: Path) -> None:
+def test_every_byte_passes_in_both_directions_exactly_once(tmp_path: Path) -> None:
     seeded = random.Random(7)
     outward, inward = seeded.randbytes(200_000), seeded.randbytes(200_000)
 
@@ -184,7 +184,7 @@ def test_the_port_stays_while_the_carrier_goes_and_comes_back(tmp_path: Path, dr
     run(main())
 
 
-def test_what_is_said_while_there_is_no_carrier_is_lost_and_counted_never_delivered_late(tmp_path: Path) -> None:
+def test_bytes_written_without_a_carrier_are_lost_and_counted_never_delivered_late(tmp_path: Path) -> None:
     async def main() -> None:
         with socket.socket() as sleeping:
             sleeping.bind(("127.0.0.1", 0))  # bound and not listening yet
@@ -209,7 +209,7 @@ def test_what_is_said_while_there_is_no_carrier_is_lost_and_counted_never_delive
 
 
 @pytest.mark.parametrize("away", ["waiting for a client", "between two attempts"])
-def test_the_line_is_cut_for_as_long_as_there_is_no_carrier(tmp_path: Path, away: str) -> None:
+def test_the_line_is_cut_while_there_is_no_carrier(tmp_path: Path, away: str) -> None:
     async def main() -> None:
         with socket.socket() as nobody:
             nobody.bind(("127.0.0.1", 0))
@@ -228,7 +228,7 @@ def test_the_line_is_cut_for_as_long_as_there_is_no_carrier(tmp_path: Path, away
     run(main())
 
 
-def test_what_is_in_flight_is_bounded_and_a_slow_driver_loses_nothing(tmp_path: Path) -> None:
+def test_bytes_in_transit_are_bounded_and_a_slow_driver_loses_nothing(tmp_path: Path) -> None:
     sent = random.Random(3).randbytes(8_000_000)  # more than both sockets and the link together hold
 
     async def main() -> None:
@@ -348,7 +348,7 @@ def test_a_serial_device_as_the_near_side_unplugged_and_back(tmp_path: Path) -> 
     run(main())
 
 
-def test_a_port_that_nobody_reads_loses_bytes_and_does_not_wedge_the_link(tmp_path: Path) -> None:
+def test_an_unread_port_loses_bytes_and_does_not_block_the_link(tmp_path: Path) -> None:
     async def main() -> None:
         loop = asyncio.get_running_loop()
         with Far() as far:
@@ -390,7 +390,7 @@ def test_between_two_tcp_sides_a_half_close_is_passed_on() -> None:
     run(main())
 
 
-def test_what_cannot_be_linked_is_refused_at_start(tmp_path: Path) -> None:
+def test_an_impossible_link_is_refused_at_start(tmp_path: Path) -> None:
     async def main() -> None:
         with pytest.raises(UsageError, match="carried over TCP"):
             await run_link(port(tmp_path), Endpoint.parse(f"pty:{tmp_path}/b"))
@@ -405,7 +405,7 @@ def test_what_cannot_be_linked_is_refused_at_start(tmp_path: Path) -> None:
     run(main())
 
 
-def test_a_serial_device_that_is_none_or_held_says_so(tmp_path: Path) -> None:
+def test_an_invalid_or_busy_serial_device_is_reported(tmp_path: Path) -> None:
     async def main() -> None:
         (tmp_path / "file").touch()
         with pytest.raises(Unreachable, match="no serial device"):

@@ -96,7 +96,7 @@ def test_socat_is_the_controllers_side(tmp_path: Path) -> None:
     run(main())
 
 
-def test_socat_is_the_field_side(tmp_path: Path) -> None:
+def test_socat_on_the_emulators_side(tmp_path: Path) -> None:
     async def main() -> None:
         async with socat("tcp-listen:0,bind=127.0.0.1", f"pty,raw,echo=0,link={tmp_path}/field") as process:
             assert process.stderr is not None

@@ -27,7 +27,7 @@ from fieldtwin.gateway.core.endpoint import Endpoint, SerialSettings
 from fieldtwin.gateway.core.errors import UsageError
 
 
-def test_the_setting_keeps_what_the_board_needs() -> None:
+def test_the_setting_keeps_the_boards_requirements() -> None:
     driver = struct.pack("=8I", RTS_AFTER_SEND | 1 << 5, 3, 4, 5, 0, 0, 0, 9)
     assert struct.unpack("=8I", settings_sent(driver)) == (ENABLED | RTS_ON_SEND | 1 << 5, 3, 4, 5, 0, 0, 0, 9)
 
@@ -68,7 +68,7 @@ def test_a_port_without_the_mode_is_refused_and_free_again() -> None:
         os.close(slave)
 
 
-def test_the_endpoint_says_so_or_not() -> None:
+def test_the_endpoint_enables_it_or_not() -> None:
     assert Endpoint.parse("rtu:/dev/ttyS0?rs485=1").rs485
     assert not Endpoint.parse("rtu:/dev/ttyS0").rs485
     with pytest.raises(UsageError, match="0 or 1"):

@@ -211,7 +211,7 @@ def test_a_strange_server_is_read_and_written(opened: Opened, tmp_path: Path) ->
 
 @pytest.mark.interop
 @pytest.mark.parametrize("opened", [pymodbus_ascii, pymodbus_rtu_over_tcp, libmodbus_tcp, libmodbus_rtu])
-def test_what_only_some_know(opened: Opened, tmp_path: Path) -> None:
+def test_functions_that_only_some_servers_support(opened: Opened, tmp_path: Path) -> None:
     async def main() -> None:
         async with opened(tmp_path) as client:
             await client.write_register(1, 5, 0x12)

@@ -99,7 +99,7 @@ def test_a_client_with_a_certificate_reads_and_writes_and_its_role_is_passed_on(
     run(main())
 
 
-def test_without_a_role_the_server_refuses_what_needs_one(pki: Pki) -> None:
+def test_without_a_role_the_server_refuses_restricted_functions(pki: Pki) -> None:
     async def main() -> None:
         async with server(pki) as (at, roles):
             endpoint = with_files(at, ca=pki.ca, cert=pki.cert("plain"), key=pki.key("plain"))
@@ -133,7 +133,7 @@ def test_a_server_that_is_not_the_one_is_refused(pki: Pki, name: str, files: dic
     run(main())
 
 
-def test_a_server_of_another_name_is_accepted_when_told_so(pki: Pki) -> None:
+def test_a_server_with_a_different_name_is_accepted_if_configured(pki: Pki) -> None:
     async def main() -> None:
         async with server(pki, "other", mutual=False) as (at, _):
             connection = await TlsConnection.open(with_files(at, ca=pki.ca, name="elsewhere"))
@@ -151,7 +151,7 @@ async def open_and_read(endpoint: Endpoint) -> None:
         await connection.aclose()
 
 
-def test_a_server_that_wants_a_certificate_says_so_before_or_after_opening(pki: Pki) -> None:
+def test_a_server_that_requires_a_certificate_reports_it_before_or_after_opening(pki: Pki) -> None:
     async def main() -> None:
         for version, error in ((ssl.TLSVersion.TLSv1_2, Unreachable), (ssl.TLSVersion.TLSv1_3, ConnectionLost)):
             async with server(pki, version=version) as (at, _):
@@ -161,7 +161,7 @@ def test_a_server_that_wants_a_certificate_says_so_before_or_after_opening(pki: 
     run(main())
 
 
-def test_a_server_without_tls_is_told_apart_and_a_silent_one_times_out(pki: Pki) -> None:
+def test_a_server_without_tls_is_recognised_and_a_silent_one_times_out(pki: Pki) -> None:
     async def main() -> None:
         async def talk(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
             await reader.read(1)
@@ -211,7 +211,7 @@ def test_bad_files_are_named_and_no_secret_is_shown(pki: Pki, tmp_path: Path) ->
         with_files(where, password="secret")
 
 
-def test_what_the_far_side_ends_is_lost(pki: Pki) -> None:
+def test_a_connection_closed_by_the_peer_is_lost(pki: Pki) -> None:
     async def main() -> None:
         async with server(pki) as (at, _):
             endpoint = with_files(at, ca=pki.ca, cert=pki.cert("client"), key=pki.key("client"))

@@ -59,7 +59,7 @@ def test_each_chunk_is_a_datagram() -> None:
     run(main())
 
 
-def test_a_lost_reply_is_a_timeout_and_a_late_one_is_told_by_its_transaction_id() -> None:
+def test_a_lost_reply_is_a_timeout_and_a_late_one_is_identified_by_its_transaction_id() -> None:
     async def main() -> None:
         async with device() as (connection, peer):
             client = ModbusClient.at(connection.endpoint, connection, WallClock(), timeout_s=0.05)
@@ -95,7 +95,7 @@ def test_datagrams_that_wait_together_are_not_joined() -> None:
     run(main())
 
 
-def test_a_stranger_is_not_heard() -> None:
+def test_a_foreign_datagram_is_ignored() -> None:
     async def main() -> None:
         async with device() as (connection, peer):
             await connection.write(b"?")
@@ -108,7 +108,7 @@ def test_a_stranger_is_not_heard() -> None:
     run(main())
 
 
-def test_nobody_listens() -> None:
+def test_no_program_listens() -> None:
     async def main() -> None:
         async with device() as (connection, peer):
             peer.close()

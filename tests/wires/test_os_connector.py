@@ -55,7 +55,7 @@ def test_the_scheme_decides_which_end_opens() -> None:
         ("pty:line1", "listening side"),
     ],
 )
-def test_what_cannot_be_opened_as_bytes_is_a_usage_error(url: str, says: str) -> None:
+def test_an_endpoint_without_a_byte_stream_is_a_usage_error(url: str, says: str) -> None:
     async def main() -> None:
         with pytest.raises(UsageError, match=says):
             await OsConnector().open_bytes(Endpoint.parse(url))
@@ -63,7 +63,7 @@ def test_what_cannot_be_opened_as_bytes_is_a_usage_error(url: str, says: str) ->
     run(main())
 
 
-def test_what_is_no_can_bus_or_an_unknown_interface_is_a_usage_error() -> None:
+def test_an_endpoint_that_is_not_a_can_bus_or_an_unknown_interface_is_a_usage_error() -> None:
     async def main() -> None:
         with pytest.raises(UsageError, match="no CAN bus"):
             await OsConnector().open_can(Endpoint.parse("tcp://h:1"), 125_000)
@@ -148,7 +148,7 @@ PLANT = Endpoint.parse("tcp://modem:502")
 PLANT_CAN = Endpoint.parse("can:socketcan/can0")
 
 
-def test_taps_see_every_byte_both_ways_under_the_plants_endpoint(tmp_path: Path) -> None:
+def test_taps_see_every_byte_in_both_directions_under_the_plants_endpoint(tmp_path: Path) -> None:
     async def main() -> None:
         capture, file = CaptureTap(), TapFile(tmp_path / "capture.jsonl")
         async with Echo() as target:
@@ -231,7 +231,7 @@ class Broken(CaptureTap):
         raise ValueError("a tap with a bug")
 
 
-def test_a_tap_that_fails_is_taken_off_reported_and_harms_nobody() -> None:
+def test_a_failing_tap_is_removed_and_reported_and_affects_nothing_else() -> None:
     async def main() -> None:
         reports: list[str] = []
         asyncio.get_running_loop().set_exception_handler(lambda _, context: reports.append(context["message"]))
@@ -250,7 +250,7 @@ def test_a_tap_that_fails_is_taken_off_reported_and_harms_nobody() -> None:
     run(main())
 
 
-def test_a_capture_is_bounded_and_counts_what_it_dropped(tmp_path: Path) -> None:
+def test_a_capture_is_bounded_and_counts_dropped_entries(tmp_path: Path) -> None:
     capture = CaptureTap(capacity=3)
     file = TapFile(tmp_path / "capture.jsonl", max_bytes=200)
     for n in range(5):
@@ -275,12 +275,12 @@ def test_a_full_disk_ends_the_capture_and_not_the_run() -> None:
     assert file.error is not None
 
 
-def test_a_capture_that_cannot_be_written_is_said_at_start(tmp_path: Path) -> None:
+def test_an_unwritable_capture_is_reported_at_start(tmp_path: Path) -> None:
     with pytest.raises(FileInvalid, match="cannot write the capture"):
         TapFile(tmp_path / "no" / "such" / "folder")
 
 
-def test_a_tapped_connector_passes_on_that_nobody_is_there() -> None:
+def test_a_tapped_connector_passes_on_that_the_device_is_missing() -> None:
     async def main() -> None:
         connector = TappedConnector(OsConnector(), [], WallClock())
         with pytest.raises(Unreachable):

@@ -92,7 +92,7 @@ def a_rover() -> ReplayUnit:
     return ProfiledReplay(load_profile(PROFILE), replay, unit_id)
 
 
-def test_what_is_registered_goes_before_what_was_recorded_and_is_counted() -> None:
+def test_registered_functions_precede_recorded_ones_and_are_counted() -> None:
     unit = a_rover()
     assert unit.respond(bytes.fromhex("79 00000001"), 0) == bytes.fromhex("79 00000001")
     assert unit.respond(bytes.fromhex("03 0115 0001"), 0) == bytes.fromhex("03 02 0000")
@@ -102,7 +102,7 @@ def test_what_is_registered_goes_before_what_was_recorded_and_is_counted() -> No
 
 @pytest.mark.parametrize("piece", [1, 3, 8])
 @pytest.mark.parametrize("noise", ["", "00", "FF 00", "01 03"])
-def test_a_frame_of_its_own_that_looks_like_a_shorter_one_with_a_zero_behind_it(noise: str, piece: int) -> None:
+def test_a_device_specific_frame_that_looks_like_a_shorter_one_followed_by_a_zero(noise: str, piece: int) -> None:
     factory_reset = bytes.fromhex("01 78 00 00 00 01 60 00")  # 01 78 00 00 00 with the checksum 01 60, and a 00
     line = RtuSlave({1: a_rover()})
     heard = bytes.fromhex(noise) + factory_reset + bytes.fromhex("01 03 01 00 00 01 85 F6")
@@ -110,7 +110,7 @@ def test_a_frame_of_its_own_that_looks_like_a_shorter_one_with_a_zero_behind_it(
     assert replies == [factory_reset, bytes.fromhex("01 03 02 00 57 F9 BA")]
 
 
-def test_a_recording_tells_how_long_functions_of_its_own_are() -> None:
+def test_a_recording_defines_the_length_of_device_specific_functions() -> None:
     lengths = (("78 00 00 00 01", 5), ("78 01", 2), ("41 07", 2))
     made = [Exchange(i / 10, 1, bytes.fromhex(pdu), bytes.fromhex(pdu), 0.01) for i, (pdu, _) in enumerate(lengths)]
     unit = ReplayUnit(ExchangeReplay(made), 1)

@@ -46,7 +46,7 @@ async def received(end: PtyEnd, count: int) -> bytes:
     return data
 
 
-def test_all_bytes_pass_unchanged_both_ways(tmp_path: Path) -> None:
+def test_all_bytes_pass_unchanged_in_both_directions(tmp_path: Path) -> None:
     async def main() -> None:
         end = await PtyEnd.open(tmp_path / "line1", LINE)
         port = open_port(tmp_path / "line1")
@@ -154,7 +154,7 @@ def test_a_file_in_the_way_is_kept(tmp_path: Path) -> None:
     run(main())
 
 
-def test_closing_wakes_who_waits(tmp_path: Path) -> None:
+def test_closing_wakes_waiting_readers(tmp_path: Path) -> None:
     async def main() -> None:
         end = await PtyEnd.open(tmp_path / "line1", LINE)
         reading = asyncio.create_task(end.read())
@@ -194,7 +194,7 @@ def test_a_flood_is_held_back_and_nothing_is_lost(tmp_path: Path) -> None:
     run(main())
 
 
-def test_writing_goes_on_after_the_other_side_flushed(tmp_path: Path) -> None:
+def test_writing_continues_after_the_other_side_flushed(tmp_path: Path) -> None:
     """A client that opens the port discards its content; a writer that waits for room must notice."""
 
     async def main() -> None:
@@ -236,7 +236,7 @@ def test_a_paced_reply_takes_the_time_of_the_line(tmp_path: Path, settings: Seri
     run(main())
 
 
-def test_what_is_read_is_there_when_the_line_has_carried_it(tmp_path: Path) -> None:
+def test_bytes_are_readable_when_the_line_has_carried_them(tmp_path: Path) -> None:
     """A device starts to process a request after its last character, and receives one request after the other."""
 
     async def main() -> None:

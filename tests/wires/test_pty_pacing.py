@@ -28,7 +28,7 @@ def test_times_of_a_line(baudrate: int, frame: str, char_us: float, t3_5_us: flo
     assert line.t1_5_ns / 1000 == pytest.approx(750 if baudrate > 19200 else 1.5 * char_us, abs=0.1)
 
 
-def test_characters_queue_behind_each_other() -> None:
+def test_characters_queue_one_after_the_other() -> None:
     line = SerialPacer(SerialSettings(10_000, "8N1"))  # 1 ms per character
     assert line.earliest_end(5_000_000, 3) == 8_000_000
     assert line.earliest_end(5_000_000, 3) == 8_000_000, "asking takes no time on the line"

@@ -64,7 +64,7 @@ async def collect(connection: SerialConnection, size: int) -> bytes:
     return data
 
 
-def test_every_byte_value_passes_both_ways_unchanged(line: Line) -> None:
+def test_every_byte_value_passes_unchanged_in_both_directions(line: Line) -> None:
     every = (
         bytes(range(256)) * 3
     )  # XON, XOFF, ^C, CR, NL and 0xFF are the characters that a badly configured line removes
@@ -89,7 +89,7 @@ def test_every_byte_value_passes_both_ways_unchanged(line: Line) -> None:
     run(main())
 
 
-def test_what_the_line_said_before_it_was_opened_is_thrown_away(line: Line) -> None:
+def test_bytes_from_before_the_opening_of_the_line_are_discarded(line: Line) -> None:
     async def main() -> None:
         os.write(line.master, b"a reply to somebody else")
         connection = await SerialConnection.open(line.endpoint)
@@ -100,7 +100,7 @@ def test_what_the_line_said_before_it_was_opened_is_thrown_away(line: Line) -> N
     run(main())
 
 
-def test_a_wake_up_with_nothing_to_read_is_no_hang_up(line: Line) -> None:
+def test_a_wake_up_without_data_is_not_a_hang_up(line: Line) -> None:
     async def main() -> None:
         connection = await SerialConnection.open(line.endpoint)
         connection._on_readable()  # as after a flush by the driver between poll and read
@@ -124,7 +124,7 @@ def test_baud_rate_and_frame_reach_the_port(line: Line) -> None:
     run(main())
 
 
-def test_a_parity_that_the_driver_does_not_apply_is_said(line: Line) -> None:
+def test_a_parity_that_the_driver_does_not_apply_is_reported(line: Line) -> None:
     async def main() -> None:
         connection = await SerialConnection.open(Endpoint.parse(f"rtu:{line.path}?frame=8E1"))
         assert connection.ignored == ("parity E",)
@@ -145,7 +145,7 @@ def test_no_such_port_lists_those_that_exist(monkeypatch: pytest.MonkeyPatch) ->
 
 
 @pytest.mark.parametrize("path", ["/dev/null", "/tmp"])
-def test_something_that_is_no_serial_port_is_unreachable(path: str) -> None:
+def test_a_file_that_is_not_a_serial_port_is_unreachable(path: str) -> None:
     async def main() -> None:
         with pytest.raises(Unreachable):
             await SerialConnection.open(Endpoint.parse(f"rtu:{path}"))
@@ -171,7 +171,7 @@ def _some_group() -> int:
     return 20 if os.getuid() == 0 else os.getgid()
 
 
-def test_a_second_opener_is_told_that_the_port_is_held(line: Line) -> None:  # MB-067
+def test_a_second_opener_gets_an_error_that_the_port_is_held(line: Line) -> None:  # MB-067
     async def main() -> None:
         first = await SerialConnection.open(line.endpoint)
         with pytest.raises(EndpointBusy, match="another program"):
@@ -182,7 +182,7 @@ def test_a_second_opener_is_told_that_the_port_is_held(line: Line) -> None:  # M
     run(main())
 
 
-def test_unplugged_gives_what_arrived_and_then_the_loss(line: Line) -> None:  # MB-066
+def test_unplugging_gives_received_bytes_and_then_the_loss(line: Line) -> None:  # MB-066
     async def main() -> None:
         connection = await SerialConnection.open(line.endpoint)
         os.write(line.master, b"last words")

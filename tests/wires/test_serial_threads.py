@@ -39,7 +39,7 @@ loop.close()
 """
 
 
-def test_bytes_go_both_ways_and_closing_ends_it(tmp_path: Path) -> None:
+def test_bytes_pass_in_both_directions_and_closing_ends_it(tmp_path: Path) -> None:
     async def main() -> None:
         link = tmp_path / "line"
         device = await PtyEnd.open(link, Endpoint.parse("pty:line"))

@@ -205,7 +205,7 @@ def test_udp_a_flood_is_dropped_and_counted() -> None:
     run(main())
 
 
-def test_udp_a_sender_that_is_gone_costs_the_others_nothing() -> None:
+def test_udp_a_vanished_sender_does_not_affect_the_others() -> None:
     async def main() -> None:
         async with udp_server(make_unit()) as (end, _, client):
             gone = UdpClient()
@@ -264,7 +264,7 @@ def test_tls_the_role_of_the_client_decides(pki: Pki) -> None:
 
 
 @needs_openssl
-def test_tls_nobody_gets_in_without_a_certificate(pki: Pki, tmp_path: Path) -> None:
+def test_tls_a_client_without_a_certificate_is_refused(pki: Pki, tmp_path: Path) -> None:
     served: list[str] = []
 
     async def serve(client: SocketEnd) -> None:

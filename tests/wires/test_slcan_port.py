@@ -52,7 +52,7 @@ class Client:
         await self.writer.wait_closed()
 
 
-def test_python_cans_slcan_both_ways() -> None:
+def test_python_cans_slcan_in_both_directions() -> None:
     sent = [
         can.Message(arbitration_id=0x605, data=bytes(8), is_extended_id=False),
         can.Message(arbitration_id=0x1FFFFFFF, data=b"\x01", is_extended_id=True),
@@ -112,7 +112,7 @@ def test_a_node_from_open_to_close() -> None:
     run(main())
 
 
-def test_who_only_listens_does_not_acknowledge() -> None:
+def test_a_listen_only_adapter_does_not_acknowledge() -> None:
     async def main() -> None:
         async with bench(1_000_000, monitored=False) as (server, port):
             alone, client = server.attach("alone"), await Client.join(port)
@@ -144,7 +144,7 @@ def test_a_burst_keeps_its_order_and_waits_for_the_wire() -> None:
     run(main())
 
 
-def test_status_tells_of_bus_off_and_what_was_queued_goes_out_after_it() -> None:
+def test_status_reports_bus_off_and_queued_frames_go_out_after_it() -> None:
     async def main() -> None:
         async with bench(10_000) as (server, port):
             client, other = await Client.join(port), server.attach("other")

@@ -41,7 +41,7 @@ async def hang_up(writer: asyncio.StreamWriter) -> None:
         pass
 
 
-def test_port_0_takes_a_free_one_and_says_which() -> None:
+def test_port_0_takes_a_free_one_and_reports_it() -> None:
     async def main() -> None:
         listener = await SocketListener.open(ANY_PORT, echo)
         assert listener.bound.port > 0
@@ -213,7 +213,7 @@ def test_a_failure_of_ours_is_reported_and_ends_only_that_client() -> None:
     assert [type(context["exception"]) for context in reported] == [ZeroDivisionError]
 
 
-def test_modbus_pipelined_in_order_and_told_to_the_tap() -> None:
+def test_modbus_pipelined_in_order_and_visible_to_the_tap() -> None:
     bank = MapBank([Span("holding", 0, 4)])
     bank.poke("holding", 0, 7)
     unit = ModbusUnit(bank)

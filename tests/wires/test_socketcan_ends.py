@@ -52,7 +52,7 @@ def ip(*arguments: str) -> None:
 
 
 @pytest.mark.skipif(has_socketcan(), reason="this kernel has SocketCAN")
-def test_a_kernel_without_socketcan_is_unreachable_and_says_what_to_do() -> None:
+def test_a_kernel_without_socketcan_is_unreachable_with_a_remedy() -> None:
     async def main() -> None:
         with pytest.raises(Unreachable, match=r"can:socketcan/vcan0: .*no SocketCAN.*can:fieldtwin/HOST:PORT"):
             await SocketCanConnection.open(VCAN0, 125_000)
@@ -73,7 +73,7 @@ def test_another_kind_of_endpoint_is_refused() -> None:
 @pytest.mark.socketcan
 @pytest.mark.usefixtures("kernel_can")
 class TestVcan:
-    def test_every_kind_of_frame_both_ways(self) -> None:
+    def test_every_kind_of_frame_in_both_directions(self) -> None:
         frames = [
             CanFrame(0x000),
             CanFrame(0x7FF, bytes(range(8))),

@@ -89,7 +89,7 @@ def test_the_data_bit_rate_is_checked() -> None:
     run(main())
 
 
-def test_an_older_bus_refuses_can_fd_with_an_error_that_says_so() -> None:
+def test_an_older_bus_refuses_can_fd_with_a_clear_error() -> None:
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         assert unpack_hello(await reader.readexactly(RECORD_SIZE)) is not None
         writer.write(Hello(500_000, status=2, window=1).pack())  # as version 1 answers a version that it does not know

@@ -40,7 +40,7 @@ async def ends(server: SoftBusServer) -> list[CanConnection]:
     ]
 
 
-def test_every_kind_of_end_is_told_of_its_own_controller_and_of_no_other() -> None:
+def test_every_kind_of_end_gets_errors_of_its_own_controller_only() -> None:
     async def main() -> None:
         async with bus() as server:
             all_ends = await ends(server)
@@ -64,7 +64,7 @@ def test_every_kind_of_end_is_told_of_its_own_controller_and_of_no_other() -> No
     run(main())
 
 
-def test_python_can_is_told_as_a_kernel_tells_and_of_each_error_when_it_asks() -> None:
+def test_python_can_gets_error_frames_like_those_of_a_kernel_and_each_error_on_request() -> None:
     def program(channel: str) -> list[tuple[int, int, int]]:
         with SoftBus(channel, [{"can_id": 0x7FF, "can_mask": 0x7FF}], bus_errors=True) as own:
             own.send(can.Message(arbitration_id=0x7FF, is_extended_id=False), 5.0)
@@ -90,7 +90,7 @@ def test_python_can_is_told_as_a_kernel_tells_and_of_each_error_when_it_asks() -
     run(main())
 
 
-def test_a_node_that_is_too_slow_is_told_once_it_reads() -> None:
+def test_a_slow_node_is_informed_once_it_reads() -> None:
     async def main() -> None:
         async with bus(paced=False) as server:
             sender = server.attach("sender")
@@ -109,7 +109,7 @@ def test_a_node_that_is_too_slow_is_told_once_it_reads() -> None:
     run(main())
 
 
-def test_alone_on_a_bus_that_nobody_watches() -> None:
+def test_alone_on_a_bus_without_listeners() -> None:
     async def main() -> None:
         async with bus(monitored=False) as server:
             alone = await open_can_end(server.bound, 0)

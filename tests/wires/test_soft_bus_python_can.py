@@ -173,7 +173,7 @@ def test_error_frames_and_records_cut_anywhere() -> None:
     run(main())
 
 
-def test_what_is_sent_last_is_not_lost_by_leaving() -> None:
+def test_the_last_frame_is_not_lost_by_leaving() -> None:
     async def main() -> None:
         async with bus(50_000) as server:
             watch, a = server.attach(), await join(server)

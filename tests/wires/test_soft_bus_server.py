@@ -142,7 +142,7 @@ def test_20000_frames_between_two_clients_in_order_and_whole() -> None:
     run(main(), timeout_s=40)
 
 
-def test_late_joiner_hears_only_what_starts_later() -> None:
+def test_late_joiner_receives_only_later_frames() -> None:
     async def main() -> None:
         async with bus(1000) as server:
             a = await SoftBusConnection.open(server.bound, 1000)
@@ -198,7 +198,7 @@ def test_a_client_that_floods_without_waiting_is_read_no_faster_than_the_bus_sen
     run(main())
 
 
-def test_a_slow_receiver_overruns_alone_and_stalls_nobody() -> None:
+def test_a_slow_receiver_overruns_alone_and_blocks_no_other() -> None:
     async def main() -> None:
         async with bus(paced=False, max_outbound_frames=16) as server:
             slow = socket.socket()
@@ -276,7 +276,7 @@ def test_the_bus_closing_is_a_lost_connection_for_readers_and_senders(kind: str)
     run(main())
 
 
-def test_what_arrived_before_the_bus_closed_is_still_read() -> None:
+def test_frames_received_before_the_bus_closed_are_still_read() -> None:
     async def main() -> None:
         async with bus() as server:
             a, b = server.attach(), await SoftBusConnection.open(server.bound, 125_000)
@@ -332,7 +332,7 @@ def test_refusals(opener) -> None:  # type: ignore[no-untyped-def]
 @pytest.mark.parametrize(
     "answer", [b"HTTP/1.1 400 Bad Request\r\n\r\n", b"", Hello(125_000, status=2, version=9).pack()]
 )
-def test_something_else_listens_there(opener, answer: bytes) -> None:  # type: ignore[no-untyped-def]
+def test_a_different_program_listens_there(opener, answer: bytes) -> None:  # type: ignore[no-untyped-def]
     async def main() -> None:
         async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
             await reader.read(100)
@@ -376,7 +376,7 @@ def test_a_client_that_breaks_the_protocol_is_dropped_alone(sent: bytes) -> None
     run(main())
 
 
-def test_another_version_is_told_ours() -> None:
+def test_a_different_version_gets_our_version() -> None:
     async def main() -> None:
         async with bus() as server:
             reader, writer = await asyncio.open_connection(*server.bound.address)

@@ -54,7 +54,7 @@ def test_a_notifier_whose_bus_is_shut_down_first_ends_without_an_error(
     assert uncaught == []
 
 
-def test_recv_without_a_limit_returns_none_when_its_bus_is_shut_down() -> None:
+def test_recv_without_a_timeout_returns_none_when_its_bus_is_shut_down() -> None:
     def use(one: SoftBus, other: SoftBus) -> None:
         got: list[can.Message | Exception | None] = []
         first = threading.Event()

@@ -42,7 +42,7 @@ async def collect(connection: TcpConnection, size: int) -> bytes:
     return data
 
 
-def test_bytes_pass_both_ways_and_the_socket_is_tuned() -> None:
+def test_bytes_pass_in_both_directions_and_the_socket_is_tuned() -> None:
     async def main() -> None:
         loop = asyncio.get_running_loop()
         async with connected() as (connection, peer):
@@ -60,7 +60,7 @@ def test_bytes_pass_both_ways_and_the_socket_is_tuned() -> None:
     run(main())
 
 
-def test_refused_says_that_nobody_listens() -> None:
+def test_the_message_of_a_refusal_is_that_no_program_listens() -> None:
     async def main() -> None:
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))  # bound and not listening: no other program can take the port meanwhile
@@ -102,7 +102,7 @@ def test_no_answer_ends_at_the_timeout() -> None:
     run(main())
 
 
-def test_end_of_stream_gives_what_arrived_and_then_the_loss() -> None:
+def test_end_of_stream_gives_received_bytes_and_then_the_loss() -> None:
     async def main() -> None:
         async with connected() as (connection, peer):
             peer.send(b"last words")
@@ -192,7 +192,7 @@ def test_a_writer_that_waits_learns_of_the_loss() -> None:
     run(main())
 
 
-def test_closing_sends_what_was_written_even_to_a_peer_that_never_reads_within_bounds() -> None:
+def test_closing_sends_written_bytes_even_to_a_peer_that_never_reads_within_bounds() -> None:
     async def main() -> None:
         loop = asyncio.get_running_loop()
         async with connected() as (connection, peer):

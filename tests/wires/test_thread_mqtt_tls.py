@@ -97,7 +97,9 @@ def test_certificates_users_and_passwords_are_asked_for_and_the_logs_are_equal(
     run(main())
 
 
-def test_whom_the_broker_does_not_want_hears_why(tmp_path: Path, pki: Pki, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_client_that_the_broker_refuses_gets_the_reason(
+    tmp_path: Path, pki: Pki, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "other").mkdir()
     stranger = make_pki(tmp_path / "other")
 
@@ -153,7 +155,7 @@ def test_a_broker_without_tls_is_asked_about(tmp_path: Path, pki: Pki) -> None:
     run(main())
 
 
-def test_a_topic_that_we_may_not_hear_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_forbidden_topic_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     """mosquitto grants every subscription and withholds messages; other brokers answer SUBACK with 0x80 (MQTT 3.9.3)."""
 
     gone = asyncio.Event()
@@ -194,6 +196,6 @@ def test_a_topic_that_we_may_not_hear_is_said(monkeypatch: pytest.MonkeyPatch) -
         ("mqtts://u:secret@broker/sea/obs", "a password in a URL"),
     ],
 )
-def test_what_is_wrong_in_the_url_is_said_at_once(place: str, text: str) -> None:
+def test_errors_in_the_url_are_reported_at_once(place: str, text: str) -> None:
     with pytest.raises((UsageError, Unreachable), match=text):
         twin_carrier(place, SYSTEM, CLOCK)

@@ -69,7 +69,7 @@ def port(place: str) -> int:
 @pytest.mark.parametrize(
     "place", ["tcp://0.0.0.0:7700", "tcp://[::]:7700", "tcp://plant:7700", "tls://0.0.0.0:7700?cert=a.pem&key=a.key"]
 )
-def test_nobody_is_let_in_from_elsewhere_without_a_certificate(place: str) -> None:
+def test_a_remote_client_without_a_certificate_is_refused(place: str) -> None:
     with pytest.raises(UsageError, match=r"whoever reaches this port may command the plant|asks for the clients'"):
         run(plant_carrier(place, SYSTEM, CLOCK))
 
@@ -78,6 +78,6 @@ def test_nobody_is_let_in_from_elsewhere_without_a_certificate(place: str) -> No
     "place",
     ["udp://127.0.0.1:1", "mqtt://broker", "mqtt://u:secret@broker/a/b", "mqtt://broker/a/b/c", "mqtt://broker/+/b"],
 )
-def test_a_place_that_is_none_is_refused(place: str) -> None:
+def test_an_invalid_place_is_refused(place: str) -> None:
     with pytest.raises(UsageError):
         twin_carrier(place, SYSTEM, CLOCK)

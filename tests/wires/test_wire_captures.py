@@ -37,7 +37,7 @@ FRAMES = [
 ]
 
 
-def test_what_a_tap_wrote_comes_back(tmp_path: Path) -> None:
+def test_the_content_of_a_tap_is_complete(tmp_path: Path) -> None:
     tap = TapFile(tmp_path / "capture.jsonl")
     tap.on_bytes(RTU, S, 10, b"\x01\x02")
     tap.on_bytes(TCP, R, 11, b"")

@@ -18,13 +18,15 @@ KILLS = int(os.environ.get("FIELDTWIN_KILLS", "100"))
 """Number of kills per process."""
 KILLS_OF_A_RUN = int(os.environ.get("FIELDTWIN_KILLS_OF_A_RUN", "12"))
 """A whole run takes seconds to start, so 100 of them take ten minutes; that number is only used manually."""
+SEED = int(os.environ.get("FIELDTWIN_KILLS_SEED", "0"))
+"""Another seed gives other instants."""
 
 
 class Victim:
     """A process of fieldtwin that can be started again at once. `rng` is the seeded random generator of the test."""
 
     def __init__(self, module: str, *args: str, root: Path, imports: str = "", seed: int = 1) -> None:
-        self.rng = random.Random(seed)
+        self.rng = random.Random(seed + 1000 * SEED)
         self.log = root / f"{module}.kills.err"
         self.log.touch()
         self.pid = 0

@@ -1,7 +1,7 @@
 """Each process is killed with SIGKILL 100 times at random instants, also while it starts: its stored data remain consistent.
 
-The instants are seeded. FIELDTWIN_KILLS and FIELDTWIN_KILLS_OF_A_RUN set the numbers; a whole run is killed 12 times by
-default, because it takes seconds to start.
+The instants are seeded (FIELDTWIN_KILLS_SEED, default 0). FIELDTWIN_KILLS and FIELDTWIN_KILLS_OF_A_RUN set the numbers;
+a whole run is killed 12 times by default, because it takes seconds to start.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from stores import ask, log_of, own
 sys.path.insert(0, str(CHECKOUT / "tests" / "unit"))
 from fan_hall import hall, writes
 
-pytestmark = [pytest.mark.long, pytest.mark.timeout(900)]
+pytestmark = [pytest.mark.long, pytest.mark.timeout(900 + 15 * max(KILLS, KILLS_OF_A_RUN))]
 
 RETAINING = """
 PROGRAM Fan

@@ -1,14 +1,17 @@
 #!/usr/bin/env python3
-"""The bridge from Modbus TCP to RTU on a pty that is not paced: requests a second, compared with mbusd's.
+"""The bridge from Modbus TCP to RTU on a pty that is not paced: requests per second, compared with a bridge in C and with mbusd.
 
     benchmarks/bridge.py [--seconds 5] [--runs 5] [--quick]
 
 One client in C style (a blocking socket that sends the next request when it has the reply) reads one register of a device that
 answers at once. A pty has no characters, so this measures the programs and the silences that they keep between frames, and no
-line. The peer mbusd is used if it is on PATH (Debian has no package of it); otherwise only our own figures are printed. mbusd
-waits at least 1 ms and two characters before a request. Our bridge runs with the silence that SL 2.5.1.1 recommends above 19200
-baud (1.75 ms), and with the silence of mbusd, for which the goal holds. As a bound, the table shows what the recommended silence
-allows if everything else takes no time.
+line. The silence before a request determines most of a rate, so programs are compared at the same silence:
+
+- at 1.75 ms, which SL 2.5.1.1 recommends above 19200 baud and which our bridge keeps by default;
+- at the silence of `mbusd -R 1`, 1 ms and two characters.
+
+The bridge in C (c/modbus_bridge.c) does only what every bridge has to do. mbusd is compared too if it is on PATH (Debian has no
+package of it). `over the silence` is the time of a request that is not silence: the device, the pty, and the program.
 """
 
 from __future__ import annotations
@@ -28,14 +31,15 @@ import tty
 from pathlib import Path
 from statistics import median
 
-from peers import HERE, Goals, cpu_s, free_port, python, ratio, row
+from peers import HERE, Goals, Missing, build, cpu_s, free_port, python, ratio
 
 from fieldtwin.gateway.core.endpoint import SerialSettings
 from fieldtwin.gateway.protocols.modbus.crc import with_crc
 
 BAUD, GOAL = 115_200, 0.9
 PEER_SILENCE_US = 1000 + round(2e7 / BAUD)
-RECOMMENDED, SAME = "fieldtwin bridge", f"the same, {PEER_SILENCE_US} us"
+RECOMMENDED_US = round(max(3.5 * SerialSettings(BAUD, "8N1").char_time_s, 0.00175) * 1e6)
+OURS, IN_C, MBUSD = "fieldtwin bridge", "bridge in C", "mbusd"
 REQUEST = bytes.fromhex("0001 0000 0006 01 03 0000 0001")
 RTU_REQUEST = with_crc(REQUEST[6:])
 RTU_REPLY = with_crc(bytes.fromhex("01 03 02 002a"))
@@ -81,22 +85,22 @@ def ready(port: int) -> None:
             time.sleep(0.1)
 
 
-def commands(name: str, port: int, path: str) -> list[str]:
+def commands(name: str, silence_us: int, in_c: Path, port: int, path: str) -> list[str]:
     """How a subject is started."""
-    if name == "mbusd":
+    if name == MBUSD:
         # The shortest pause between requests, no retries, in the foreground: its fastest.
         return ["mbusd", "-d", "-L", "-", "-v", "0", "-p", path, "-s", str(BAUD), "-P", str(port), "-R", "1", "-N", "0"]
-    target = f"rtu:{path}?baudrate={BAUD}&frame=8N1" + (f"&silence_us={PEER_SILENCE_US}" if name == SAME else "")
+    if name == IN_C:
+        return [str(in_c), str(port), path, str(silence_us)]
+    silence = "" if silence_us == RECOMMENDED_US else f"&silence_us={silence_us}"
+    target = f"rtu:{path}?baudrate={BAUD}&frame=8N1{silence}"
     return [python(), "-m", "fieldtwin", "bridge", f"tcp://127.0.0.1:{port}", target, "--instance", "bench"]
 
 
-def one(name: str, path: str, seconds: float, folder: str) -> tuple[float, float]:
+def one(command: list[str], port: int, seconds: float, folder: str) -> tuple[float, float]:
     """Requests a second, and CPU in microseconds a request."""
-    port = free_port()
     environment = {**os.environ, "XDG_RUNTIME_DIR": folder, "PYTHONPATH": str(HERE.parent)}
-    process = subprocess.Popen(
-        commands(name, port, path), env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    )
+    process = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
         ready(port)
         before = cpu_s(process.pid)
@@ -114,35 +118,45 @@ def main() -> int:
     parser.add_argument("--quick", action="store_true")
     options = parser.parse_args()
     seconds, runs = (1.0, 2) if options.quick else (options.seconds, options.runs)
-    names = [RECOMMENDED, SAME, *(["mbusd"] if shutil.which("mbusd") else [])]
+    try:
+        in_c = build("modbus_bridge")
+    except Missing as e:
+        print(f"not installed: {e}")
+        return 2
+    subjects = [(name, us) for us in (RECOMMENDED_US, PEER_SILENCE_US) for name in (OURS, IN_C)]
+    if shutil.which(MBUSD):
+        subjects.append((MBUSD, PEER_SILENCE_US))
     master, slave = pty.openpty()
     tty.setraw(slave)
     field = multiprocessing.get_context("fork").Process(target=device, args=(master,), daemon=True)
     field.start()
-    rates: dict[str, list[float]] = {name: [] for name in names}
-    costs: dict[str, list[float]] = {name: [] for name in names}
+    rates: dict[tuple[str, int], list[float]] = {subject: [] for subject in subjects}
+    costs: dict[tuple[str, int], list[float]] = {subject: [] for subject in subjects}
     try:
         with tempfile.TemporaryDirectory(prefix="ft.") as folder:
             Path(folder).chmod(0o700)
             for _ in range(runs):
-                for name in names:
-                    rate, cost = one(name, os.ttyname(slave), seconds, folder)
-                    rates[name].append(rate)
-                    costs[name].append(cost)
+                for subject in subjects:
+                    port = free_port()
+                    rate, cost = one(commands(*subject, in_c, port, os.ttyname(slave)), port, seconds, folder)
+                    rates[subject].append(rate)
+                    costs[subject].append(cost)
     finally:
         with contextlib.suppress(ProcessLookupError):
             field.terminate()
-    silence_s = max(3.5 * SerialSettings(BAUD, "8N1").char_time_s, 0.00175)
-    base = rates[names[-1]]
-    print(f"{'':<24} {'requests/s':>12}   {'ratio':>6}   {'CPU us a request':>16}")
-    for name in names:
-        print(f"{row(name, rates[name], base)}   {median(costs[name]):>16.0f}")
-    print(f"{'bound: the silence alone':<24} {1 / silence_s:>12.1f}")
-    if "mbusd" not in names:
-        print("mbusd is not installed: no comparison (Debian has no package; https://github.com/3cky/mbusd)")
-        return 2
+    print(f"{'':<18} {'silence us':>10}   {'requests/s':>10}   {'over the silence us':>19}   {'CPU us a request':>16}")
+    for (name, us), values in rates.items():
+        rate = median(values)
+        print(f"{name:<18} {us:>10}   {rate:>10.1f}   {1e6 / rate - us:>19.0f}   {median(costs[name, us]):>16.0f}")
+    print(
+        f"the recommended silence alone allows {1e6 / RECOMMENDED_US:.0f} requests/s, mbusd's {1e6 / PEER_SILENCE_US:.0f}"
+    )
     goals = Goals()
-    goals.least("requests/s at mbusd's silence, to mbusd's", ratio(rates[SAME], base), GOAL, "x")
+    for us in (RECOMMENDED_US, PEER_SILENCE_US):
+        goals.least(f"to the bridge in C, silence {us} us", ratio(rates[OURS, us], rates[IN_C, us]), GOAL, "x")
+    if (MBUSD, PEER_SILENCE_US) in rates:
+        theirs = rates[MBUSD, PEER_SILENCE_US]
+        goals.least("to mbusd, at its silence", ratio(rates[OURS, PEER_SILENCE_US], theirs), GOAL, "x")
     return goals.verdict()
 
 

@@ -73,7 +73,7 @@ def main() -> int:
     options = parser.parse_args()
     runs, seconds = (1, 1.0) if options.quick else (options.runs, options.seconds)
     try:
-        one, many, libmodbus = build("modbus_client"), build("modbus_clients"), build("modbus_server")
+        one, many, libmodbus = (build(f"modbus_{name}", "modbus") for name in ("client", "clients", "server"))
     except Missing as e:
         print(f"emulator_tcp: needs {e}", file=sys.stderr)
         return 2

@@ -24,17 +24,21 @@ class Missing(Exception):
     """A peer that is not installed; says what to install."""
 
 
-def build(name: str) -> Path:
-    """Compile benchmarks/c/NAME.c against libmodbus; the program's path."""
+def build(name: str, *libraries: str) -> Path:
+    """Compile benchmarks/c/NAME.c, linked with `libraries`, and return the program's path."""
     if shutil.which("cc") is None:
         raise Missing("a C compiler (Debian: gcc)")
     out = Path(tempfile.mkdtemp(prefix="fieldtwin-bench-")) / name
     source = HERE / "c" / f"{name}.c"
     done = subprocess.run(
-        ["cc", "-O2", "-o", str(out), str(source), "-lmodbus"], capture_output=True, text=True, check=False
+        ["cc", "-O2", "-o", str(out), str(source), *(f"-l{library}" for library in libraries)],
+        capture_output=True,
+        text=True,
+        check=False,
     )
     if done.returncode:
-        raise Missing(f"libmodbus's headers (Debian: libmodbus-dev): {done.stderr.strip().splitlines()[0]}")
+        needed = " ".join(f"lib{library}-dev" for library in libraries)
+        raise Missing(f"a C library (Debian: {needed}): {done.stderr.strip().splitlines()[0]}")
     return out
 
 

@@ -34,6 +34,8 @@ class Dripper:
     def __init__(self, segments: int = 1 << 30) -> None:
         self.aborts: list[bytes] = []
         self.uploads = 0
+        self.ignores = 0
+        """How many of the next uploads get no reply."""
         self._segments = self._left = segments
 
     async def serve(self, connection: CanConnection, clock: VirtualClock) -> None:
@@ -44,6 +46,8 @@ class Dripper:
                 await connection.send(CanFrame(0x586, b"\x43" + multiplexor + b"\x2a\0\0\0"))
             elif frame.can_id == 0x605 and request[0] == 0x80:
                 self.aborts.append(request)
+            elif frame.can_id == 0x605 and request[0] == 0x40 and self.ignores:
+                self.ignores -= 1
             elif frame.can_id == 0x605 and request[0] == 0x40:
                 self.uploads += 1
                 self._left = self._segments
@@ -132,3 +136,20 @@ def test_a_limit_below_the_timeout_does_not_shorten_the_wait_for_a_reply() -> No
                 await master.sdo_upload(5, 0x2000, 0)
 
     on_bus(Dripper().serve, use)
+
+
+def test_the_upload_that_gets_past_a_late_reply_has_the_same_limit() -> None:
+    """After a request without a reply, the master reads another object first; the node drips that one."""
+    node = Dripper()
+    node.ignores = 1
+
+    async def use(net: MemoryNet, url: str, clock: VirtualClock) -> None:
+        async with master_on(net, url, clock, sdo_transfer_s=20.0) as master:
+            with pytest.raises(ReplyTimeout, match="no reply to the request"):
+                await master.sdo_upload(5, 0x2000, 0, retries=0)
+            began_ns = clock.monotonic_ns()
+            with pytest.raises(ReplyTimeout, match="the node does not answer"):
+                await master.sdo_upload(5, 0x2000, 0, retries=0)
+            assert clock.monotonic_ns() - began_ns == pytest.approx(20 * NS_PER_S, abs=NS_PER_S)
+
+    on_bus(node.serve, use)

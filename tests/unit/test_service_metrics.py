@@ -125,6 +125,75 @@ def test_metrics_for_maintainers_exist() -> None:
     assert value(got, "plc_restarts_total") == 3
 
 
+SERIES = """
+fieldtwin_bus_connected gauge bus
+fieldtwin_bus_events_total counter bus,event
+fieldtwin_bus_latency_seconds_bucket histogram bus,le
+fieldtwin_bus_latency_seconds_count histogram bus
+fieldtwin_bus_latency_seconds_sum histogram bus
+fieldtwin_bus_not_produced_total counter bus
+fieldtwin_bus_opens_total counter bus
+fieldtwin_device_boots_total counter bus,device
+fieldtwin_device_emcys_total counter bus,device
+fieldtwin_device_errors_total counter bus,device
+fieldtwin_device_online gauge bus,device
+fieldtwin_device_pdos_total counter bus,device,direction
+fieldtwin_device_polls_total counter bus,device
+fieldtwin_device_wrong gauge bus,device
+fieldtwin_devices gauge
+fieldtwin_devices_left_out gauge
+fieldtwin_devices_online gauge
+fieldtwin_devices_wrong gauge
+fieldtwin_info gauge mode,system,version
+fieldtwin_log_dropped_total counter
+fieldtwin_logged_total counter
+fieldtwin_mailbox_messages_total counter device,what
+fieldtwin_mailbox_queued gauge device
+fieldtwin_outputs_pending gauge
+fieldtwin_outputs_safe gauge
+fieldtwin_plc_alive gauge
+fieldtwin_plc_events_total counter event
+fieldtwin_plc_forces gauge
+fieldtwin_plc_lateness_seconds gauge quantile,task
+fieldtwin_plc_losses_total counter
+fieldtwin_plc_missed_periods_total counter task
+fieldtwin_plc_overruns_total counter task
+fieldtwin_plc_programs_waiting gauge
+fieldtwin_plc_restarts_total counter
+fieldtwin_plc_running gauge task
+fieldtwin_plc_scan_seconds gauge quantile,task
+fieldtwin_plc_scans_total counter task
+fieldtwin_published_total counter
+fieldtwin_reloads_total counter
+fieldtwin_run_seconds gauge
+fieldtwin_server_events_total counter event,kind,name
+fieldtwin_status_age_seconds gauge
+fieldtwin_store_ok gauge
+fieldtwin_tags gauge quality
+fieldtwin_tags_oldest_seconds gauge
+fieldtwin_thread_dropped_total counter
+fieldtwin_up gauge process
+fieldtwin_writes_allowed gauge
+fieldtwin_writes_total counter result
+"""
+"""Name, type and labels of every series. Users have dashboards and alerts for them: a change breaks those."""
+
+
+def test_names_types_and_labels_are_those_that_dashboards_use() -> None:
+    found = {
+        " ".join((sample.name, family.type, ",".join(sorted(sample.labels)))).rstrip()
+        for family in text_string_to_metric_families(render(families(seen(thread={"dropped": 3}))))
+        for sample in family.samples
+    }
+    assert sorted(found) == sorted(SERIES.split("\n")[1:-1])
+
+
+def test_bounds_of_buckets_are_written_as_dashboards_use_them() -> None:
+    buckets = [dict(labels)["le"] for name, labels in scraped(render(families(seen()))) if name.endswith("_bucket")]
+    wanted = "0.001 0.002 0.005 0.01 0.02 0.05 0.1 0.2 0.5 1 2 5 +Inf"
+    assert buckets == wanted.split()
+
+
 def test_latency_is_a_histogram_whose_buckets_add_up() -> None:
     got = scraped(render(families(seen())))
     buckets = [value(got, "bus_latency_seconds_bucket", bus="line1", le=f"{ms / 1000:g}") for ms in BOUNDS_MS]

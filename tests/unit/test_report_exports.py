@@ -132,7 +132,7 @@ def test_a_run_as_waveforms(tmp_path: Path) -> None:
     system, path = observatory(), tmp_path / "run.vcd"
     write_vcd(path, run_trace(20), system, machines_of(system), "a run\nwith $end in its name")
     found = read_vcd(path)
-    assert [(t // MS, word(v)) for t, v in found["plc.relay_state"][1:]] == [
+    assert [(t // MS, word(v)) for t, v in found["plc.relay_state"]] == [
         (0, "STANDBY"), (2010, "ACTIVE"), (16_000, "OFF"), (18_000, "STANDBY"),
     ]  # fmt: skip
     assert found["faults.f1_drop"] == [(0, "x"), (12_000 * MS, "1"), (15_000 * MS, "0")]
@@ -152,10 +152,21 @@ def test_names_that_no_viewer_takes(tmp_path: Path) -> None:
     ]  # fmt: skip
     write_vcd(tmp_path / "a.vcd", events)
     found = read_vcd(tmp_path / "a.vcd")
-    assert [word(v) for _, v in found["a_b.c_d"]] == ["x", "1", "off"]
-    assert found["a_b.c_d_2"] == [(0, 0.0), (0, 2.0)]
+    assert [word(v) for _, v in found["a_b.c_d"]] == ["1", "off"]
+    assert found["a_b.c_d_2"] == [(0, 2.0)]
     assert found["_.x"] == [(0, 0.0)]
     assert found["_.y"] == [(0, "x"), (3 * MS, "1")]
+
+
+def test_a_text_does_not_meet_the_quality_of_another_tag(tmp_path: Path) -> None:
+    """A tag may have the name under which the quality of another one stands."""
+    events = [
+        note(1, Kind.TAG, "a.b", value=1.5, quality="good"), note(2, Kind.TAG, "a.b_quality", value="fine", quality="bad"),
+    ]  # fmt: skip
+    write_vcd(tmp_path / "a.vcd", events)
+    found = read_vcd(tmp_path / "a.vcd")
+    assert found["a.b_quality"] == [(0, "x"), (1 * MS, 0)]
+    assert [word(v) for _, v in found["a.b_quality_2"]] == ["x", "fine"]
 
 
 KINDS = st.sampled_from(list(Kind))

@@ -149,6 +149,7 @@ def bus_rule(active: Active, now_ns: Callable[[], int], from_nodes: frozenset[in
             return None
         again = frame
         spoilt += 1
+        active.struck += 1
         return Disturbance()
 
     return rule

@@ -29,6 +29,7 @@ def struck(faults: WireFaults, way: Way, frame: CanFrame, node: int, now_ns: int
             for piece in before
             for after in fault.strike(piece.frame, node, active.random)
         ]
+        active.struck += pieces != before
     return pieces
 
 

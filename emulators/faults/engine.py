@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 
-from fieldtwin.emulators.faults.fault import Active, Hang, Outcome, Piece, WireFault
+from fieldtwin.emulators.faults.fault import Active, Hang, Outcome, Piece, WireFault, passed
 from fieldtwin.emulators.faults.frames import Frame, Framing, Way, understood
 
 
@@ -67,15 +67,22 @@ class WireFaults:
                 if active.fault.divides:
                     dividing.append((active, active.fault))
                 else:
-                    outcome = _joined(outcome, frame, active.fault, active)
+                    outcome = _struck(outcome, frame, active.fault, active)
         for active, fault in dividing:
-            outcome = _joined(outcome, frame, fault, active)
+            outcome = _struck(outcome, frame, fault, active)
         return outcome
 
 
 def in_time(active: Active, now_ns: int) -> bool:
     """Return whether the start of a fault has been reached and its end has not."""
     return active.from_ns <= now_ns and (active.until_ns is None or now_ns < active.until_ns)
+
+
+def _struck(before: Outcome | None, frame: Frame, fault: WireFault, active: Active) -> Outcome:
+    """Apply a fault, and count it as struck if it changed anything."""
+    after = _joined(before, frame, fault, active)
+    active.struck += after != (before or passed(frame.data))
+    return after
 
 
 def _joined(before: Outcome | None, frame: Frame, fault: WireFault, active: Active) -> Outcome:
@@ -99,7 +106,12 @@ def _joined(before: Outcome | None, frame: Frame, fault: WireFault, active: Acti
 def _later(pieces: Iterable[Piece], behind: Piece) -> list[Piece]:
     return [
         Piece(
-            p.data, p.delay_s + behind.delay_s, p.overtake or behind.overtake, p.gather or behind.gather, p.back, p.gone
+            p.data,
+            p.delay_s + behind.delay_s,
+            p.overtake or behind.overtake,
+            p.gather or behind.gather,
+            p.back,
+            p.gone or behind.gone,
         )
         for p in pieces
     ]

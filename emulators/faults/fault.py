@@ -190,7 +190,10 @@ class Active:
     """Function codes of the table that contains the addresses; empty: all."""
 
     def strikes(self, frame: Frame, now_ns: int) -> bool:
-        """Return whether the fault strikes this frame, and count frames that match its aim."""
+        """Return whether the fault strikes this frame, and count frames that match its aim.
+
+        The caller counts it in `struck` if that changed the frame: a fault without an effect has tested nothing.
+        """
         aim = self.aim
         if now_ns < self.from_ns or (self.until_ns is not None and now_ns >= self.until_ns):
             return False
@@ -216,5 +219,4 @@ class Active:
             return False
         if aim.probability < 1.0 and self.random.random() >= aim.probability:
             return False
-        self.struck += 1
         return True

@@ -46,6 +46,8 @@ def fault(said: str) -> str:
         ("name: lost-frame, device: inclinometer, cob_id: 0x7F", False),
         ("name: silence, device: modem, function: 23", False),
         ("name: silence, device: modem, from: 1h", False),
+        ("name: wrong-function, device: ctd, function: 4, code: 4", False),
+        ("name: corrupt-crc, device: modem", False),
         ("name: drift, device: inclinometer, register: slope_long, per_s: 1", True),
     ],
 )

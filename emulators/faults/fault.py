@@ -217,6 +217,4 @@ class Active:
             return False
         if aim.every is not None and self.matched % aim.every:
             return False
-        if aim.probability < 1.0 and self.random.random() >= aim.probability:
-            return False
-        return True
+        return not (aim.probability < 1.0 and self.random.random() >= aim.probability)

@@ -21,6 +21,7 @@ from fieldtwin.gateway.devices.register_device import RegisterDriver, SensorDriv
 from fieldtwin.gateway.devices.transmitter import TransmitterDriver
 from fieldtwin.gateway.runtime.audit_log import AuditLog
 from fieldtwin.gateway.runtime.bridge.bridge import Bridge, BridgeConfig
+from fieldtwin.gateway.runtime.buses.bus import Bus
 from fieldtwin.gateway.runtime.buses.canopen_bus import CanopenBus
 from fieldtwin.gateway.runtime.buses.modbus_bus import ModbusBus
 from fieldtwin.gateway.runtime.image_io import ImageExchange
@@ -101,7 +102,9 @@ class Gateway:
         self._audit = audit
         self._started_ns = clock.monotonic_ns()
         self.drivers: dict[str, RegisterDriver | CanopenDriver] = {}
-        self.buses: dict[str, ModbusBus | CanopenBus] = {}
+        self.buses: dict[str, Bus] = {}
+        self._modbus: dict[str, ModbusBus] = {}
+        """Those of `buses` that can carry mailboxes and bridges."""
         for device in config.devices.values():
             driver = make_driver(device, config.buses[device.bus], self.tags, clock)
             self.let_trigger(driver)
@@ -109,13 +112,12 @@ class Gateway:
             self._declare(driver)
         for n, bus in enumerate(config.buses.values()):
             self._make_bus(bus, connector, n / len(config.buses))
-        modbus = {name: bus for name, bus in self.buses.items() if isinstance(bus, ModbusBus)}
-        self.bridges = [Bridge(b, modbus, connector, clock, audit, self._blocked, listen) for b in config.bridges]
+        self.bridges = [Bridge(b, self._modbus, connector, clock, audit, self._blocked, listen) for b in config.bridges]
         self.outputs = OutputWriter(self._make_outputs(), self.tags, audit, config.allow_writes)
         self.pumps = [
             MailboxPump(
                 d,
-                self._modbus(d),
+                self._modbus[d.config.bus],
                 audit,
                 allow_writes=config.allow_writes,
                 remote=config.remote,
@@ -152,12 +154,8 @@ class Gateway:
             )
         elif on_it or any(bus.name in b.buses for b in self.config.bridges):
             units = [d for d in on_it if isinstance(d, RegisterDriver)]
-            self.buses[bus.name] = ModbusBus(bus, units, connector, self.clock, self.tags, self._on_offline, offset)
-
-    def _modbus(self, driver: RegisterDriver) -> ModbusBus:
-        bus = self.buses[driver.config.bus]
-        assert isinstance(bus, ModbusBus)
-        return bus
+            made = ModbusBus(bus, units, connector, self.clock, self.tags, self._on_offline, offset)
+            self.buses[bus.name] = self._modbus[bus.name] = made
 
     def _make_outputs(self) -> list[Output]:
         """Return every tag that a program or a client of the gateway may write, and every tag that has a safe value."""
@@ -276,9 +274,6 @@ class Gateway:
         while not self.outputs.settled and self.clock.monotonic_ns() < deadline_ns:
             await self.clock.sleep_until_ns(self.clock.monotonic_ns() + 5 * NS_PER_MS)
         for bus in self.buses.values():
-            if isinstance(bus, CanopenBus):
-                await bus.stop_nodes(timeout_s / 2)
-            else:
-                await bus.halt(timeout_s / 2)
+            await bus.halt(timeout_s / 2)
         self.outputs.journal.flush()
         return self.outputs.settled

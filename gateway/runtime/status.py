@@ -6,6 +6,7 @@ from typing import Any
 
 from fieldtwin.gateway.devices.transmitter import TransmitterDriver
 from fieldtwin.gateway.runtime.buses.canopen_bus import CanopenBus
+from fieldtwin.gateway.runtime.buses.modbus_bus import ModbusBus
 from fieldtwin.gateway.runtime.gateway import Gateway
 
 
@@ -102,7 +103,7 @@ def _devices(gateway: Gateway, now_ns: int) -> dict[str, Any]:
                     "rpdos": {str(r.number): [tag for tag in r.tags if tag] for r in driver.rpdos},
                     "rpdos_sent": status.writes.frames,
                 }
-        else:
+        elif isinstance(bus, ModbusBus):
             for state in bus.devices:
                 found[state.driver.config.name] = {
                     "bus": bus.config.name,

@@ -225,7 +225,7 @@ async def converse_on_can(target: Endpoint, run_dir: Path, patience_s: float = 1
                     await driver.master.sdo_upload(driver.node, index, subindex)
                 except DeviceRefused:
                     pass  # expected: the comparison checks the abort code
-            await bus.stop_nodes(1.0)
+            await bus.halt(1.0)
             await _until_quiet(tap, patience_s)
     finally:
         audit.close()

@@ -25,7 +25,7 @@ from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.connection import ByteConnection, CanConnection
 from fieldtwin.gateway.core.endpoint import Endpoint
-from fieldtwin.gateway.core.errors import FieldtwinError, NotAllowed, Unreachable
+from fieldtwin.gateway.core.errors import FieldtwinError, NotAllowed, ReplyTimeout, Unreachable
 from fieldtwin.gateway.core.files.profile import load_profile
 from fieldtwin.gateway.devices.canopen_config import CanopenBusConfig, CanopenNodeConfig, RpdoConfig
 from fieldtwin.gateway.devices.canopen_device import CanopenDriver
@@ -34,6 +34,7 @@ from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig, Heartbeat,
 from fieldtwin.gateway.protocols.canopen.configure import PdoConfig
 from fieldtwin.gateway.protocols.canopen.pdo import PdoMapping
 from fieldtwin.gateway.runtime.audit_log import AuditLog
+from fieldtwin.gateway.runtime.buses.bus import HeldBack
 from fieldtwin.gateway.runtime.buses.canopen_bus import CanopenBus
 from fieldtwin.gateway.runtime.outputs.output import Output
 from fieldtwin.gateway.runtime.outputs.outputs import OutputWriter
@@ -230,7 +231,7 @@ def test_nothing_goes_to_a_node_that_is_not_operational_and_all_of_it_when_it_is
             r.want(controlword=7)
             await asyncio.sleep(0.5)
             assert len(r.field.rpdos) == sent
-            assert not r.bus.takes(r.status.driver, "controlword")
+            assert not r.bus.takes(r.status.driver.config.name, "controlword")
             assert r.writer.failures == 0  # it waits, without futile attempts
             await r.status.driver.master.send(CanFrame(0, bytes([0x01, NODE])))
             await asyncio.sleep(0.2)
@@ -287,8 +288,43 @@ def test_a_read_only_plant_is_sent_no_rpdo_and_no_download(tmp_path: Path) -> No
             assert {line[:2] for line in r.audit("refuse")} >= {("d.mode", "plc")}
             ends: list[FieldtwinError | None] = []
             driver = r.status.driver
-            r.bus.write(driver, "mode", driver.command("mode", 1), ends.append)  # nor past the writer
+            command = driver.command("mode", 1)
+            # The bus refuses the write even without the writer.
+            r.bus.write(driver.config.name, [("mode", command)], lambda tag, error: ends.append(error))
             assert isinstance(ends[0], NotAllowed)
+
+    run_virtually(main())
+
+
+def test_a_group_goes_in_one_frame_per_rpdo_and_ends_at_the_first_failed_write(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with rig(tmp_path) as r:
+            driver, ends = r.status.driver, list[tuple[str, type[Exception]]]()
+
+            def write(**values: int) -> None:
+                writes = [(tag, driver.command(tag, value)) for tag, value in values.items()]
+                r.bus.write("d", writes, lambda tag, error: ends.append((tag, type(error))))
+
+            write(controlword=6, mode=3, target_velocity=1000)
+            await eventually(lambda: len(ends) == 3)
+            assert ends == [(tag, type(None)) for tag in ("controlword", "target_velocity", "mode")]
+            assert r.field.rpdos == ["207#0600E8030000"]
+            assert r.field.downloaded(0x6060) == [b"\x03"]
+            await r.field.power_off()
+            ends.clear()
+            write(mode=1, controlword=7)
+            await eventually(lambda: len(ends) == 2)
+            assert ends == [("mode", ReplyTimeout), ("controlword", HeldBack)]
+            assert len(r.field.rpdos) == 1
+
+    run_virtually(main())
+
+
+def test_the_bus_knows_which_tags_the_node_sends_by_itself(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with rig(tmp_path) as r:
+            assert r.bus.unrequested("d", "statusword")
+            assert not r.bus.unrequested("d", "mode")
 
     run_virtually(main())
 

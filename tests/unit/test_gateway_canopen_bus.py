@@ -267,7 +267,7 @@ def test_without_permission_the_mapping_is_adopted_and_nothing_is_written(tmp_pa
             assert set(uploads) == {2}  # SDO uploads, and not one download
             assert r.audit() == []
             assert node.counters.nmt_commands == 1  # the operator's
-            await r.bus.stop_nodes(0.2)
+            await r.bus.halt(0.2)
             assert [f.data for f in r.frames if f.can_id == 0] == [bytes([1, NODE])]
 
     run(main())
@@ -280,7 +280,7 @@ def test_on_the_way_out_nodes_that_we_started_are_stopped_even_without_a_record(
             await eventually(lambda: r.quality("slope_long") == ("good", "none") and r.status.online)
             kept, r.bus._audit = r.bus._audit, AuditLog(Path("/dev/full"), WallClock())
             try:
-                await r.bus.stop_nodes(0.5)
+                await r.bus.halt(0.5)
             finally:
                 r.bus._audit.close()
                 r.bus._audit = kept

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import asyncio
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 
@@ -43,9 +43,10 @@ from fieldtwin.gateway.protocols.canopen.sync import Producer, SyncProducer, Tim
 from fieldtwin.gateway.protocols.canopen.sync_watch import SyncWatch
 from fieldtwin.gateway.runtime.audit_log import AuditLog
 from fieldtwin.gateway.runtime.buses.backoff import Backoff
+from fieldtwin.gateway.runtime.buses.bus import Ended
 from fieldtwin.gateway.runtime.buses.bus_turns import rates_of
 from fieldtwin.gateway.runtime.buses.modbus_bus import MOST_LOCALS, reason_of
-from fieldtwin.gateway.runtime.buses.node_writes import Done, NodeWrites
+from fieldtwin.gateway.runtime.buses.node_writes import Done, InOrder, NodeWrites
 from fieldtwin.gateway.runtime.buses.pending_config import Coming
 from fieldtwin.gateway.runtime.buses.poll_schedule import PollSchedule
 from fieldtwin.gateway.runtime.tags import TagTable
@@ -119,6 +120,7 @@ class CanopenBus:
     ) -> None:
         self.config = config
         self.nodes = {d.node: self._status(d, drivers, clock) for d in drivers}
+        self._by_name = {status.driver.config.name: status for status in self.nodes.values()}
         self.connected = False
         self.opens = 0
         self.locals: deque[str] = deque(maxlen=MOST_LOCALS)
@@ -182,32 +184,41 @@ class CanopenBus:
         because their time passed while the gateway did not run."""
         return self._not_produced + sum(status.writes.not_sent for status in self.nodes.values())
 
-    def takes(self, driver: CanopenDriver, tag: str) -> bool:
+    def takes(self, device: str, tag: str) -> bool:
         """Return whether a write of this tag can be sent now: the node is up, and also OPERATIONAL if the tag goes by
         RPDO."""
-        status = self.nodes[driver.node]
+        status = self._by_name[device]
+        driver = status.driver
         if not status.online or self._master is None:
             return False
         if driver.rpdo_of(tag) is not None:
             return driver.operational
         return self._master.node_state(driver.node) is not NmtState.STOPPED  # a stopped node answers no SDO (7.3.2.2)
 
-    def frame_of(self, driver: CanopenDriver, tag: str) -> Rpdo | None:
+    def frame_of(self, device: str, tag: str) -> Rpdo | None:
         """Return the RPDO that carries this tag together with others, or None for a tag that is written by itself."""
-        return driver.rpdo_of(tag)
+        return self._by_name[device].driver.rpdo_of(tag)
 
-    def settle_ns(self, driver: CanopenDriver, tag: str) -> int:
+    def settle_ns(self, device: str, tag: str) -> int:
         """Return for how many nanoseconds after a write the node may still report the value before it."""
-        rpdo = driver.rpdo_of(tag)
+        rpdo = self.frame_of(device, tag)
         if rpdo is None:
             return SETTLE_NS
         return SETTLE_NS + (2 * self.config.canopen.sync_ms * NS_PER_MS if rpdo.synchronous else 0)
 
-    def write(self, driver: CanopenDriver, tag: str, command: COMMAND, done: Done) -> None:
-        """Start a write; `done` is called with its result, at once if the write cannot be sent."""
+    def unrequested(self, device: str, tag: str) -> bool:
+        """Return whether a TPDO of the node brings this tag."""
+        return f"{device}.{tag}" in self._by_name[device].driver.pdo_tags
+
+    def write(self, device: str, writes: Sequence[tuple[str, COMMAND]], ended: Ended) -> None:
+        """Start to write tags of one node: those of one RPDO with one frame; see `Bus`."""
+        driver = self._by_name[device].driver
+        InOrder(driver, writes, self._write, ended).next()
+
+    def _write(self, driver: CanopenDriver, tag: str, command: COMMAND, done: Done) -> None:
         if not self._allow_writes:
             done(NotAllowed("this plant is read-only", where=driver.config.where))
-        elif not self.takes(driver, tag):
+        elif not self.takes(driver.config.name, tag):
             done(Unreachable("the node takes nothing now", where=driver.config.where))
         else:
             self.nodes[driver.node].writes.write(tag, command, done)
@@ -498,9 +509,9 @@ class CanopenBus:
                 status.start_again.cancel()  # it was started meanwhile, and left OPERATIONAL again
             status.start_again = asyncio.get_running_loop().call_later(START_AGAIN_S, again)
 
-    async def stop_nodes(self, timeout_s: float) -> None:
+    async def halt(self, timeout_s: float) -> None:
         """Put the nodes that the gateway started back to PRE-OPERATIONAL when it stops, so that they send no process
-        data."""
+        data. A node may take `timeout_s` seconds."""
         self._stopping = True
         if self._master is None or not self._allow_writes:
             return

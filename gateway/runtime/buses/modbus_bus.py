@@ -13,8 +13,9 @@ from __future__ import annotations
 
 import asyncio
 from collections import Counter, deque
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import TypeVar
 
 from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S, Clock
@@ -31,9 +32,9 @@ from fieldtwin.gateway.core.errors import (
     WrongDevice,
 )
 from fieldtwin.gateway.core.latency import Latencies
-from fieldtwin.gateway.core.values import Reason
+from fieldtwin.gateway.core.values import COMMAND, Reason
 from fieldtwin.gateway.devices.config import BusConfig
-from fieldtwin.gateway.devices.register_device import RegisterDriver
+from fieldtwin.gateway.devices.register_device import Progress, RegisterDriver
 from fieldtwin.gateway.devices.transmitter import TransmitterDriver
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient
 from fieldtwin.gateway.protocols.modbus.framings import framing_of
@@ -41,6 +42,7 @@ from fieldtwin.gateway.protocols.modbus.refusals import Acknowledged, GatewayRef
 from fieldtwin.gateway.protocols.modbus.server import NO_RESPONSE
 from fieldtwin.gateway.runtime.buses.backoff import Backoff
 from fieldtwin.gateway.runtime.buses.bridge_queue import GuestQueue
+from fieldtwin.gateway.runtime.buses.bus import Ended, not_sent
 from fieldtwin.gateway.runtime.buses.bus_turns import DeviceState, Turns, rates_of, restate, states_of
 from fieldtwin.gateway.runtime.buses.pending_config import Coming
 from fieldtwin.gateway.runtime.buses.unanswered import MOST_UNANSWERED, Unanswered
@@ -101,6 +103,7 @@ class ModbusBus:
     ) -> None:
         self.config = config
         self.devices = states_of(drivers, offset)
+        self._by_name = {device.driver.config.name: device for device in self.devices}
         self.connected = False
         self.opens = 0
         self.locals: deque[str] = deque(maxlen=MOST_LOCALS)
@@ -138,6 +141,43 @@ class ModbusBus:
     def online(self, driver: RegisterDriver) -> bool:
         """Return whether the device answers and is the expected one."""
         return any(d.driver is driver and d.online for d in self.devices)
+
+    def takes(self, device: str, tag: str) -> bool:
+        """Return whether a write of this tag can be sent now; see `Bus`."""
+        state = self._by_name.get(device)
+        return state is not None and state.online
+
+    def frame_of(self, device: str, tag: str) -> None:
+        """Return None, because registers have no frame that they always share; see `Bus`."""
+
+    def settle_ns(self, device: str, tag: str) -> int:
+        """Return 0: a server answers a write after it took effect; see `Bus`."""
+        return 0
+
+    def unrequested(self, device: str, tag: str) -> bool:
+        """Return False: a Modbus server sends nothing without a request; see `Bus`."""
+        return False
+
+    def write(self, device: str, writes: Sequence[tuple[str, COMMAND]], ended: Ended) -> None:
+        """Start to write tags of one device: adjacent registers with one request; see `Bus`."""
+        driver = self._by_name[device].driver
+        if len(writes) == 1:
+            [(tag, command)] = writes
+            driver.consumer.observe(command)
+            self.submit(Job(driver, driver.send, partial(ended, tag)))
+            return
+        progress = Progress()
+
+        def done(error: FieldtwinError | None) -> None:
+            for tag, _ in writes:
+                if tag in progress.confirmed:
+                    ended(tag, None)
+                else:
+                    unsent = bool(progress.sent) and tag not in progress.sent
+                    ended(tag, not_sent(driver.config.where) if unsent else error)
+
+        commands = [command for _, command in writes]
+        self.submit(Job(driver, partial(driver.write_together, commands, progress), done))
 
     def submit(self, job: Job) -> None:
         """Queue a job, ahead of every poll. If the queue is full or there is no connection, the job fails at once."""

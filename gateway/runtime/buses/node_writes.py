@@ -9,17 +9,21 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S, Clock
 from fieldtwin.gateway.core.errors import ConnectionLost, FieldtwinError, ReplyTimeout, Unreachable
 from fieldtwin.gateway.core.values import COMMAND
 from fieldtwin.gateway.devices.canopen_device import CanopenDriver
 from fieldtwin.gateway.devices.canopen_rpdo import Rpdo
+from fieldtwin.gateway.runtime.buses.bus import Ended, not_sent
 
 Done = Callable[[FieldtwinError | None], None]
 """Called once with the result of a write."""
+Write = Callable[[CanopenDriver, str, COMMAND, Done], None]
+"""Starts the write of one tag."""
 
 
 @dataclass
@@ -152,3 +156,46 @@ class NodeWrites:
                 await self._rpdo_wake.wait()
         except TimeoutError:
             pass  # an RPDO is due for repetition
+
+
+class InOrder:
+    """Writes tags of one node one after another, and those that share an RPDO together. After a failed write the other
+    tags are not sent; their error is `HeldBack`. `write` starts one write."""
+
+    def __init__(
+        self, driver: CanopenDriver, writes: Sequence[tuple[str, COMMAND]], write: Write, ended: Ended
+    ) -> None:
+        self._driver = driver
+        self._write = write
+        self._ended = ended
+        self._steps: list[list[tuple[str, COMMAND]]] = []
+        frames: dict[Rpdo, list[tuple[str, COMMAND]]] = {}
+        for tag, command in writes:
+            rpdo = driver.rpdo_of(tag)
+            step = frames.get(rpdo) if rpdo is not None else None
+            if step is None:
+                self._steps.append(step := [])
+                if rpdo is not None:
+                    frames[rpdo] = step
+            step.append((tag, command))
+        self._open = 0
+        self._error: FieldtwinError | None = None
+
+    def next(self) -> None:
+        """Start the next step, or end the remaining steps after a failure."""
+        if self._error is not None:
+            rest, self._steps = self._steps, []
+            for tag, _ in (item for step in rest for item in step):
+                self._ended(tag, not_sent(self._driver.config.where))
+        elif self._steps:
+            step = self._steps.pop(0)
+            self._open = len(step)
+            for tag, command in step:
+                self._write(self._driver, tag, command, partial(self._done, tag))
+
+    def _done(self, tag: str, error: FieldtwinError | None) -> None:
+        self._error = self._error or error
+        self._ended(tag, error)
+        self._open -= 1
+        if not self._open:
+            self.next()

@@ -6,11 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from fieldtwin.gateway.core.errors import FieldtwinError, NotAllowed
-from fieldtwin.gateway.core.values import COMMAND, TagValue
-from fieldtwin.gateway.devices.canopen_device import CanopenDriver
-from fieldtwin.gateway.devices.register_device import RegisterDriver
-from fieldtwin.gateway.runtime.buses.canopen_bus import CanopenBus
-from fieldtwin.gateway.runtime.buses.modbus_bus import Job, ModbusBus
+from fieldtwin.gateway.core.values import TagValue
+from fieldtwin.gateway.devices.driver import DeviceDriver
+from fieldtwin.gateway.runtime.buses.bus import Bus
 
 SAFE = "safe: "
 
@@ -21,8 +19,8 @@ class Output:
 
     tag: str
     local: str
-    driver: RegisterDriver | CanopenDriver
-    bus: ModbusBus | CanopenBus
+    driver: DeviceDriver
+    bus: Bus
     safe: float | None
     wanted: float | None = None
     by: str = ""
@@ -49,46 +47,28 @@ class Output:
     @property
     def ready(self) -> bool:
         """Whether the device accepts a write now."""
-        if isinstance(self.driver, CanopenDriver):
-            assert isinstance(self.bus, CanopenBus)
-            return self.bus.takes(self.driver, self.local)
-        assert isinstance(self.bus, ModbusBus)
-        return self.bus.online(self.driver)
+        return self.bus.takes(self.driver.config.name, self.local)
 
     @property
     def frame(self) -> object | None:
         """The frame that carries this output: the same object for each output that shares it, None for one that is
         written by itself."""
-        if isinstance(self.bus, CanopenBus) and isinstance(self.driver, CanopenDriver):
-            return self.bus.frame_of(self.driver, self.local)
-        return None
+        return self.bus.frame_of(self.driver.config.name, self.local)
 
     @property
     def settle_ns(self) -> int:
         """How many nanoseconds after a write the device may still report the value before it."""
-        if isinstance(self.bus, CanopenBus) and isinstance(self.driver, CanopenDriver):
-            return self.bus.settle_ns(self.driver, self.local)
-        return 0
+        return self.bus.settle_ns(self.driver.config.name, self.local)
 
     @property
     def read_back(self) -> bool:
-        """Whether the gateway reads it cyclically: by polls, or by process data that the node sends."""
+        """Whether the gateway reads it cyclically: by polls, or because the device sends it."""
         driver, tag = self.driver, self.driver.profile.tags[self.local]
         if not tag.readable:
             return False
-        if isinstance(driver, CanopenDriver) and self.tag in driver.pdo_tags:
+        if self.bus.unrequested(driver.config.name, self.local):
             return True
         return any(tag in driver.profile.group(group) for group in driver.config.poll)
-
-    def submit(self, command: COMMAND, done: Callable[[FieldtwinError | None], None]) -> None:
-        """Start the write."""
-        if isinstance(self.driver, CanopenDriver):
-            assert isinstance(self.bus, CanopenBus)
-            self.bus.write(self.driver, self.local, command, done)
-        else:
-            assert isinstance(self.bus, ModbusBus)
-            self.driver.consumer.observe(command)
-            self.bus.submit(Job(self.driver, self.driver.send, done))
 
     def shown(self, value: object) -> object:
         """Return `value` as the audit log may show it: a secret is not written down."""

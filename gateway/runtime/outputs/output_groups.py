@@ -11,18 +11,9 @@ The safe state is independent of groups: safe values are written one by one, wha
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
 
-from fieldtwin.gateway.core.errors import FieldtwinError
-from fieldtwin.gateway.core.values import COMMAND
-from fieldtwin.gateway.devices.register_device import Progress, RegisterDriver
-from fieldtwin.gateway.runtime.buses.modbus_bus import Job, ModbusBus
 from fieldtwin.gateway.runtime.outputs.output import Output
-from fieldtwin.gateway.runtime.outputs.refusals import HeldBack
-
-Ended = Callable[[Output, FieldtwinError | None], None]
-"""Called once for each member with the result of its write."""
 
 
 class OutputGroup:
@@ -53,72 +44,6 @@ class OutputGroup:
     def differing(self) -> list[Output]:
         """Return the members whose device does not hold the wanted value."""
         return [o for o in self.outputs if o.wanted is not None and o.held != o.wanted]
-
-    def submit(self, commands: Sequence[COMMAND], ended: Ended) -> None:
-        """Write all members. `commands` are the members' commands, in the same order."""
-        first = self.outputs[0]
-        if isinstance(first.driver, RegisterDriver) and isinstance(first.bus, ModbusBus):
-            self._submit_registers(first.driver, first.bus, commands, ended)
-        else:
-            _InOrder(self.outputs, commands, ended).next()
-
-    def _submit_registers(
-        self, driver: RegisterDriver, bus: ModbusBus, commands: Sequence[COMMAND], ended: Ended
-    ) -> None:
-        progress = Progress()
-
-        def done(error: FieldtwinError | None) -> None:
-            for output in self.outputs:
-                if output.local in progress.confirmed:
-                    ended(output, None)
-                else:
-                    unsent = bool(progress.sent) and output.local not in progress.sent
-                    ended(output, _not_sent(output) if unsent else error)
-
-        bus.submit(Job(driver, partial(driver.write_together, commands, progress), done))
-
-
-class _InOrder:
-    """Writes outputs one after another, and those that share a frame together. After a failed write the rest are not
-    sent."""
-
-    def __init__(self, outputs: Sequence[Output], commands: Sequence[COMMAND], ended: Ended) -> None:
-        self._ended = ended
-        self._steps: list[list[tuple[Output, COMMAND]]] = []
-        frames: dict[object, list[tuple[Output, COMMAND]]] = {}
-        for output, command in zip(outputs, commands, strict=True):
-            frame = output.frame
-            step = frames.get(frame) if frame is not None else None
-            if step is None:
-                self._steps.append(step := [])
-                if frame is not None:
-                    frames[frame] = step
-            step.append((output, command))
-        self._open = 0
-        self._error: FieldtwinError | None = None
-
-    def next(self) -> None:
-        """Start the next step, or end the remaining steps after a failure."""
-        if self._error is not None:
-            rest, self._steps = self._steps, []
-            for output, _ in (item for step in rest for item in step):
-                self._ended(output, _not_sent(output))
-        elif self._steps:
-            step = self._steps.pop(0)
-            self._open = len(step)
-            for output, command in step:
-                output.submit(command, partial(self._done, output))
-
-    def _done(self, output: Output, error: FieldtwinError | None) -> None:
-        self._error = self._error or error
-        self._ended(output, error)
-        self._open -= 1
-        if not self._open:
-            self.next()
-
-
-def _not_sent(output: Output) -> HeldBack:
-    return HeldBack("not sent: the write of another member of its group failed", where=output.driver.config.where)
 
 
 def groups_of(outputs: Sequence[Output]) -> list[OutputGroup]:

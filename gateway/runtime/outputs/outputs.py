@@ -11,13 +11,11 @@ and refusal is recorded in the audit log before it is sent.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import partial
 
 from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
 from fieldtwin.gateway.core.errors import EndpointBusy, FieldtwinError, NotAllowed, Unreachable
 from fieldtwin.gateway.core.values import Quality, Reason
-from fieldtwin.gateway.devices.canopen_device import CanopenDriver
-from fieldtwin.gateway.devices.register_device import RegisterDriver
+from fieldtwin.gateway.devices.driver import DeviceDriver
 from fieldtwin.gateway.runtime.audit_log import AuditLog
 from fieldtwin.gateway.runtime.outputs.first_reading import is_known, waits_for_reading
 from fieldtwin.gateway.runtime.outputs.output import SAFE, Output, as_sent
@@ -134,7 +132,7 @@ class OutputWriter:
             if not output.commanded and output.by.startswith(SAFE):
                 output.wanted, output.by = None, ""
 
-    def restated(self, driver: RegisterDriver | CanopenDriver, held: Mapping[str, bytes]) -> None:
+    def restated(self, driver: DeviceDriver, held: Mapping[str, bytes]) -> None:
         """Apply the new configuration of a driver's device.
 
         `held` is what the device held, as sent, by tag: a value that would now be sent as different bytes is written
@@ -151,11 +149,11 @@ class OutputWriter:
             if output.tag in held and as_sent(output) != held[output.tag]:
                 output.held = None
 
-    def as_sent(self, driver: RegisterDriver | CanopenDriver) -> dict[str, bytes]:
+    def as_sent(self, driver: DeviceDriver) -> dict[str, bytes]:
         """Return the values that a device's outputs hold, by tag, as the bytes that were sent."""
         return {o.tag: as_sent(o) for o in self.outputs if o.driver is driver and o.held is not None}
 
-    def forget(self, driver: RegisterDriver | CanopenDriver) -> None:
+    def forget(self, driver: DeviceDriver) -> None:
         """Forget what a lost device holds: after its return the values are unknown."""
         for output in self.outputs:
             if output.driver is driver:
@@ -275,7 +273,14 @@ class OutputWriter:
         by = {output.tag: output.by for output in group.outputs}
         for output in group.outputs:
             output.pending, output.untouched, output.waits_since_ns = True, False, None
-        group.submit(commands, lambda output, error: self._done(output, wanted[output.tag], by[output.tag], error))
+        members = {output.local: output for output in group.outputs}
+
+        def ended(local: str, error: FieldtwinError | None) -> None:
+            output = members[local]
+            self._done(output, wanted[output.tag], by[output.tag], error)
+
+        first = group.outputs[0]
+        first.bus.write(first.driver.config.name, list(zip(members, commands, strict=True)), ended)
 
     def _wait(self, output: Output, value: float) -> None:
         """Note that the device accepts no write now. An output that waits for `AWAY_AFTER_NS` is reported, once."""
@@ -332,7 +337,8 @@ class OutputWriter:
             output.answer(Unreachable("the write could not be put on record", where=name))
             return
         output.pending, output.untouched = True, False
-        output.submit(command, partial(self._done, output, value, output.by))
+        by = output.by
+        output.bus.write(name, [(output.local, command)], lambda local, error: self._done(output, value, by, error))
 
     def _refuse(self, output: Output, value: float, error: NotAllowed) -> None:
         """Refuse a value that may not be written. It is not tried again until a different value is wanted."""

@@ -24,6 +24,7 @@ from fieldtwin.gateway.core.errors import (
     WrongDevice,
 )
 from fieldtwin.gateway.runtime.audit_log import AuditLog
+from fieldtwin.gateway.runtime.buses.bus import HeldBack
 
 KEPT = 256
 """How many entries are kept."""
@@ -69,10 +70,6 @@ OF_PROGRAM = frozenset({Cause.LIMIT, Cause.NOT_WRITABLE})
 """Causes that require a change to the program or the configuration, whatever happens in the plant."""
 OF_DEVICE = frozenset({Cause.WRONG_DEVICE, Cause.DEVICE})
 """Causes that a disturbed device may also produce."""
-
-
-class HeldBack(NotAllowed):
-    """A member of a group was not sent because of another member."""
 
 
 def cause_of(error: FieldtwinError) -> Cause:

@@ -1,0 +1,84 @@
+"""The interface of a bus to the gateway and its outputs, the same for each protocol.
+
+Devices and tags are named as in the system file (``speed`` of ``drive``), so that a caller needs no driver of a certain
+protocol. This module must not know a protocol; what only one of them has (jobs, LSS) is a method of its bus.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
+from typing import Protocol
+
+from fieldtwin.gateway.core.errors import FieldtwinError, NotAllowed
+from fieldtwin.gateway.core.latency import Latencies
+from fieldtwin.gateway.core.values import COMMAND
+from fieldtwin.gateway.devices.config import BusConfig
+from fieldtwin.gateway.runtime.buses.pending_config import Coming
+
+Ended = Callable[[str, FieldtwinError | None], None]
+"""Called once for each tag with the result of its write: None, or the error; `HeldBack` for a tag that was not sent."""
+
+
+class HeldBack(NotAllowed):
+    """A member of a group was not sent because of another member."""
+
+
+def not_sent(where: str) -> HeldBack:
+    """Return the error of a tag of `where` that was not sent after the write of another tag failed."""
+    return HeldBack("not sent: the write of another member of its group failed", where=where)
+
+
+class Bus(Protocol):
+    """A bus with its devices. It runs until cancelled, and opens its connection again whenever it is lost."""
+
+    config: BusConfig
+    connected: bool
+    opens: int
+    """How many connections were opened so far."""
+    locals: deque[str]
+    """The local addresses of the connections so far, latest last; an empty text for a medium without addresses."""
+    error: str
+    """Why the bus is not connected; empty while it is."""
+    latency: Latencies
+
+    def takes(self, device: str, tag: str) -> bool:
+        """Return whether a write of this tag can be sent now: the device answers and is the expected one."""
+        ...
+
+    def frame_of(self, device: str, tag: str) -> object | None:
+        """Return the frame in which this tag is sent together with others: the same object for all tags of the frame,
+        None for a tag that is sent by itself."""
+        ...
+
+    def settle_ns(self, device: str, tag: str) -> int:
+        """Return for how many nanoseconds after a write the device may still report the value before it."""
+        ...
+
+    def unrequested(self, device: str, tag: str) -> bool:
+        """Return whether the device sends this tag by itself, so that the gateway does not have to poll it."""
+        ...
+
+    def write(self, device: str, writes: Sequence[tuple[str, COMMAND]], ended: Ended) -> None:
+        """Start to write tags of one device, each with its command, in this order and as close together as the protocol
+        allows. If a write fails, the tags that were not sent yet are not sent.
+
+        `ended` is called once for each tag, at once if the bus cannot send it.
+        """
+        ...
+
+    def reconfigure(self, coming: Coming) -> None:
+        """Take over a new configuration, each device's part between two of its polls."""
+        ...
+
+    def totals(self) -> Counter[str]:
+        """Return counters over all connections so far."""
+        ...
+
+    async def run(self) -> None:
+        """Open the connection, serve, and open it again, until cancelled."""
+        ...
+
+    async def halt(self, timeout_s: float) -> None:
+        """Stop sending, and put devices that the gateway started back, in at most `timeout_s` seconds for each."""
+        ...

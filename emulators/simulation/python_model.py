@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import importlib.util
 import math
+import traceback
 from collections.abc import Mapping
 from pathlib import Path
 from types import ModuleType
@@ -38,6 +39,7 @@ class PythonModel:
 
     def __init__(self, path: Path, name: str, start: Mapping[str, float]) -> None:
         self.where = f"{path}:{name}"
+        self._file = str(path)
         module = _load(path)
         made = getattr(module, name, None)
         if not isinstance(made, type) or not callable(getattr(made, "step", None)):
@@ -55,7 +57,8 @@ class PythonModel:
         try:
             values = self._model.step(t_s, dt_s, inputs)
         except Exception as e:
-            raise FileInvalid(f"step() failed at {t_s:g} s: {type(e).__name__}: {e}", path=self.where) from e
+            text = f"step() failed at {t_s:g} s{self._line_of(e)}: {type(e).__name__}: {e}"
+            raise FileInvalid(text, path=self.where) from e
         if not isinstance(values, Mapping):
             raise FileInvalid(
                 "step() returned no values", path=self.where, expected="{name: number}", got=repr(values)[:80]
@@ -68,6 +71,12 @@ class PythonModel:
                 )
             out[key] = float(value) if abs(value) < 1e308 or math.isinf(value) or math.isnan(value) else math.inf
         return out
+
+    def _line_of(self, error: Exception) -> str:
+        """Return the line of the user's file at which it failed, as `` in line 7``; empty if the file has no part in it."""
+        frames = traceback.extract_tb(error.__traceback__)
+        line = next((frame.lineno for frame in reversed(frames) if frame.filename == self._file), None)
+        return f" in line {line}" if line is not None else ""
 
 
 def _load(path: Path) -> ModuleType:

@@ -240,6 +240,8 @@ class ControlClient:
             if self._token:
                 request["token"] = self._token
             try:
+                if self._writer.is_closing():
+                    raise ConnectionLost("the other process closed its control channel", where=self._where)
                 async with asyncio.timeout(timeout_s):
                     self._writer.write(json.dumps(request).encode() + b"\n")
                     await self._writer.drain()

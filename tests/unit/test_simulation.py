@@ -141,7 +141,7 @@ def test_a_python_model(tmp_path: Path) -> None:
     [
         ("Tonk", "no class 'Tonk'"),
         ("Forgetful", "other names at 1 s"),
-        ("Broken", "failed at 1 s: ZeroDivisionError"),
+        ("Broken", "failed at 1 s in line 16: ZeroDivisionError"),
         ("Odd", "returned 'level'"),
         ("Unmade", "failed: RuntimeError: no"),
         ("Shadow", "returned the input"),

@@ -32,7 +32,7 @@ from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.concurrency.stop_signal import on_stop_signal
 from fieldtwin.gateway.core.control import ControlServer
 from fieldtwin.gateway.core.endpoint import Endpoint
-from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.twin.plant.child_main import child_main
 from fieldtwin.twin.prototype.field import FieldSide
@@ -99,6 +99,7 @@ class FieldProcess:
         self._config = config
         self._clock = WallClock()
         self._stop = asyncio.Event()
+        self._failure: FileInvalid | None = None
         self._fresh_asked = asyncio.Event()
         self._fresh_done: asyncio.Future[None] | None = None
         self._lease_changed = asyncio.Event()
@@ -146,6 +147,7 @@ class FieldProcess:
                     raise UsageError("the control channel's address", expected="HOST:PORT", got=self._config.control)
                 self.control_port = await server.listen_tcp(host or "127.0.0.1", int(port))
             on_stop_signal(self._stop.set)
+            asyncio.get_running_loop().set_exception_handler(self._on_exception)
             if on_ready is not None:
                 on_ready(self._field)
             await self._serve()
@@ -153,7 +155,18 @@ class FieldProcess:
             await server.aclose()
             socket.unlink(missing_ok=True)
             await self._field.aclose()
+        if self._failure is not None:
+            raise self._failure
         return 0
+
+    def _on_exception(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+        """End the process if a simulation failed while a client was served. Other failures end that client only."""
+        error = context.get("exception")
+        if isinstance(error, FileInvalid):
+            self._failure = self._failure or error
+            self._stop.set()
+        else:
+            loop.default_exception_handler(context)
 
     async def _serve(self) -> None:
         async with Nursery() as nursery:

@@ -25,7 +25,7 @@ from fieldtwin.gateway.core.concurrency.async_resource import Started
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.control import ControlClient, RemoteError
 from fieldtwin.gateway.core.endpoint import Endpoint
-from fieldtwin.gateway.core.errors import FieldtwinError, Unreachable, UsageError
+from fieldtwin.gateway.core.errors import ConnectionLost, FieldtwinError, Unreachable, UsageError
 from fieldtwin.gateway.core.image.image import OUTPUTS
 from fieldtwin.gateway.core.image.region import RegionReader
 from fieldtwin.gateway.wallclock import WallClock
@@ -48,6 +48,8 @@ from fieldtwin.twin.site.system import System
 
 PLC_EVERY_S = 0.25
 STARTING_S = 5.0
+ENDS_WITHIN_S = 2.0
+"""How long a process that has closed its control channel may take to end."""
 """Time in seconds in which a PLC may start and receive the gateway's first heartbeat."""
 HELD_KEPT = 20_000
 SERVED_WITHIN_S = 5.0
@@ -384,6 +386,19 @@ class ControlBench(Started):
         self._note(Kind.NOTE, FAR_END, {"text": f"commands {period_s} s", "period_s": period_s})
 
     async def _refresh(self) -> None:
+        try:
+            await self._look()
+        except ConnectionLost as e:
+            raise await self._reason_of(e) from e
+
+    async def _reason_of(self, lost: ConnectionLost) -> FieldtwinError:
+        """Return why a process closed its control channel. A process that fails does so a moment before it has ended."""
+        until_s = self.now_s() + ENDS_WITHIN_S
+        while (gone := self._gone()) is None and self.now_s() < until_s:
+            await asyncio.sleep(0.02)
+        return gone or lost
+
+    async def _look(self) -> None:
         gone = self._gone() or (self.lease.lost if self.lease is not None else None)
         if gone is not None:
             raise gone

@@ -7,20 +7,20 @@ FROM python:3.11-slim-bookworm AS build
 WORKDIR /src
 ENV PIP_NO_CACHE_DIR=1 PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_ROOT_USER_ACTION=ignore
 RUN python -m venv --without-pip /opt/fieldtwin
-# What fieldtwin stands on, and its client of a broker, in a layer of its own: a change of our code does not fetch it again.
+# The dependencies of fieldtwin, and its MQTT client, in a separate layer: a change of our code does not install them again.
 COPY pyproject.toml ./
 RUN python -c "import tomllib; p = tomllib.load(open('pyproject.toml', 'rb'))['project']; print(*p['dependencies'], *p['optional-dependencies']['mqtt'], sep='\n')" \
       > /tmp/requirements.txt \
  && pip --python /opt/fieldtwin/bin/python install -r /tmp/requirements.txt
 COPY . .
-# share: where the shipped profiles and recordings are, whatever the version of Python in their path.
+# share: the folder of the shipped profiles and recordings, independent of the Python version in their path.
 RUN pip --python /opt/fieldtwin/bin/python install --no-deps . \
  && cd / && ln -s "$(/opt/fieldtwin/bin/python -c 'from fieldtwin.twin.site.data_files import data_root; print(data_root())')" \
       /opt/fieldtwin/share
 
 FROM python:3.11-slim-bookworm
 LABEL org.opencontainers.image.title="fieldtwin" org.opencontainers.image.licenses="Apache-2.0"
-# iproute2 makes the host's vcan0 (docker-compose's profile vcan); nothing else uses it.
+# iproute2 creates the host's vcan0 (docker-compose's profile vcan); no other part uses it.
 RUN apt-get update -qq && apt-get install -y -qq --no-install-recommends iproute2 \
  && rm -rf /var/lib/apt/lists/* /var/cache/apt/*
 RUN useradd --uid 10001 --no-create-home --home-dir /nonexistent --shell /usr/sbin/nologin fieldtwin \

@@ -4,8 +4,8 @@
     benchmarks/bridge.py [--seconds 5] [--runs 5] [--quick]
 
 One client in C style (a blocking socket that sends the next request when it has the reply) reads one register of a device that
-answers at once. A pty has no characters, so this measures the programs and the silences that they keep between frames, and no
-line. The silence before a request determines most of a rate, so programs are compared at the same silence:
+answers at once. A pty has no character times, so this measures the programs and the silences that they keep between frames, not
+a line. The silence before a request determines most of a rate, so programs are compared at the same silence:
 
 - at 1.75 ms, which SL 2.5.1.1 recommends above 19200 baud and which our bridge keeps by default;
 - at the silence of `mbusd -R 1`, 1 ms and two characters.
@@ -57,7 +57,7 @@ def device(fd: int) -> None:
 
 
 def per_s(port: int, seconds: float) -> float:
-    """Replies a second."""
+    """Return replies per second."""
     with socket.create_connection(("127.0.0.1", port), timeout=10) as client:
         client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         replies, end = 0, time.perf_counter() + seconds
@@ -86,9 +86,9 @@ def ready(port: int) -> None:
 
 
 def commands(name: str, silence_us: int, in_c: Path, port: int, path: str) -> list[str]:
-    """How a subject is started."""
+    """Return the command that starts a subject."""
     if name == MBUSD:
-        # The shortest pause between requests, no retries, in the foreground: its fastest.
+        # The shortest pause between requests, no retries, in the foreground: its fastest settings.
         return ["mbusd", "-d", "-L", "-", "-v", "0", "-p", path, "-s", str(BAUD), "-P", str(port), "-R", "1", "-N", "0"]
     if name == IN_C:
         return [str(in_c), str(port), path, str(silence_us)]
@@ -98,7 +98,7 @@ def commands(name: str, silence_us: int, in_c: Path, port: int, path: str) -> li
 
 
 def one(command: list[str], port: int, seconds: float, folder: str) -> tuple[float, float]:
-    """Requests a second, and CPU in microseconds a request."""
+    """Return requests per second, and CPU time in microseconds per request."""
     environment = {**os.environ, "XDG_RUNTIME_DIR": folder, "PYTHONPATH": str(HERE.parent)}
     process = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:

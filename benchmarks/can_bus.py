@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
-"""The software CAN bus unpaced: frames/s from one process to another, whole and in order, and round trips between them.
+"""The software CAN bus unpaced: frames/s from one process to another, complete and in order, and round trips between them.
 
     benchmarks/can_bus.py [--runs 5] [--frames 100000] [--trips 3000]
 
 Three processes: the bus, and two programs on it. The peer is a plain TCP hub (24 bytes in, the same to all others, no model of
-a bus), with the same programs on it, in the same run; runs interleaved, medians, ratios. python-can's `udp_multicast` is shown
-where it works, for what a burst loses there. Goals: 10,000 frames/s, and half of the round trips within 300 us. Exit status 1
-when one is missed, or a frame is lost or out of order.
+a bus), with the same programs on it, in the same run; runs are interleaved; the results are medians and ratios. python-can's
+`udp_multicast` is shown where it works, with its losses in a burst. Goals: 10,000 frames/s, and half of the round trips within
+300 us. The exit status is 1 if a goal is missed, or a frame is lost or out of order.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ async def serve_bus() -> None:
 
 
 class _HubClient(asyncio.Protocol):
-    """Says what a bus says to a hello, confirms every record, and hands it to all others. As little as there can be."""
+    """A minimal hub: answer a hello like a bus, confirm every record, and pass it to all others."""
 
     everybody: ClassVar[set[_HubClient]] = set()
 
@@ -82,7 +82,7 @@ async def serve_hub() -> None:
 
 
 async def device(port: int) -> None:
-    """The other program: counts the stream and tells when it was whole, echoes what it is asked."""
+    """The second program: count the stream, report when it was complete, and echo requests."""
     from fieldtwin.emulators.endpoints.can_end import open_can_end
     from fieldtwin.gateway.core.canframe import CanFrame
     from fieldtwin.gateway.core.endpoint import Endpoint
@@ -106,7 +106,7 @@ async def device(port: int) -> None:
 
 
 async def measure(port: int, frames: int, trips: int) -> tuple[float, float, float, int]:
-    """Frames/s to the other process, median and 99th percentile of a round trip in us, and frames lost or out of order."""
+    """Return frames/s to the other process, median and 99th percentile of a round trip in us, and frames lost or out of order."""
     from fieldtwin.gateway.connections.soft_bus import SoftBusConnection
     from fieldtwin.gateway.core.canframe import CanFrame
     from fieldtwin.gateway.core.endpoint import Endpoint
@@ -146,7 +146,7 @@ def once(kind: str, frames: int, trips: int) -> tuple[float, float, float, int]:
 
 
 def lost_by_multicast() -> str:
-    """What a burst of `PEER_FRAMES` loses on python-can's udp_multicast, within one computer."""
+    """Return the losses of a burst of `PEER_FRAMES` on python-can's udp_multicast, within one computer."""
     program = f"""
 import can, time
 a = can.Bus(interface="udp_multicast", channel="239.74.163.2", ignore_config=True)

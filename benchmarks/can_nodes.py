@@ -3,9 +3,10 @@
 
     benchmarks/can_nodes.py [--runs 3] [--seconds 5] [--nodes 127]
 
-Do they keep up? How late is a TPDO against its timer, is one lost, what does the process cost? The peer is the `canopen` package:
-as many LocalNodes with periodic TPDOs and heartbeats on python-can's virtual bus, which models no timing at all. Each run is a
-process of its own, the two in turn, medians, ratios pair by pair. Exit status 1 when a goal is missed. Wants a quiet machine.
+Do they keep up? How late is a TPDO relative to its timer, is one lost, and how much CPU time does the process use? The peer is
+the `canopen` package: the same number of LocalNodes with periodic TPDOs and heartbeats on python-can's virtual bus, which does
+not model timing. Each run is a separate process, both alternate; the results are medians and ratios of pairs. The exit status
+is 1 if a goal is missed. Needs an idle machine.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ OURS, PEER = "fieldtwin", "canopen LocalNode"
 
 
 def late(times_s: dict[int, list[float]]) -> list[float]:
-    """How late each TPDO was against its node's own grid, in ms; the grid stands on the node's most punctual TPDO."""
+    """Return the lateness of each TPDO relative to its node's grid, in ms; the grid starts at the node's most punctual TPDO."""
     out: list[float] = []
     for times in times_s.values():
         offsets = [t - n * PERIOD_S for n, t in enumerate(times)]
@@ -39,7 +40,7 @@ def late(times_s: dict[int, list[float]]) -> list[float]:
 
 
 def report(times_s: dict[int, list[float]], nodes: int, seconds: float, cpu_s: float, load: float) -> None:
-    """One line of JSON: the outcome of one side's run."""
+    """Return one line of JSON: the result of one side's run."""
     lateness = late(times_s)
     whole = round(seconds / PERIOD_S)
     fewest = min((len(times) for times in times_s.values()), default=0) if len(times_s) == nodes else 0
@@ -59,7 +60,7 @@ def report(times_s: dict[int, list[float]], nodes: int, seconds: float, cpu_s: f
 
 
 async def ours(nodes: int, seconds: float) -> None:
-    """Every node with its recording and model on the paced bus; a watcher counts what really went over it."""
+    """Run every node with its recording and model on the paced bus; a watcher counts the frames on it."""
     from fieldtwin.emulators.canopen.serve import serve_node
     from fieldtwin.emulators.endpoints.bus_runner import BusRunner
     from fieldtwin.emulators.models.emulated_node import emulated_node
@@ -82,7 +83,7 @@ async def ours(nodes: int, seconds: float) -> None:
         made.append(node)
         tasks.append(asyncio.create_task(serve_node(bus.attach(here), node, clock)))
     await asyncio.sleep(0.2)
-    for node_id in range(1, nodes + 1):  # by SDO and one after the other, so that the timers are not in step
+    for node_id in range(1, nodes + 1):  # by SDO and one after the other, so that the timers are not synchronised
         event = b"\x2b\x00\x18\x05" + round(PERIOD_S * 1000).to_bytes(4, "little")
         await master.send(CanFrame(0x600 + node_id, event))
         await master.send(
@@ -108,7 +109,7 @@ async def ours(nodes: int, seconds: float) -> None:
     }
     lost = sum(len(times) for times in sent.values()) - sum(seen.values())
     assert master.overruns == 0, master.overruns
-    assert abs(lost) <= 2 * nodes * 0.02 + 2, lost  # in flight at the window's edges
+    assert abs(lost) <= 2 * nodes * 0.02 + 2, lost  # in transit at the window's edges
     bits = bus.stats()["bits"] - before["bits"]
     report(sent, nodes, seconds, cpu, bits / BITRATE / seconds)
     for task in tasks:
@@ -117,7 +118,7 @@ async def ours(nodes: int, seconds: float) -> None:
 
 
 def peer(nodes: int, seconds: float) -> None:
-    """LocalNodes with periodic TPDOs; a bus beside them takes the times of arrival."""
+    """Run LocalNodes with periodic TPDOs; an additional bus records the times of arrival."""
     import can
     import canopen
 

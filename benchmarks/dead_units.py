@@ -1,16 +1,16 @@
 #!/usr/bin/env python3
-"""31 units on a serial line at 19200 8N1, 30 of them silent: how many of its polls does the unit that answers keep?
+"""31 units on a serial line at 19200 8N1, 30 of them silent: which share of its polls does the unit that answers keep?
 
     benchmarks/dead_units.py [--runs 1] [--seconds 150] [--quick]
 
-A process models the line and the one unit on a pty, on the wall clock: the characters of request and reply, 5 ms of the
-unit's own, silence for all other units. It notes when it hears which unit asked for. Every unit is to be polled for one register
-every 500 ms, with a timeout of 1 s and one repetition: first by our gateway (a process of its own), then by pymodbus's async
-client in a loop that asks the units in turn, begins a round every 500 ms, and begins it at once when the last one took longer.
-The figure is the share of the live unit's polls that took place in the worst minute, from the first request on.
+A process models the line and the one unit on a pty, in real time: the characters of request and reply, 5 ms of response time,
+silence for all other units. It records the time and unit of each request. Every unit is polled for one register every 500 ms,
+with a timeout of 1 s and one repetition: first by our gateway (a separate process), then by pymodbus's async client in a loop
+that asks the units in order and starts a round every 500 ms, or at once if the last one took longer. The figure is the share
+of the live unit's polls that took place in the worst minute, from the first request on.
 
-Exit status 1 when the goal is missed, 2 without pymodbus, 3 when the host took so much time away from this machine (steal) that
-the figures say nothing.
+The exit status is 1 if the goal is missed, 2 without pymodbus, and 3 if the host took so much CPU time from this machine
+(steal) that the figures have no meaning.
 """
 
 from __future__ import annotations
@@ -122,7 +122,7 @@ def system_file(folder: Path) -> Path:
 
 
 async def our_polls(port: str, seconds: float) -> None:
-    """Let our gateway poll for so long."""
+    """Let our gateway poll for this time."""
     with tempfile.TemporaryDirectory(prefix="ft-dead-") as name:
         folder = Path(name)
         path = system_file(folder)
@@ -142,7 +142,7 @@ async def our_polls(port: str, seconds: float) -> None:
 
 
 async def peer_polls(port: str, seconds: float) -> None:
-    """Let pymodbus poll for so long."""
+    """Let pymodbus poll for this time."""
     process = await asyncio.create_subprocess_exec(python(), "-c", PEER, port, str(UNITS), str(PERIOD_S))
     try:
         await asyncio.sleep(seconds)
@@ -154,7 +154,7 @@ async def peer_polls(port: str, seconds: float) -> None:
 
 
 def worst_minute(times: list[float], first: float, seconds: float) -> float:
-    """The lowest share of the polls due in any window of one minute that begins on a tenth of a second."""
+    """Return the lowest share of the due polls in any window of one minute that starts on a tenth of a second."""
     shares = []
     for tenth in range(int((seconds - WINDOW_S) * 10) + 1):
         start = first + tenth / 10
@@ -163,7 +163,7 @@ def worst_minute(times: list[float], first: float, seconds: float) -> float:
 
 
 def measure(name: str, seconds: float) -> tuple[float, float]:
-    """The share of its polls that the live unit keeps, in its worst minute and altogether."""
+    """Return the share of its polls that the live unit keeps, in its worst minute and in total."""
     master, slave = pty.openpty()
     tty.setraw(slave)
     ours, theirs = multiprocessing.Pipe(duplex=False)
@@ -192,7 +192,7 @@ def measure(name: str, seconds: float) -> tuple[float, float]:
 
 
 def cpu_ticks() -> tuple[int, int]:
-    """Stolen and all CPU time so far, in clock ticks."""
+    """Return stolen and total CPU time so far, in clock ticks."""
     ticks = [int(field) for field in Path("/proc/stat").read_text().splitlines()[0].split()[1:9]]
     return ticks[7], sum(ticks)
 

@@ -1,10 +1,11 @@
 #!/usr/bin/env python3
-"""The emulator over TCP against libmodbus's and pymodbus's servers: 10 registers a request.
+"""The emulator over TCP against libmodbus's and pymodbus's servers: 10 registers per request.
 
     benchmarks/emulator_tcp.py [--runs 5] [--seconds 2] [--clients 64] [--quick]
 
-One libmodbus C client, then many clients at once. Runs of all servers interleaved, ratios pair by pair, medians. Exit
-status 1 when a goal is missed. Needs gcc and libmodbus-dev; uvloop (the `perf` extra) for its rows; a quiet machine.
+One libmodbus C client, then many clients at once. Runs of all servers are interleaved; the results are medians and ratios of
+pairs. The exit status is 1 if a goal is missed. Needs gcc and libmodbus-dev, uvloop (the `perf` extra) for its rows, and an
+idle machine.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ PLAIN, FAST = "fieldtwin", "fieldtwin (uvloop)"
 
 
 class Server:
-    """A server under measurement: how to start it, and what was measured."""
+    """A server under measurement: its command, and its results."""
 
     def __init__(self, name: str, *command: str, flags: tuple[str, ...] = ()) -> None:
         self.name = name

@@ -1,7 +1,7 @@
-"""Compare the percentages that `fieldtwin infer` claims with the observed share of right readings, on generated maps.
+"""Compare the percentages that `fieldtwin infer` claims with the observed share of correct readings, on generated maps.
 
-``benchmarks/infer_calibration.py [--maps 600] [--svg FILE] [--fit]``. The curves in the program were fitted on other maps, with
-another seed (`--fit --maps 2000` prints them).
+``benchmarks/infer_calibration.py [--maps 600] [--svg FILE] [--fit]``. The curves in the program were fitted on other maps,
+with another seed (`--fit --maps 2000` prints them).
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from fieldtwin.commissioning.infer.infer import Series, infer  # noqa: E402
 FIT_SEED, CHECK_SEED = 1, 2
 MOST_BRIER = 0.11
 MOST_OVERCONFIDENT = 0.06
-"""How far a claimed share may exceed the observed one in a bin of at least 50 readings."""
+"""Maximum excess of a claimed share over the observed one in a bin of at least 50 readings."""
 
 
 @dataclass(frozen=True)
 class Judged:
-    """A reading: what the model and the program claimed of it, and whether it is right."""
+    """A reading: the probabilities of the model and of the program, and whether it is correct."""
 
     model: float
     claimed: float
@@ -42,7 +42,7 @@ class Judged:
 
 @dataclass(frozen=True)
 class Bin:
-    """Readings whose claimed probability lies in one tenth."""
+    """Readings whose claimed probability is in one tenth."""
 
     low: float
     count: int
@@ -51,7 +51,7 @@ class Bin:
 
 
 def is_right(reading: Reading, one: Map) -> bool:
-    """Whether a generated map has this value there: same registers, type and order."""
+    """Return whether a generated map has this value there: same registers, type and order."""
     kinds = {reading.type, reading.type[1:]} if reading.sign_open else {reading.type}
     for f in one.fields:
         if f.address == reading.address and f.registers == reading.registers:
@@ -63,7 +63,7 @@ def is_right(reading: Reading, one: Map) -> bool:
 
 
 def judged(maps: int, seed: int) -> list[Judged]:
-    """Every reading of every map of a corpus."""
+    """Return every reading of every map of a corpus."""
     out = []
     for one in corpus(maps, seed):
         for r in infer(Series(one.times_s, {"holding": one.words})).readings:
@@ -74,12 +74,12 @@ def judged(maps: int, seed: int) -> list[Judged]:
 
 
 def brier(readings: Sequence[Judged]) -> float:
-    """The mean squared difference of claim and truth: 0 is perfect, 0.25 is what always claiming 50 % gives."""
+    """Return the mean squared difference of claim and truth: 0 is perfect; always claiming 50 % gives 0.25."""
     return sum((j.claimed - j.right) ** 2 for j in readings) / len(readings)
 
 
 def bins(readings: Sequence[Judged]) -> list[Bin]:
-    """Claimed and observed shares by tenths of the claim."""
+    """Return claimed and observed shares by tenths of the claim."""
     parts: dict[int, list[Judged]] = defaultdict(list)
     for j in readings:
         parts[min(9, int(10 * j.claimed))].append(j)
@@ -90,7 +90,7 @@ def bins(readings: Sequence[Judged]) -> list[Bin]:
 
 
 def diagram(found: Sequence[Bin], score: float, maps: int) -> str:
-    """The reliability diagram as SVG: on the diagonal a claim is what was observed."""
+    """Return the reliability diagram as SVG: on the diagonal, claims equal observations."""
     size, edge = 360, 50
 
     def at(claimed: float, observed: float) -> str:

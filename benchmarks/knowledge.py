@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
-"""Knowledge in SQLite: how many events a second are written for good, and how long a day of it takes to replay.
+"""Knowledge in SQLite: how many events per second are written durably, and how long the replay of a day takes.
 
     benchmarks/knowledge.py [--runs 3] [--seconds 4] [--day-rate 10] [--quick]
 
-Events are offered by a writer as a run offers them, and it ends when the last of them is on disk (synchronous=FULL). The peer is
+A writer offers events as a run does, and the measurement ends when the last of them is on disk (synchronous=FULL). The peer is
 sqlite3 itself with the same rows in the same batches and settings, without names, numbers or a queue. A day is 864,000 events:
-ten a second. Runs are interleaved; times are medians. Exit status 1 when a goal is missed.
+ten a second. Runs are interleaved; times are medians. The exit status is 1 if a goal is missed.
 """
 
 from __future__ import annotations

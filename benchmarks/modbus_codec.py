@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
-"""One read without a wire, both ends: request, framing, the slave's answer, framing, checked reply. Against pymodbus.
+"""One read without a wire, both ends: request, framing, the server's answer, framing, checked reply. Against pymodbus.
 
     benchmarks/modbus_codec.py [--runs 5] [--transactions 3000] [--quick]
 
-Ours is the master's `Transaction` and the emulator's slave with a map behind it; pymodbus's is its client and server over
-its own null modem, and, apart, its framers and PDU classes alone with a list behind them. Runs are interleaved; times are
-microseconds a transaction: the median, and the least, which others on the machine disturbed least and which the goal is for.
-Ratios are pairwise to the null modem over the same framing. Exit status 1 when a goal is missed.
+Ours is the client's `Transaction` and the emulator's server with a map; pymodbus's is its client and server over its own null
+modem, and, separately, its framers and PDU classes alone with a list. Runs are interleaved. Times are microseconds per
+transaction: the median, and the minimum, which is least disturbed by other programs and to which the goal applies. Ratios are
+those of pairs to the null modem over the same framing. The exit status is 1 if a goal is missed.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ GOALS_US = {10: 12.0, 125: 90.0}
 
 
 def ours(framing: str, count: int, transactions: int) -> float:
-    """Seconds for `transactions` reads of `count` registers."""
+    """Return the seconds for `transactions` reads of `count` registers."""
     bank = MapBank([Span("holding", 0, len(VALUES))])
     bank.poke("holding", 0, *VALUES)
     units = {UNIT: ModbusUnit(bank)}

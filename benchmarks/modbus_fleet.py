@@ -1,14 +1,14 @@
 #!/usr/bin/env python3
-"""1,000 emulated Modbus TCP devices in one process, each on a port of its own, each polled once a second by one gateway.
+"""1,000 emulated Modbus TCP devices in one process, each on a separate port and polled once a second by one gateway.
 
     benchmarks/modbus_fleet.py [--devices 1000] [--seconds 30] [--runs 5] [--quick]
 
-A system, a profile of 20 registers (a poll is one request, so that devices can count polls), a recording and a prototype file
-are made. Goals: all of them listen 5 s
-after their process was started, the process never takes more than 200 MB, and in `--seconds` no device misses a poll: counted
-by the devices, not by the gateway. The gateway is the one of `fieldtwin run`, a process of its own. The peer is pymodbus: as
-many of its servers in one process, for how fast they are up and how much they take, `--runs` times in turn with ours, ratios
-pair by pair. The polling is one run. Exit status 1 when a goal is missed. Up within 5 s wants a quiet machine.
+The benchmark creates a system, a profile of 20 registers (a poll is one request, so that devices can count polls), a recording
+and a prototype file. Goals: all devices listen 5 s after the start of their process, the process never uses more than 200 MB,
+and in `--seconds` no device misses a poll, counted by the devices, not by the gateway. The gateway is the one of `fieldtwin
+run`, in a separate process. The peer is pymodbus: the same number of its servers in one process, for start-up time and memory,
+`--runs` times alternating with ours, with ratios of pairs. The polling is one run. The exit status is 1 if a goal is missed. A
+start within 5 s needs an idle machine.
 """
 
 from __future__ import annotations
@@ -49,13 +49,13 @@ tags:
 """
 UP_S, MOST_MB, PERIOD_S = 5.0, 200.0, 1.0
 SETTLE_S = 60.0
-"""How long all devices may take to be online at first, on a loaded machine."""
+"""Time limit until all devices are online for the first time, on a loaded machine."""
 SETTLED = 4
 """Polls that each device must have answered before counting begins."""
 RECOVER_S = 3.0
-"""A gateway that says all it knows of 24,000 tags polls nobody meanwhile: it is asked before and behind the window."""
+"""A gateway that reports all details of 24,000 tags cannot poll meanwhile, so it is asked only before and after the window."""
 HALF_PERIOD_S = PERIOD_S / 2
-"""The window is so much longer than whole periods: a poll that is less than that late still falls into it."""
+"""Surplus of the window over whole periods: a poll with a smaller delay is still inside the window."""
 PROGRAM = '''
 from fieldtwin.plc.program import Program
 
@@ -68,7 +68,7 @@ class Idle(Program):
 
 
 def make_files(folder: Path, devices: int) -> Path:
-    """The system file of so many devices, each on a host of its own, with its prototype file beside it."""
+    """Write the system file of so many devices, each on a separate host, with its prototype file."""
     (folder / "idle_program.py").write_text(PROGRAM)
     (folder / PROFILE).write_text(METER)
     lines: list[dict[str, Any]] = [
@@ -96,7 +96,7 @@ def make_files(folder: Path, devices: int) -> Path:
 
 @dataclass
 class Up:
-    """A process with all its servers: seconds until they listened, and memory then."""
+    """Measure a process with all its servers: seconds until they listened, and its memory then."""
 
     seconds: float
     mb: float
@@ -138,12 +138,12 @@ async def compare_up(devices: int, runs: int, goals: Goals) -> None:
 
 
 def requests(status: dict[str, Any]) -> dict[str, int]:
-    """Answered requests of each device, as the device counts them."""
+    """Return the answered requests of each device, as the device counts them."""
     return {name: d["counters"]["replies"] for name, d in status["devices"].items()}
 
 
 def polls_of(status: dict[str, Any]) -> tuple[int, int]:
-    """Polls and failed ones of all devices, as the gateway counts them."""
+    """Return polls and failed polls of all devices, as the gateway counts them."""
     return sum(d["polls"] for d in status["devices"].values()), sum(d["errors"] for d in status["devices"].values())
 
 

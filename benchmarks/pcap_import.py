@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
-"""Importing captures: packets a second, from the file to recordings and draft profiles. Against tshark.
+"""Importing captures: packets per second, from the file to recordings and draft profiles. Against tshark.
 
     benchmarks/pcap_import.py [--runs 3] [--packets 200000] [--quick]
 
-Modbus TCP: four clients that poll four servers, ten registers a request, an acknowledgement behind each reply, some requests in
-two segments. RTU over TCP: the same, on another port. CAN: frames of a SocketCAN capture. tshark, where it is installed, only
-filters the same packets. Runs are interleaved; times are medians. Exit status 1 when a goal is missed.
+Modbus TCP: four clients that poll four servers, ten registers per request, an acknowledgement after each reply, some requests
+in two segments. RTU over TCP: the same, on a different port. CAN: frames of a SocketCAN capture. tshark, if installed, only
+filters the same packets. Runs are interleaved; times are medians. The exit status is 1 if a goal is missed.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ SERVERS = 4
 
 
 def segment(source: int, target: int, ports: tuple[int, int], sequence: int, acknowledged: int, data: bytes) -> bytes:
-    """An Ethernet frame with a TCP segment, check sums left 0 as a network card that makes them leaves them."""
+    """An Ethernet frame with a TCP segment; checksums are 0, as with a network card that computes them."""
     addresses = bytes((10, 0, 0, source, 10, 0, 0, target))
     ip = struct.pack(">BBHHHBBH", 0x45, 0, 40 + len(data), 0, 0x4000, 64, 6, 0) + addresses
     tcp = struct.pack(">HHIIBBHHH", *ports, sequence & 0xFFFFFFFF, acknowledged & 0xFFFFFFFF, 0x50, 0x18, 0xFFFF, 0, 0)
@@ -39,7 +39,7 @@ def segment(source: int, target: int, ports: tuple[int, int], sequence: int, ack
 
 
 def make_can(path: Path, packets: int) -> int:
-    """Write a capture of a CAN bus; how many packets it has."""
+    """Write a capture of a CAN bus; return the number of packets."""
     with path.open("wb") as file:
         file.write(struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 227))
         for i in range(packets):
@@ -49,7 +49,7 @@ def make_can(path: Path, packets: int) -> int:
 
 
 def make(path: Path, packets: int, *, rtu: bool = False) -> int:
-    """Write a capture of Modbus TCP, or of RTU over TCP; how many packets it has."""
+    """Write a capture of Modbus TCP, or of RTU over TCP; return the number of packets."""
     made = 0
     sequences = [[1, 1] for _ in range(SERVERS)]
     with path.open("wb") as file:

@@ -1,7 +1,7 @@
-"""What the benchmarks share: building the C peers, starting servers, and CPU time of a process.
+"""Helpers for the benchmarks: build the C peers, start servers, and measure the CPU time of a process.
 
-Benchmarks compare with a named peer in the same run and print ratios with medians; single absolute figures on a shared
-machine mean little. Nothing here runs in the tests.
+Benchmarks compare with a named peer in the same run and print ratios with medians; single absolute figures on a shared machine
+have little meaning. The tests do not use this module.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if str(ROOT) not in sys.path:
 
 
 class Missing(Exception):
-    """A peer that is not installed; says what to install."""
+    """A missing peer; the message names the package to install."""
 
 
 def build(name: str, *libraries: str) -> Path:
@@ -62,18 +62,18 @@ def stop(process: subprocess.Popen[str]) -> None:
 
 
 def cpu_s(pid: int) -> float:
-    """User and system time that a process has used, in seconds."""
+    """Return the user and system time that a process has used, in seconds."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def rss_mb(pid: int) -> float:
-    """Memory that a process has now, in MB (10^6 bytes), pages shared with others included."""
+    """Return the present memory of a process, in MB (10^6 bytes), including shared pages."""
     return _status_kib(pid, "VmRSS") * 1024 / 1e6
 
 
 def peak_mb(pid: int) -> float:
-    """The most that it ever had."""
+    """Return its maximum memory."""
     return _status_kib(pid, "VmHWM") * 1024 / 1e6
 
 
@@ -92,17 +92,17 @@ def free_port() -> int:
 
 
 def ratio(values: list[float], base: list[float]) -> float:
-    """The median of the pairwise ratios: each pair was measured one after the other."""
+    """Return the median of the pairwise ratios: each pair was measured one after the other."""
     return median(v / b for v, b in zip(values, base, strict=True))
 
 
 def row(name: str, values: list[float], base: list[float]) -> str:
-    """One line of a table: median, and the median of the pairwise ratios to `base`."""
+    """Print one line of a table: median, and the median of the pairwise ratios to `base`."""
     return f"{name:<24} {median(values):>12.1f}   {ratio(values, base):>6.2f}"
 
 
 class Goals:
-    """What is to be reached, and whether it was."""
+    """A goal, and whether it was reached."""
 
     def __init__(self) -> None:
         self._missed = 0
@@ -119,7 +119,7 @@ class Goals:
         print(f"{'reached' if reached else 'MISSED ':<8} {what}: {shown} (goal: {goal}{' ' + unit if unit else ''})")
 
     def verdict(self) -> int:
-        """The exit status: 0 when all were reached."""
+        """Return the exit status: 0 if all goals were reached."""
         return 1 if self._missed else 0
 
 

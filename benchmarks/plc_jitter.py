@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
-"""How late a scan begins, against cyclictest (Debian's rt-tests), with a gateway busy on three buses beside both.
+"""The lateness of a scan's start, against cyclictest (Debian's rt-tests), with a gateway that is busy on three buses as load.
 
     benchmarks/plc_jitter.py [--runs 3] [--seconds 10] [--quick]
 
-The load is the observatory's prototype: field side, gateway on a serial line, CANopen and Modbus TCP, and its own PLC. Then by
-turns: cyclictest with one thread, our PLC process, and our PLC process while a third process reads its image as fast as it can;
-each in the same scheduling class (SCHED_FIFO 10 where this host allows it), at 10 ms and at 1 ms. Ratios and differences are
-taken pair by pair. Exit status 1 when a goal is missed, 2 where cyclictest is missing.
+The load is the observatory's prototype: simulated field devices, gateway on a serial line, CANopen and Modbus TCP, and its own
+PLC. Then in turn: cyclictest with one thread, our PLC process, and our PLC process while a third process reads its image as
+fast as possible; each in the same scheduling class (SCHED_FIFO 10 if this host allows it), at 10 ms and at 1 ms. Ratios and
+differences are those of pairs. The exit status is 1 if a goal is missed, 2 if cyclictest is missing.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Copy(Program):
 
 @dataclass
 class Lateness:
-    """Of one run: us, and the share of scans that began more than 1 ms late."""
+    """The figures of one run: us, and the share of scans that began more than 1 ms late."""
 
     p50: float
     p99: float
@@ -108,7 +108,7 @@ def asked(path: Path) -> dict[str, Any]:
 
 @contextmanager
 def reader(image: Path, layout: dict[str, Any]) -> Iterator[None]:
-    """A process that takes snapshots of both regions as fast as it can."""
+    """A process that takes snapshots of both regions as fast as possible."""
     code = (
         "import json, mmap, sys\nfrom fieldtwin.gateway.core.image.image import ImageLayout\n"
         "layout = ImageLayout.from_description(json.loads(sys.argv[2]))\n"

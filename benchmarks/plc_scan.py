@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
-"""What a scan costs: the observatory's, 1,000 tags with 200 function blocks, and how it grows with the number of tags.
+"""The cost of a scan: of the observatory, of 1,000 tags with 200 function blocks, and its growth with the number of tags.
 
     benchmarks/plc_scan.py [--runs 5] [--quick]
 
-In one thread, back to back: execution time without waking up, with warm caches. Once every 10 ms the same scan takes several
-times as long, on a computer that does anything else meanwhile; that is shown beside it, and is what `plc status` shows.
-The peer for each figure is a plain Python loop that copies as many numbers from one list to another, in the same run: what no
-interpreter could do without. Exit status 1 when a goal is missed.
+In one thread, back to back: execution time without waking up, with warm caches. At one scan per 10 ms the same scan takes
+several times as long on a computer with other work; that time is also shown, and is the one in `plc status`. The peer for each
+figure is a plain Python loop that copies the same number of values from one list to another, in the same run: the minimum for
+an interpreter. The exit status is 1 if a goal is missed.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ SIZES = (100, 500, 1000, 2000, 5000, 10_000)
 
 
 class Rig:
-    """Programs over an image in plain memory, with the gateway's side at hand."""
+    """Programs over an image in plain memory, with access to the gateway's side."""
 
     def __init__(self, layout: Any, programs: list[BoundProgram]) -> None:
         memory = memoryview(bytearray(layout.size))
@@ -47,7 +47,7 @@ class Rig:
         self.scan = Scan(image, programs, 1e12)
 
     def scan_us(self, scans: int, every_s: float = 0.0) -> float:
-        """Median time of a scan, one every `every_s`; every second one finds inputs that are new."""
+        """Return the median time of a scan, one every `every_s`; every second one has new inputs."""
         took = []
         for n in range(scans):
             if n & 1:
@@ -100,7 +100,7 @@ def copy_us(count: int, times: int) -> float:
 
 
 def fit(sizes: tuple[int, ...], took_us: list[float]) -> tuple[float, float, float]:
-    """Least squares: us a tag, us for none, and R^2."""
+    """Least squares: us per tag, us for none, and R^2."""
     n, mean_x, mean_y = len(sizes), sum(sizes) / len(sizes), sum(took_us) / len(took_us)
     sxx = sum((x - mean_x) ** 2 for x in sizes)
     slope = sum((x - mean_x) * (y - mean_y) for x, y in zip(sizes, took_us, strict=True)) / sxx

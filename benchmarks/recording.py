@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
-"""Recordings: writing them record by record, reading them, and how soon an emulator answers from one. Against json.
+"""Recordings: writing record by record, reading, and the time until an emulator answers from one. Against json.
 
     benchmarks/recording.py [--runs 3] [--exchanges 1000000] [--quick]
 
-Each record is one write, so that a killed writer loses at most that one. The peer is the standard library's json over the
-same lines, written through a buffered file. An exchange reads ten registers. Runs are interleaved; times are medians. Exit
-status 1 when a goal is missed.
+Each record is one write, so that a killed writer loses at most that one. The peer is the standard library's json over the same
+lines, written through a buffered file. An exchange reads ten registers. Runs are interleaved; times are medians. The exit
+status is 1 if a goal is missed.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def exchanges(count: int) -> Iterator[Exchange]:
 
 
 def write(path: Path, count: int) -> float:
-    """Seconds to write so many."""
+    """Return the seconds to write this number of records."""
     path.unlink(missing_ok=True)
     made = list(exchanges(min(count, 10_000)))
     began = time.perf_counter()
@@ -78,7 +78,7 @@ def read_json(path: Path) -> float:
 
 
 def answer(path: Path) -> float:
-    """Seconds from opening the file to the first answer from it."""
+    """Return the seconds from opening the file to the first answer from it."""
     began = time.perf_counter()
     replay = ExchangeReplay.load(path)
     assert replay.respond(1, REQUEST).reply

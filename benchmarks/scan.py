@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
-"""A scan of 247 units at 9600 baud 8N1, modelled on a pty: how near to what its timeout allows, on the wall clock?
+"""A scan of 247 units at 9600 baud 8N1, modelled on a pty: how close is its real time to the minimum given by its timeout?
 
     benchmarks/scan.py [--runs 3] [--timeout-ms 50] [--quick]
 
-Three units of a line that an emulator (a process of its own) models answer after 5 ms, the others are silent. In theory a
-silent unit costs 8 characters and the timeout, one that answers 8 characters, 5 ms, 7 characters and 3.5 of silence. The peer
-is minimalmodbus in a loop over the same units with the same timeout, which counts from the write: the characters of the question
-are in it. Runs in turn, medians. Exit status 1 when the goal is missed.
+Three units of a line modelled by an emulator (a separate process) answer after 5 ms, the others are silent. In theory a silent
+unit costs 8 characters and the timeout, and one that answers 8 characters, 5 ms, 7 characters and 3.5 of silence. The peer is
+minimalmodbus in a loop over the same units with the same timeout, which counts from the write and thus includes the characters
+of the request. Runs alternate; the results are medians. The exit status is 1 if the goal is missed.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ print(time.perf_counter() - began, *found)
 
 
 def theory_s(units: int, timeout_s: float) -> float:
-    """Seconds that the line and the timeout take."""
+    """Return the seconds given by the line and the timeout."""
     line, there = SerialPacer(LINE), [u for u in PRESENT if u <= units]
     answered_s = (line.duration_ns(15) + line.t3_5_ns) / 1e9 + LATENCY_S
     return (units - len(there)) * (line.duration_ns(8) / 1e9 + timeout_s) + len(there) * answered_s

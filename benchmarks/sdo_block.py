@@ -1,11 +1,12 @@
 #!/usr/bin/env python3
-"""SDO block transfer over a modelled CAN bus, in virtual time: what share of the bus's theoretical rate is reached?
+"""SDO block transfer over a modelled CAN bus, in virtual time: which share of the bus's theoretical rate is reached?
 
     benchmarks/sdo_block.py [--bytes 1048576] [--bitrate 1000000]
 
-The gateway's client against the emulated node's server, both directions, plain segmented transfer beside them. The peer is
-the bus itself: what it would carry if every bit of its time went to segments of 7 bytes, each at its exact stuffed length.
-Exit status 1 when a block transfer stays under 95 % of that. Virtual time: the figures are the same on any machine.
+The gateway's client against the emulated node's server, in both directions, compared with plain segmented transfer. The peer
+is the bus itself: the amount it would carry if all of its time were used by segments of 7 bytes, each at its exact stuffed
+length. The exit status is 1 if a block transfer stays under 95 % of that. Virtual time: the figures are the same on any
+machine.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ DefaultValue=
 
 
 class _Jump(selectors.SelectSelector):
-    """Instead of waiting, the time moves on."""
+    """Instead of waiting, advance the time."""
 
     now_ns = 0
 
@@ -66,7 +67,7 @@ class _Jump(selectors.SelectSelector):
 
 
 class VirtualLoop(asyncio.SelectorEventLoop):
-    """Starts at 0, never waits, and is its own `Clock`."""
+    """The loop starts at 0, never waits, and is its own `Clock`."""
 
     def __init__(self) -> None:
         self._jump = _Jump()
@@ -87,7 +88,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
 
 
 def ideal_s(data: bytes, can_id: int, block: int, bitrate: int) -> float:
-    """How long the segments of `data` are on the wire, one behind the other."""
+    """Return the time of the segments of `data` on the wire, one after the other."""
     bits, total = 0, -(-len(data) // SEGMENT)
     for number in range(total):
         first = number % block + 1 | (0x80 if number + 1 == total else 0)
@@ -97,7 +98,7 @@ def ideal_s(data: bytes, can_id: int, block: int, bitrate: int) -> float:
 
 
 async def measure(data: bytes, bitrate: int, *, block: bool) -> tuple[float, float]:
-    """Virtual seconds of a download of `data` and of the upload that brings it back."""
+    """Return the virtual seconds of a download of `data` and of the upload that reads it back."""
     loop = asyncio.get_running_loop()
     assert isinstance(loop, VirtualLoop)
     runner = BusRunner(bitrate)

@@ -1,13 +1,13 @@
 #!/usr/bin/env python3
-"""A serial line at 19200 baud 8E1, modelled on a pty: how near to its theoretical rate do polls come, on the wall clock?
+"""A serial line at 19200 baud 8E1, modelled on a pty: how close to its theoretical rate are polls in real time?
 
     benchmarks/serial_line.py [--runs 5] [--seconds 10] [--quick]
 
-The field side (a process of its own) models the line: characters, the 3.5 characters of silence, 5 ms of the device's own.
-One device with 10 registers is polled as often as the line allows, by our gateway (a process too, its period 1 ms, so that a
-poll is always due), and by minimalmodbus in a bare loop, the peer. In theory a poll takes 8 characters, 5 ms, 25 characters,
-and 3.5 characters of silence. Polls are counted by the device. Runs in turn, medians. Exit status 1 when the goal is missed.
-Wants a quiet machine.
+A separate process simulates the line and the device: characters, the 3.5 characters of silence, 5 ms of response time. One
+device with 10 registers is polled as often as the line allows, by our gateway (also a process, with a period of 1 ms, so that
+a poll is always due), and by minimalmodbus in a bare loop, the peer. In theory a poll takes 8 characters, 5 ms, 25 characters,
+and 3.5 characters of silence. The device counts the polls. Runs alternate; the results are medians. The exit status is 1 if
+the goal is missed. Needs an idle machine.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ while True:
 
 
 def theory_per_s() -> float:
-    """Polls a second that the line allows."""
+    """Return the polls per second that the line allows."""
     line = SerialPacer(LINE)
     took_ns = line.duration_ns(REQUEST_CHARS) + LATENCY_MS * 1_000_000 + line.duration_ns(REPLY_CHARS) + line.t3_5_ns
     return 1e9 / took_ns
@@ -106,7 +106,7 @@ def make_files(folder: Path) -> Path:
 
 
 async def counted_per_s(client: ControlClient, seconds: float) -> float:
-    """Replies of the device a second, by its own count."""
+    """Return the device's replies per second, by its own count."""
     await asyncio.sleep(WARM_UP_S)
     counts: list[tuple[float, int]] = []
     for wait_s in (seconds, 0.0):
@@ -118,7 +118,7 @@ async def counted_per_s(client: ControlClient, seconds: float) -> float:
 
 
 async def one_run(folder: Path, seconds: float) -> tuple[float, float]:
-    """The gateway's rate, then minimalmodbus's, on the same emulated line."""
+    """Return the gateway's rate, then minimalmodbus's, on the same emulated line."""
     path = make_files(folder)
     config = folder / "field.json"
     config.write_bytes(msgspec.json.encode(FieldConfig(str(path), str(folder))))

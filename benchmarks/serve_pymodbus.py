@@ -1,6 +1,6 @@
 """pymodbus's server as a benchmark's peer: 100 holding registers on Modbus TCP.  serve_pymodbus.py PORT [SERVERS]
 
-With SERVERS, so many of them in this process, each on a free port.
+With SERVERS, it runs this number of servers in one process, each on a free port.
 """
 
 from __future__ import annotations

@@ -1,13 +1,12 @@
 #!/usr/bin/env python3
-"""What a sample costs on the way: bytes of a thread on the modems' link, against JSON and Avro.
+"""The bytes of a sample on the modems' link: a thread, against JSON and Avro.
 
     benchmarks/thread_bytes.py [--samples 6000]
 
 The samples are those of a CTD and an inclinometer: five tags a second, each with number, time, name, value and quality. A
-thread packs them into messages of 64 bytes, with numbers and times in each; JSON is one compact line a sample, Avro (fastavro) a
-record a sample with names as numbers, both without anything around them. Nothing is measured in time: the figures are the same
-on every computer.
-Exit status 1 when a goal is missed, 2 without fastavro.
+thread packs them into messages of 64 bytes, with numbers and times in each; JSON is one compact line per sample, Avro
+(fastavro) a record per sample with names as numbers, both without any transport overhead. No time is measured, so the figures
+are the same on every computer. The exit status is 1 if a goal is missed, 2 without fastavro.
 """
 
 from __future__ import annotations
@@ -59,7 +58,7 @@ def made(count: int) -> list[Event]:
 
 
 def thread(events: list[Event]) -> tuple[int, int]:
-    """Bytes and messages of a thread."""
+    """Return bytes and messages of a thread."""
     codec = FrameCodec([Schema(TAGS)], MTU)
     hello = Hello("plant:5f3a91c2", Schema(TAGS).id, 1, events[-1].sequence, True)
     codec.encode(hello)

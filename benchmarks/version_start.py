@@ -1,9 +1,9 @@
 #!/usr/bin/env python3
-"""How long `fieldtwin --version` takes, against `python -c pass`: what a shell's completion and every script wait for.
+"""The duration of `fieldtwin --version`, against `python -c pass`: the minimum delay of shell completion and of every script.
 
     benchmarks/version_start.py [--runs 20] [--quick]
 
-Both in turn, medians. Exit status 1 when the goal is missed.
+Both alternate; the results are medians. The exit status is 1 if the goal is missed.
 """
 
 from __future__ import annotations

@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
-"""How many times as fast as time a whole prototype runs in virtual time: gateway, PLC and emulators, unmodified.
+"""The speed of a whole prototype in virtual time, relative to real time: gateway, PLC and emulators, unmodified.
 
     benchmarks/virtual_run.py [--runs 3] [--quick]
 
-The observatory with its sensor polled each second, its mailbox each 500 ms, TPDO and heartbeat each second: with a scan of
-100 ms, with one of 10 ms, and with everything at 100 ms. Everything is traced and hashed, and every value that is published as
-good is compared with what its device held. The peer is the wall clock: 1. Beside it, for scale, the same loop doing nothing but
-wake two tasks a scan. Medians; exit status 1 when a goal is missed.
+The observatory with its sensor polled each second, its mailbox each 500 ms, TPDO and heartbeat each second: with a scan of 100
+ms, with one of 10 ms, and with everything at 100 ms. Everything is traced and hashed, and every value that is published as
+good is compared with the value of its device. The peer is the wall clock: 1. For scale, the table also shows the same loop
+with only two tasks that wake in each scan. Results are medians; the exit status is 1 if a goal is missed.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def system(folder: Path, scan: int, sensor: int, mailbox: int, node: int) -> Pat
 
 
 def faster(path: Path, seconds: float) -> tuple[float, str]:
-    """One run; how many times as fast as time, and its trace's hash."""
+    """Run once; return the speed relative to real time, and the hash of the trace."""
     run = VirtualRun(VirtualOptions(str(path), seconds, seed=1))
     began = time.perf_counter()
     run.run()
@@ -71,7 +71,7 @@ def faster(path: Path, seconds: float) -> tuple[float, str]:
 
 
 def idle(scan_ms: int, seconds: float) -> float:
-    """The loop alone: two tasks that wake each scan."""
+    """The loop alone: two tasks that wake in each scan."""
     loop = VirtualLoop()
     clock = VirtualClock(loop)
 

@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
-"""How long the answer to a what-if takes: 6 hours of the observatory at a scan of 100 ms, forked from a state.
+"""The duration of the answer to a what-if query: 6 hours of the observatory at a scan of 100 ms, forked from a state.
 
     benchmarks/what_if.py [--runs 3] [--quick]
 
-The system is that of benchmarks/virtual_run.py with everything each second; its sensor samples each second and its responses go
-out by the modem. The peer is a run in virtual time of the same system in standby, traced, hashed and judged, in the same
-process. Medians; exit status 1 when the goal is missed.
+The system is that of benchmarks/virtual_run.py with everything each second; its sensor samples each second and its responses
+are sent by the modem. The peer is a run in virtual time of the same system in standby, traced, hashed and checked, in the same
+process. Results are medians; the exit status is 1 if the goal is missed.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 #!/usr/bin/env python3
-"""Makes recordings of the devices that fieldtwin has profiles of: plausible values from the manuals' facts, with a seed.
+"""Generate recordings of the devices with profiles in fieldtwin: plausible values from the facts in the manuals, with a seed.
 
     scripts/make_device_recordings.py [--seed N] [--out DIR]
 
-Nothing here was measured: every header says `synthetic`. The same seed gives the same bytes; a test compares.
+Nothing here was measured: every header contains `synthetic`. The same seed gives the same bytes; a test compares them.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ EVERY_S = 5.0
 
 Value = float | int | str
 Steps = Callable[[random.Random, int], Mapping[str, Value]]
-"""(random, round) -> what each tag holds then, as the raw number of its type."""
+"""Map (random, round) to the value of each tag, as the raw number of its type."""
 
 
 def sdm630(r: random.Random, n: int) -> Mapping[str, Value]:
@@ -65,7 +65,7 @@ def vfd_e(r: random.Random, n: int) -> Mapping[str, Value]:
 
 
 def rover(r: random.Random, n: int) -> Mapping[str, Value]:
-    """Noon: the battery charges."""
+    """Noon: the battery is charging."""
     return {
         "model": "RNG-CTRL-RVR40", "unit_id": 1, "soc": 87, "battery_voltage": 134 + r.randint(0, 1),
         "charging_current": 842 + r.randint(-9, 9), "controller_temperature": 27 << 8 | 24,
@@ -76,7 +76,7 @@ def rover(r: random.Random, n: int) -> Mapping[str, Value]:
 
 
 def sunspec(r: random.Random, n: int) -> Mapping[str, Value]:
-    """A 10 kW inverter at half its power. The current of the third phase and much else is not implemented."""
+    """A 10 kW inverter at half its power. The current of the third phase and many other values are not implemented."""
     details = {
         f"{name}_{i}": 0x8000 - 0x10000
         for name, n in (("power_details", 6), ("temperature", 4))
@@ -105,7 +105,7 @@ DEVICES: dict[str, Steps] = {
 
 
 LOOP_S = 60
-"""How long a CANopen node's signals go before they begin again; the last row is the first."""
+"""Duration of a CANopen node's signals until they repeat; the last row equals the first."""
 
 Rows = Iterator[tuple[float, Sequence[float]]]
 
@@ -129,7 +129,7 @@ def io_module(r: random.Random) -> Rows:
 
 
 def drive(r: random.Random) -> Rows:
-    """What a drive cannot compute from its set-points: the mains' ripple on its DC link, and the load on its shaft."""
+    """Values that a drive cannot compute from its set-points: the mains' ripple on its DC link, and the load on its shaft."""
     phase = r.random() * 2 * math.pi
     for i in range(LOOP_S * 10 + 1):
         turn = 2 * math.pi * (i % (LOOP_S * 10)) / (LOOP_S * 10)
@@ -137,7 +137,7 @@ def drive(r: random.Random) -> Rows:
 
 
 def measuring_device(r: random.Random) -> Rows:
-    """A hydraulic cylinder at work: 80 to 210 bar, oil that warms and cools."""
+    """A working hydraulic cylinder: 80 to 210 bar, oil that warms and cools."""
     phase = r.random() * 2 * math.pi
     for i in range(LOOP_S * 10 + 1):
         turn = 2 * math.pi * (i % (LOOP_S * 10)) / (LOOP_S * 10)
@@ -146,7 +146,7 @@ def measuring_device(r: random.Random) -> Rows:
 
 
 def encoder(r: random.Random) -> Rows:
-    """A winch: forty turns out and forty turns back, in a minute, from turn 1000 on."""
+    """A winch: forty turns out and forty turns back, in a minute, starting at turn 1000."""
     start = 1000 * 8192 + r.randrange(8192)
     for i in range(LOOP_S * 10 + 1):
         turn = 2 * math.pi * (i % (LOOP_S * 10)) / (LOOP_S * 10)
@@ -159,11 +159,11 @@ NODES: dict[str, tuple[tuple[str, ...], Callable[[random.Random], Rows]]] = {
     "measuring-cia404": (("pressure", "temperature"), measuring_device),
     "encoder-cia406": (("position",), encoder),
 }
-"""CANopen nodes: the tags that are played, and how they go."""
+"""CANopen nodes: the replayed tags, and their signals."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Write every recording; returns the exit code."""
+    """Write every recording; return the exit code."""
     parser = argparse.ArgumentParser(description="make the recordings of real devices that ship with fieldtwin")
     parser.add_argument("--seed", type=int, default=DEFAULT_SEED)
     parser.add_argument("--out", type=Path, default=ROOT / "recordings")
@@ -177,7 +177,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def make(name: str, out: Path, seed: int) -> None:
-    """Write NAME.jsonl: `ROUNDS` readings of every value, as a master that reads each by itself would have recorded them."""
+    """Write NAME.jsonl: `ROUNDS` readings of every value, as recorded by a client that reads each one separately."""
     profile = load_profile(ROOT / "profiles" / "devices" / f"{name}.yaml")
     path = out / f"{name}.jsonl"
     path.unlink(missing_ok=True)

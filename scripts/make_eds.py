@@ -1,10 +1,11 @@
 #!/usr/bin/env python3
-"""Writes the electronic data sheets of fieldtwin's reference nodes (CiA 306-1), each from a table of its objects.
+"""Generate the electronic data sheets of fieldtwin's reference nodes (CiA 306-1), each from a table of its objects.
 
     scripts/make_eds.py [--out DIR]
 
-The objects are the public facts of the device profiles: indices, types, access and meaning, as makers' manuals print them.
-No such products exist: the vendor id is 0, which CiA assigns to nobody. A test compares the files with what this makes.
+The objects are the public facts of the device profiles: indices, types, access and meaning, as printed in manufacturers'
+manuals. No such products exist: the vendor ID is 0, which CiA does not assign. A test compares the files with the output of
+this script.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ BOOL, I8, I16, I32, U8, U16, U32, F32, TEXT = 0x01, 0x02, 0x03, 0x04, 0x05, 0x06
 VAR, ARRAY, RECORD = 7, 8, 9
 BITS = {BOOL: 1, I8: 8, U8: 8, I16: 16, U16: 16, I32: 32, U32: 32, F32: 32}
 ROOM = 8
-"""Entries of a mapping: as many bytes as a frame has."""
+"""Entries of a mapping: up to the number of bytes in a frame."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,7 @@ class Sub:
 
 @dataclass(frozen=True)
 class Object:
-    """One index. A VAR has the entry 0 only; an ARRAY or RECORD says how many it has in entry 0."""
+    """One index. A VAR has the entry 0 only; entry 0 of an ARRAY or RECORD holds the number of its entries."""
 
     index: int
     name: str
@@ -124,7 +125,7 @@ class Sheet:
 
 
 def communication(sheet: Sheet) -> list[Object]:
-    """What every node here has of CiA 301 v4.2."""
+    """The objects of CiA 301 v4.2 in every node here."""
     return [
         var(0x1000, "Device type", U32, default=f"0x{sheet.detail << 16 | sheet.profile:08X}"),
         var(0x1001, "Error register", U8, mapped=True),
@@ -162,9 +163,9 @@ def communication(sheet: Sheet) -> list[Object]:
 
 
 def text(sheet: Sheet) -> str:
-    """The whole file."""
+    """Return the whole file."""
     objects = {o.index: o for o in [*communication(sheet), *sheet.objects]}
-    objects[0x1003].subs[0] = Sub("Number of errors", U8, "rw", 0)  # written with 0 to forget them
+    objects[0x1003].subs[0] = Sub("Number of errors", U8, "rw", 0)  # written with 0 to clear them
     mandatory = [0x1000, 0x1001, 0x1018]
     optional = sorted(i for i in objects if i not in mandatory)
     tpdos = sum(0x1800 <= i < 0x1A00 for i in objects)
@@ -392,7 +393,7 @@ SHEETS = (io_module(), drive(), measuring_device(), encoder())
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Write every file; returns the exit code."""
+    """Write every file; return the exit code."""
     parser = argparse.ArgumentParser(description="write the data sheets of fieldtwin's reference nodes")
     parser.add_argument("--out", type=Path, default=ROOT / "profiles" / "devices")
     out: Path = parser.parse_args(argv).out

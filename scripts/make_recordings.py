@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Makes the recordings that ship with fieldtwin: no measurement, our own models with a seed. Overwrites.
+"""Generate the recordings that ship with fieldtwin: no measurements, our own models with a seed. Overwrites the files.
 
     scripts/make_recordings.py [--seed N] [--out DIR]
 
@@ -26,7 +26,7 @@ Rows = Iterable[tuple[float, Sequence[float]]]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Write both recordings; returns the exit code."""
+    """Write both recordings; return the exit code."""
     parser = argparse.ArgumentParser(description="make the recordings that ship with fieldtwin")
     parser.add_argument("--seed", type=int, default=DEFAULT_SEED)
     parser.add_argument("--out", type=Path, default=ROOT / "recordings")
@@ -36,7 +36,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def make(out: Path, seed: int) -> None:
-    """Write cast.jsonl and incl.jsonl into `out`. Each has a generator of its own: one model's change leaves the other."""
+    """Write cast.jsonl and incl.jsonl into `out`. Each has a separate generator, so a change of one model does not affect the
+    other."""
     out.mkdir(parents=True, exist_ok=True)
     _write(
         out / "cast.jsonl",

@@ -1,4 +1,4 @@
-"""The command line's reference, from the commands themselves: the help that each prints, at 80 columns."""
+"""Generate the command line's reference from the commands themselves: the help of each, at 80 columns."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from fieldtwin.cli.main import COMMANDS, cli
 
 
 def cli_page() -> str:
-    """Markdown: a section for each command, in the order of the program's own list, subcommands below theirs."""
+    """Return Markdown: a section for each command, in the order of the program's own list, subcommands after theirs."""
     parts = [
         "# Commands\n",
         "What `fieldtwin COMMAND --help` prints, of this version.\n",

@@ -1,4 +1,4 @@
-"""Sphinx's settings for the book. What is built is the folder that stage.py makes, never docs/ itself."""
+"""Sphinx's settings for the book. Sphinx builds the folder created by stage.py, never docs/ itself."""
 
 from pygments.lexers.pascal import DelphiLexer
 from sphinx.highlighting import lexers
@@ -16,12 +16,12 @@ html_title = f"fieldtwin {__version__}"
 html_show_sphinx = False
 html_last_updated_fmt = None  # the same source gives the same pages
 
-myst_heading_anchors = 4  # as forges make them: files.md#device-profile
+myst_heading_anchors = 4  # like the anchors of forges: files.md#device-profile
 myst_enable_extensions = ["deflist"]
-suppress_warnings = ["misc.highlighting_failure"]  # examples leave things out
+suppress_warnings = ["misc.highlighting_failure"]  # examples omit text
 
 default_role = "code"  # docstrings write `name` as Markdown does
 autodoc_typehints = "signature"
 autodoc_member_order = "bysource"
 
-lexers["st"] = DelphiLexer()  # Structured Text is near enough to Pascal
+lexers["st"] = DelphiLexer()  # Structured Text is similar to Pascal

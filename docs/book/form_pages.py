@@ -1,4 +1,4 @@
-"""Reference pages of files, faults and shipped profiles, from the schemas and catalogues that the program itself checks by."""
+"""Generate reference pages of files, faults and shipped profiles, from the schemas and lists that the program itself uses."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ PROFILES = Path(__file__).resolve().parents[2] / "profiles" / "devices"
 
 
 def form_pages() -> dict[str, str]:
-    """Path in the book to Markdown."""
+    """Return Markdown by path in the book."""
     return {
         "reference/forms.md": _forms(),
         "reference/faults.md": _faults(),
@@ -52,7 +52,7 @@ def _forms() -> str:
 
 
 def _is_a_fault(part: dict[str, Any]) -> bool:
-    """Those have a page of their own."""
+    """These have a separate page."""
     return part["properties"].get("name", {}).get("const") in FAULTS
 
 
@@ -78,7 +78,7 @@ def _default(form: dict[str, Any]) -> str:
 
 
 def _type(form: dict[str, Any]) -> str:
-    """A JSON schema in a few words."""
+    """Describe a JSON schema in a few words."""
     if "$ref" in form:
         return _spoken(form["$ref"].rsplit("/", 1)[1])
     if "const" in form:

@@ -1,4 +1,4 @@
-"""The paper's schemas as classes: the table of docs/paper.md, resolved to what there is, and a page of their docstrings."""
+"""Generate the paper's schemas as classes: the table of docs/paper.md, resolved to existing classes, with their docstrings."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _NAME = re.compile(r"[A-Za-z]\w+")
 
 
 class NoSuchClass(Exception):
-    """The table names a class that is in none of its modules; says which."""
+    """The table names a class that is in none of its modules; the message names it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +26,7 @@ class Row:
 
 
 def rows(text: str) -> list[Row]:
-    """The table under "Schemas and classes". Raises NoSuchClass, and ImportError for a module that there is not."""
+    """Return the table under "Schemas and classes". Raises NoSuchClass, and ImportError for a missing module."""
     table = text.split("## Schemas and classes", 1)[1].split("\n## ", 1)[0]
     found = []
     for line in table.splitlines():
@@ -58,7 +58,7 @@ def _place(name: str, modules: list[ModuleType]) -> str:
 
 
 def paper_page() -> str:
-    """Markdown: each schema, its classes, and what their docstrings say."""
+    """Return Markdown: each schema, its classes, and their docstrings."""
     parts = [
         "# The paper's classes\n",
         "Each schema of [the paper](../paper.md), the classes that stand for it, and what those say of themselves."

@@ -1,7 +1,7 @@
 """Collect the book's source: the pages of docs/, the repository's own papers, and reference pages made from the program.
 
-Links between Markdown files of the repository are turned into links between pages of the book. A link that leads to
-nothing is an error, whether Sphinx is there or not.
+Links between Markdown files of the repository become links between pages of the book. A broken link is an error, whether
+Sphinx is installed or not.
 
     python docs/book/stage.py build/docs/source
 """
@@ -41,11 +41,11 @@ _FENCE = re.compile(r"^(```+|~~~+)")
 
 
 class BrokenLink(Exception):
-    """A link to a file that is not there; says the page, the line and the target."""
+    """A link to a missing file; the message has the page, the line and the target."""
 
 
 def pages() -> dict[str, str]:
-    """File of the repository to page of the book, both as POSIX paths."""
+    """Map the files of the repository to pages of the book, both as POSIX paths."""
     found = {
         path.relative_to(ROOT).as_posix(): path.relative_to(ROOT / "docs").as_posix()
         for path in sorted((ROOT / "docs").rglob("*.md"))
@@ -55,7 +55,8 @@ def pages() -> dict[str, str]:
 
 
 def with_links(text: str, source: str, page: str, book: dict[str, str]) -> tuple[str, dict[str, str]]:
-    """The text of `source` as `page`, and the files that it links to or shows: file of the repository to path in the book."""
+    """Return the text of `source` as `page`, and the files that it links to or shows: file of the repository to path in the
+    book."""
     beside: dict[str, str] = {}
     lines, fence = [], ""
     for number, line in enumerate(text.splitlines(keepends=True), 1):
@@ -94,7 +95,7 @@ def _target(link: str, source: str, number: int, book: dict[str, str], beside: d
 
 
 def contents(index: str) -> str:
-    """The book's tables of contents, hidden: one for each heading of index.md, of the pages linked below it, in order."""
+    """Return the book's tables of contents, hidden: one for each heading of index.md, of the pages linked below it, in order."""
     parts, seen = [], set()
     for section in index.split("\n## ")[1:]:
         title, _, text = section.partition("\n")
@@ -106,7 +107,7 @@ def contents(index: str) -> str:
 
 
 def generated() -> dict[str, str]:
-    """Reference pages that are made from the program itself."""
+    """Reference pages that are generated from the program itself."""
     return {"reference/cli.md": cli_page(), **form_pages(), "reference/paper.md": paper_page()}
 
 

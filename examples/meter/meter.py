@@ -1,4 +1,4 @@
-"""A user's driver: an energy meter over Modbus TCP, with nothing but sockets. It knows nothing of fieldtwin."""
+"""A user's driver: an energy meter over Modbus TCP, with plain sockets. It does not know fieldtwin."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class Meter:
         while True:
             head = self._receive(7)
             body = self._receive(int.from_bytes(head[4:6], "big") - 1)
-            if int.from_bytes(head[:2], "big") == transaction:  # else one that came too late for an earlier request
+            if int.from_bytes(head[:2], "big") == transaction:  # otherwise a late reply to an earlier request
                 return body
 
     def _receive(self, size: int) -> bytes:

@@ -1,11 +1,11 @@
-/* Somebody else's controller, as far as fieldtwin is concerned: a plain Modbus TCP master with libmodbus.
+/* A third-party controller from fieldtwin's point of view: a plain Modbus TCP client with libmodbus.
  *
  *     loop FIELD_HOST FIELD_PORT OWN_PORT
  *
  * Every 200 ms it reads pressure (input registers 30001, 30002) and sampling period (holding register 40002) of unit 1, decides as
- * sampling.st does, and writes the period where the device has another one. What it sees and wants it serves itself on OWN_PORT:
+ * sampling.st does, and writes the period if the device has a different one. It serves its values and its output on OWN_PORT:
  * 30001, 30002 pressure; 40001 the period that it wants; 40002 is 1 while the sensor does not answer; 40003 counts its cycles.
- * Ends with SIGTERM. Knows nothing of fieldtwin.
+ * Ends with SIGTERM. It does not use fieldtwin.
  */
 #include <errno.h>
 #include <modbus.h>
@@ -82,7 +82,7 @@ int main(int argc, char **argv) {
                 connected = modbus_connect(field) == 0;
             if (connected && control(field, shown) == 0) {
                 failures = 0;
-            } else if (++failures >= FAILURES) { /* what is under way on this connection may come late: a new one */
+            } else if (++failures >= FAILURES) { /* a reply may still arrive late on this connection, so open a new one */
                 modbus_close(field);
                 connected = 0;
             } else if (connected) {

@@ -1,4 +1,4 @@
-"""The text for OpenPLC decides as sampling.st does, from the two registers that the sensor has: run here, on our own PLC."""
+"""The text for OpenPLC decides as sampling.st does, from the two registers of the sensor: run here, on our own PLC."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import struct
 import pytest
 
 DEPTHS = [(10.0, 5), (80.25, 1), (45.5, 1), (3.3, 5), (45.5, 5), (float("nan"), 5), (50.01, 1), (-2.0, 1), (39.99, 5)]
-"""Pressures as they come one after the other, and the period that each leaves. What is no depth changes nothing."""
+"""Consecutive pressures, and the period after each. An invalid depth changes nothing."""
 
 
 @pytest.mark.fieldtwin(plc="openplc.st")

@@ -1,4 +1,4 @@
-"""A PLC program's tests: stepped, in a time of its own."""
+"""Tests of a PLC program: stepped, with simulated time."""
 
 from __future__ import annotations
 

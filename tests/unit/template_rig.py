@@ -1,4 +1,4 @@
-"""A packed system of our own, and manipulated versions of it."""
+"""A packed test system, and manipulated versions of it."""
 
 from __future__ import annotations
 

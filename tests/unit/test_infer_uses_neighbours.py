@@ -76,7 +76,7 @@ def test_a_fast_pulse_counter_whose_low_word_wraps_often_is_one_number(order: st
 
 
 def test_a_low_word_next_to_a_constant_register_is_not_claimed_with_confidence() -> None:
-    """Nothing tells whether the 3 beside it is the upper half: the low word alone must not be called a number with confidence."""
+    """Whether the adjacent 3 is the upper half is unknown, so the low word alone must not be called a number with confidence."""
     columns = columns_of("CDAB", [3 * 65536 + 1000 + 7 * i for i in range(PASSES)])
     found = at(inferred(columns), 0)
     assert found.level is not Level.CERTAIN

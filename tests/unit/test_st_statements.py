@@ -137,7 +137,7 @@ def test_globals_constants_and_first_scan() -> None:
         scan(one, number)
     scan(other)
     assert (one.st_body.v_r, one.st_body.v_f, len(one.st_body.v_a)) == (11, 1, 4)
-    assert other.st_body.v_r == 8  # each program has globals of its own
+    assert other.st_body.v_r == 8  # each program has separate globals
 
 
 def test_inputs_keep_their_last_value_and_is_good_shows_it() -> None:

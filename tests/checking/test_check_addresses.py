@@ -39,7 +39,7 @@ def test_an_invalid_address_is_refused_with_an_example(text: str) -> None:
         _cell(text)
 
 
-def test_cases_of_bits_are_played_on_the_coil_that_may_be_written() -> None:
+def test_cases_of_bits_run_on_the_writable_coil() -> None:
     unit = ModbusUnit(MapBank([Span("holding", 0, 10), Span("coil", 500, 8)]))
 
     async def use(net: MemoryNet, url: str, clock: VirtualClock) -> dict[str, str]:

@@ -163,7 +163,7 @@ def test_usage(words: list[str]) -> None:
     assert isinstance(fieldtwin(*words).exception, UsageError)
 
 
-def test_a_dry_run_shows_every_case_that_would_be_played_and_opens_nothing() -> None:
+def test_a_dry_run_shows_every_case_that_would_run_and_opens_nothing() -> None:
     result = fieldtwin(
         "modbus", "rtu:/dev/no/such?baudrate=9600&frame=8N1", "--dry-run", "--json", "--write", "holding:7+3", "--write",
         "coil:1", "--allow", "disrupt", "--i-know",

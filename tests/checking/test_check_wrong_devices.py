@@ -78,7 +78,7 @@ TWISTS: dict[str, wrong.Twist] = {
 
 
 @pytest.mark.parametrize("case_id", TWISTS)
-def test_a_wrong_answer_fails_the_case_that_is_about_it(case_id: str) -> None:
+def test_a_wrong_answer_fails_the_case_for_it(case_id: str) -> None:
     results = check("rtu:/virtual/line?baudrate=19200&frame=8E1", wrong.twisted(TWISTS[case_id]))
     assert failed(results) == {case_id}
 

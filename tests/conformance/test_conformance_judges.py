@@ -87,13 +87,13 @@ def test_a_master_that_is_silent_afterwards_is_wedged() -> None:
     assert "no request for 4.0 s" in finding.reason
 
 
-def test_a_master_that_never_publishes_again_fails_only_where_a_probe_looks() -> None:
+def test_a_client_that_never_publishes_again_fails_only_if_a_probe_observes_it() -> None:
     assert "not published within 4.0 s" in judges.survives(_seen(*_good()[:4])).reason
     assert judges.survives(_seen(*_good()[:4], probed=False)).verdict is Verdict.PASSED
     assert judges.rejects(_seen(*_good()[:4], probed=False)).verdict is Verdict.SKIPPED
 
 
-def test_an_odd_frame_that_is_right_is_taken_before_the_plain_one_comes() -> None:
+def test_a_correct_odd_frame_is_accepted_before_the_plain_one_arrives() -> None:
     taken = Shown(_at(0.3), Word.SECOND, "2222")
     assert judges.accepts(_seen(*_good()[:2], taken, *_good()[2:])).verdict is Verdict.PASSED
     assert "were not taken" in judges.accepts(_seen(*_good())).reason

@@ -210,7 +210,7 @@ def _gives_up_at_the_first_adu(pause_s: float) -> Callable[..., object]:
 
 
 @pytest.mark.parametrize("pause_s", [0.005, 0.016, 0.020, 0.021, 0.030])
-def test_an_honest_answer_at_the_end_of_a_case_is_not_taken_for_an_odd_one(pause_s: float) -> None:
+def test_a_correct_answer_at_the_end_of_a_case_is_not_taken_for_an_odd_one(pause_s: float) -> None:
     """The device answered correctly with the value of the case until its last delayed frame was sent."""
     result = judge(_gives_up_at_the_first_adu(pause_s), "tcp://plc:502", "MB-056c")["MB-056c"]  # type: ignore[arg-type]
     assert (result.verdict, "were not taken" in result.reason) == (Verdict.FAILED, True), result.reason

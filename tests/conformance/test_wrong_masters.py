@@ -85,7 +85,7 @@ def test_a_master_that_believes_too_much_or_too_little_fails(take: Take, case: s
     assert says in result.reason
 
 
-def test_a_late_reply_is_only_a_failure_where_the_timeout_is_known() -> None:
+def test_a_late_reply_is_only_a_failure_if_the_timeout_is_known() -> None:
     master = _master(_checks_crc_only, 0.0)
     result = judge(master, "rtu:/line?baudrate=19200", "MB-013", timeout_s=0.0)["MB-013"]  # type: ignore[arg-type]
     assert result.verdict is Verdict.INCONCLUSIVE

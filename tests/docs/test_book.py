@@ -40,7 +40,7 @@ def test_links_are_those_of_the_book():
     assert beside == {"docs/picture.svg": "picture.svg"}
 
 
-def test_every_page_stands_in_the_contents():
+def test_every_page_is_in_the_contents():
     text, _ = book.with_links((ROOT / "docs/index.md").read_text("utf-8"), "docs/index.md", "index.md", book.pages())
     listed = set(re.findall(r"^[\w/.-]+$", book.contents(text), re.MULTILINE))
     pages = {page.removesuffix(".md") for page in [*book.pages().values(), *book.GENERATED]}

@@ -121,7 +121,7 @@ def test_streams_are_ordered_separately() -> None:
     assert found(talk(one, two, three), talk(one), r) == ["number of requests: 3 / 1"]
 
 
-def test_heard_frames_are_a_series_or_states() -> None:
+def test_received_frames_are_a_series_or_states() -> None:
     field = {"name": "slope", "at": 0, "format": "<h", "within": 5, "why": "test"}
     r = rules(
         heard=[

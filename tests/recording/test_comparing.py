@@ -72,7 +72,7 @@ def test_tags_have_separate_tolerances_and_counters_may_have_increased(tmp_path:
 
 
 @pytest.mark.parametrize(("latency_s", "met"), [(0.012, True), (0.03, True), (0.05, False)])
-def test_latencies_are_judged_by_median_and_90_percent(latency_s: float, met: bool) -> None:
+def test_latencies_are_compared_by_median_and_90_percent(latency_s: float, met: bool) -> None:
     one = [asked(read(n), values(n), 0.01) for n in range(20)]
     two = [asked(read(n), values(n), latency_s) for n in range(20)]
     result = compared(one, two)

@@ -134,7 +134,7 @@ def test_values_inside_their_tolerance_are_compared_position_by_position() -> No
     assert (result.met, result.compared, result.shifts) == (True, 3, [])
 
 
-def test_with_most_the_rest_of_the_recording_is_looked_through() -> None:
+def test_with_most_the_rest_of_the_recording_is_searched() -> None:
     device = emulator(RAMP)
     for _ in range(2):
         device(1, READ)

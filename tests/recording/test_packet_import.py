@@ -100,7 +100,7 @@ def test_losses_of_the_capture_are_reported_and_the_rest_is_found(tmp_path: Path
     assert (summary.packets.lost_bytes, summary.pairs.malformed) == (7, 1)
 
 
-def test_servers_units_and_framings_are_kept_apart(tmp_path: Path) -> None:
+def test_servers_units_and_framings_are_separate(tmp_path: Path) -> None:
     one, two, web = Talk(502), Talk(4001, 50_001, bytes((10, 0, 0, 3))), Talk(80, 50_002)
     one.say(True, mbap(1, 1, read(1)) + mbap(2, 2, read(1)))
     one.say(False, mbap(2, 2, values(22)) + mbap(1, 1, values(11)))
@@ -235,7 +235,7 @@ def test_a_damaged_capture_is_an_error_with_its_offset_or_is_read(tmp_path: Path
         assert not list(tmp_path.glob("r.*"))
 
 
-def test_a_recording_that_is_there_is_not_touched(tmp_path: Path) -> None:
+def test_an_existing_recording_is_not_changed(tmp_path: Path) -> None:
     write(tmp_path / "r.jsonl", b"mine")
     with pytest.raises(FileInvalid, match="exists already"):
         imported(tmp_path, pcap(polls()))

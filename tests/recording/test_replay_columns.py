@@ -101,7 +101,7 @@ def test_cells_between_recorded_registers_are_interpolated_on_request() -> None:
     assert ExchangeReplay(recorded).respond(1, read(13)).reply == b"\x83\x02"
 
 
-def test_a_broadcast_before_a_unit_was_heard_of_is_part_of_its_past() -> None:
+def test_a_broadcast_before_the_first_request_to_a_unit_is_part_of_its_past() -> None:
     write = struct.pack(">BHH", 6, 0, 7)
     replay = ExchangeReplay([asked(write, b"", unit=0), asked(read(0), values(7)), asked(read(1), values(1))])
     replay.broadcast(write)

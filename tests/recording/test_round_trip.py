@@ -261,7 +261,7 @@ def test_writes_are_repeated_only_on_request_and_to_wearing_memory_once(tmp_path
     assert (careful.compared, careful.left_out, careful.met) == (5, 2, True)
 
 
-def test_a_device_that_is_away_for_a_while_is_recorded_again_when_it_is_back(tmp_path: Path) -> None:
+def test_a_device_that_is_disconnected_for_a_while_is_recorded_again_when_it_returns(tmp_path: Path) -> None:
     one = write(tmp_path / "one.jsonl", [Exchange(0, 1, bytes.fromhex("0300000001"), bytes.fromhex("03020001"))])
     url = f"tcp://127.0.0.1:{_free_port()}"
     counters, stop = PollCounters(), asyncio.Event()

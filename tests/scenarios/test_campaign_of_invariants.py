@@ -197,7 +197,7 @@ def test_under_random_faults_steps_only_drive(folder: Path) -> None:
     assert judge("dry.scenario.yaml", "--seeds", "1..2")[0] == 1  # without faults they are checked
 
 
-def test_a_rule_that_no_seed_judged_and_faults_that_never_struck_are_inconclusive(folder: Path) -> None:
+def test_a_rule_without_a_verdict_of_any_seed_and_faults_without_effect_are_inconclusive(folder: Path) -> None:
     (folder / "well.st").write_text(PROTECTED)
     campaign = Campaign(folder / "dry.scenario.yaml", (), RandomFaults(1e9), 60.0)
     whole = verdict_of(campaign, run_campaign(campaign, range(1, 3), 1))
@@ -214,7 +214,7 @@ def test_a_rule_that_no_seed_judged_and_faults_that_never_struck_are_inconclusiv
     )
 
 
-def test_rate_kinds_and_aims_are_kept_to(folder: Path) -> None:
+def test_rate_kinds_and_aims_are_observed(folder: Path) -> None:
     system = load_system(str(folder / "plant.yaml"), [])
     wanted = RandomFaults(30.0, ("silence", "exception", "stuck"), ("line", "sensor.level"))
     found = [fault for seed in range(20) for fault in random_schedule(system, seed, 1200.0, wanted)]

@@ -22,7 +22,7 @@ def test_the_probe_is_one(tmp_path: Path) -> None:
     assert load_scenario(path).probes[0].names == ["crane.height", "crane.moving"]
 
 
-def test_the_scenario_for_a_controller_of_the_user_looks_through_probes_only(tmp_path: Path) -> None:
+def test_the_scenario_for_a_users_controller_uses_probes_only(tmp_path: Path) -> None:
     path = tmp_path / "x.scenario.yaml"
     path.write_text(f"scenario: x\nsystem: observatory\n{BLOCKS[2]}")
     scenario = load_scenario(path)

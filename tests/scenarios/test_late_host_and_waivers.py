@@ -69,7 +69,7 @@ TODAY = date(2027, 1, 10)
         (Verdict.SKIPPED, TODAY, Verdict.SKIPPED, False),
     ],
 )
-def test_a_waiver_holds_until_its_day(found: Verdict, expires: date, verdict: Verdict, well: bool) -> None:
+def test_a_waiver_holds_until_its_expiry(found: Verdict, expires: date, verdict: Verdict, well: bool) -> None:
     passed = ScenarioResult("good", Verdict.PASSED, file="good.scenario.yaml")
     result = ScenarioResult("a test", found, file="/x/ctd-silent.scenario.yaml", reason="step 3")
     waived = waive(result, Waivers((Waiver("ctd-silent", "ticket 4711", expires),)), TODAY)

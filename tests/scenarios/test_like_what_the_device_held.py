@@ -41,7 +41,7 @@ steps:
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 @pytest.mark.parametrize("by_ms", [0, 200])
-def test_a_sampling_sensor_is_as_it_holds_at_any_delay(tmp_path: Path, seed: int, by_ms: int) -> None:
+def test_a_sampling_sensor_equals_its_held_value_at_any_delay(tmp_path: Path, seed: int, by_ms: int) -> None:
     path = tmp_path / "x.scenario.yaml"
     fault = f"fault: {{name: delay, device: ctd, by_ms: {by_ms}.0}}" if by_ms else "pause: 1s"
     path.write_text(SCENARIO.replace("SEED", str(seed)).replace("FAULT", fault))

@@ -52,7 +52,7 @@ steps:
 
 
 @pytest.mark.parametrize(("speed", "verdict"), [("60.0", Verdict.FAILED), ("40.0", Verdict.PASSED)])
-def test_an_output_that_is_refused_in_the_first_scan_is_seen(tmp_path: Path, speed: str, verdict: Verdict) -> None:
+def test_an_output_that_is_refused_in_the_first_scan_is_detected(tmp_path: Path, speed: str, verdict: Verdict) -> None:
     (tmp_path / "heater.yaml").write_text(PROFILE)
     (tmp_path / "heat.yaml").write_text(SYSTEM)
     (tmp_path / "heat.prototype.yaml").write_text(PROTOTYPE)

@@ -75,7 +75,7 @@ def test_a_failed_check_shows_the_observed_value(tmp_path: Path, steps: str, exp
     assert result.reproduce.startswith("fieldtwin test ")
 
 
-def test_a_value_that_is_set_arrives_and_leaves_again(tmp_path: Path) -> None:
+def test_a_set_value_takes_effect_and_ends(tmp_path: Path) -> None:
     steps = ACTIVE + (
         "  - set: {tag: ctd.temperature, value: 99.5}\n"
         "  - expect: {tag: ctd.temperature, value: 99.5, tolerance: 0.01, quality: good, within: 4s}\n"
@@ -87,7 +87,7 @@ def test_a_value_that_is_set_arrives_and_leaves_again(tmp_path: Path) -> None:
     assert result.verdict is Verdict.PASSED, result.checks[-1]
 
 
-def test_always_and_never_are_looked_at_all_the_time(tmp_path: Path) -> None:
+def test_always_and_never_are_checked_all_the_time(tmp_path: Path) -> None:
     always = run(tmp_path, ACTIVE, "always: [\"relay.state == 'STANDBY'\"]\n")
     assert (always.verdict, always.checks[-1].number) == (Verdict.FAILED, "always 1")
     assert "ACTIVE" in always.checks[-1].got
@@ -160,7 +160,7 @@ def test_an_unsupported_step_of_a_target_is_skipped_and_does_not_pass(tmp_path: 
         ("  - wait: {until: '1'}\n", "looks at nothing", 4),
     ],
 )
-def test_a_mistake_is_named_where_it_stands(tmp_path: Path, steps: str, told: str, line: int) -> None:
+def test_a_mistake_is_named_at_its_position(tmp_path: Path, steps: str, told: str, line: int) -> None:
     with pytest.raises(FileInvalid) as e:
         load_scenario(written(tmp_path, steps))
     assert told in str(e.value)
@@ -174,7 +174,7 @@ def test_a_mistake_is_named_where_it_stands(tmp_path: Path, steps: str, told: st
         ("system: observatory\nprototype: x.prototyp.yaml\n", "did you mean 'x.prototype.yaml'"),
     ],
 )
-def test_a_file_that_is_not_there_is_named_where_it_is_asked_for(tmp_path: Path, line: str, told: str) -> None:
+def test_a_missing_file_is_named_at_its_reference(tmp_path: Path, line: str, told: str) -> None:
     (tmp_path / "x.prototype.yaml").touch()
     path = tmp_path / "x.scenario.yaml"
     path.write_text(f"scenario: a test\n{line}steps:\n  - pause: 1s\n")
@@ -195,7 +195,7 @@ BITS = "  - fault: {id: bits, name: corrupt-bits, device: modem, function: 3, fr
 
 
 @pytest.mark.parametrize(("steps", "verdict"), [("", Verdict.PASSED), (BITS, Verdict.FAILED)])
-def test_a_scenario_can_be_judged_as_a_run_is(tmp_path: Path, steps: str, verdict: Verdict) -> None:
+def test_a_scenario_can_be_checked_like_a_run(tmp_path: Path, steps: str, verdict: Verdict) -> None:
     result = run(tmp_path, f"{steps}  - send: {{period_s: 1}}\n  - pause: 12s\n", "judge: run\n")
     assert result.verdict is verdict, result.reason
     check = result.checks[-1]

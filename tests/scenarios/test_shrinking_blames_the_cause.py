@@ -110,7 +110,7 @@ def test_a_single_item_is_tried_without() -> None:
     assert smallest([7], lambda part: 7 in part) == ([7], True)
 
 
-def test_another_failure_is_not_taken_for_the_one_that_was_found() -> None:
+def test_a_different_failure_is_not_taken_for_the_original_one() -> None:
     found = ["PLC: the program pump failed at 3.1 s", "x"]
     assert same_failure(found, ["PLC: the program pump failed at 244.0 s"])
     assert not same_failure(found, ["sensor: no reply for 3.1 s"])

@@ -73,7 +73,7 @@ def test_the_same_scenario_passes_with_a_program_that_runs(tmp_path: Path) -> No
     assert result.verdict is Verdict.PASSED, result.checks
 
 
-def test_a_program_that_stops_later_fails_rules_and_steps_that_look_elsewhere(tmp_path: Path) -> None:
+def test_a_program_that_stops_later_fails_unrelated_rules_and_steps(tmp_path: Path) -> None:
     steps = "  - pause: 1s\n  - set: {tag: sensor.level, value: 7}\n  - pause: 2s\n  - expect: {tag: sensor.level, value: 7}\n"
     result = run(plant(tmp_path, LATER, steps, "never: ['pump.fault']\n"))
     assert result.verdict is Verdict.FAILED

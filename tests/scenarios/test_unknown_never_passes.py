@@ -157,7 +157,7 @@ def test_no_construct_passes_on_unknown_values(
         ("always: ['ctd.pressure > 1000 or ctd.pressure / 0 > 1 or ctd.pressure > 0']\n", Verdict.PASSED),
     ],
 )
-def test_a_rule_is_judged_from_when_it_is_known(tmp_path: Path, head: str, verdict: Verdict) -> None:
+def test_a_rule_is_checked_from_when_its_values_are_known(tmp_path: Path, head: str, verdict: Verdict) -> None:
     steps = (
         "  - send: {period_s: 1}\n  - wait: {until: \"quality(ctd.pressure) == 'good'\", within: 15s}\n  - pause: 2s\n"
     )

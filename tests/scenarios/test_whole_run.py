@@ -73,7 +73,7 @@ def run(folder: Path, steps: str, head: str) -> ScenarioResult:
         ),
     ],
 )  # fmt: skip
-def test_the_whole_run_is_judged(tmp_path: Path, head: str, steps: str, verdict: Verdict, told: str) -> None:
+def test_the_whole_run_is_checked(tmp_path: Path, head: str, steps: str, verdict: Verdict, told: str) -> None:
     result = run(tmp_path, steps, head)
     assert result.verdict is verdict, result.checks[-1]
     assert told in result.checks[-1].got
@@ -117,7 +117,7 @@ def test_probes_see_served_values_under_their_names(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_a_mistake_is_named_where_it_stands(tmp_path: Path, head: str, told: str, line: int) -> None:
+def test_a_mistake_is_named_at_its_position(tmp_path: Path, head: str, told: str, line: int) -> None:
     with pytest.raises(FileInvalid) as e:
         run(tmp_path, "  - pause: 1s\n", head)
     assert told in str(e.value)

@@ -98,7 +98,7 @@ def test_services_wait_for_health_and_never_sleep() -> None:
     assert "version" not in COMPOSE  # compose 2 warns about it; 1.29 reads the file by the specification without it
 
 
-def test_a_folder_that_is_mounted_is_there_and_read_only() -> None:
+def test_a_mounted_folder_exists_and_is_read_only() -> None:
     for name, service in SERVICES.items():
         for volume in service.get("volumes", []):
             source, _, rest = re.sub(VARIABLE, r"\1", volume).partition(":")
@@ -176,7 +176,7 @@ def test_the_build_sees_everything_that_the_wheel_is_made_of() -> None:
 
 
 @pytest.mark.parametrize("name", ["observatory.compose.yaml", "observatory.vcan.yaml"])
-def test_the_prototype_file_differs_from_the_shipped_one_in_where_it_listens_only(name: str) -> None:
+def test_the_prototype_file_differs_from_the_shipped_one_only_in_its_endpoints(name: str) -> None:
     system = load_system(str(SYSTEMS / "observatory.yaml"))
     here, there = load_prototype(system), load_prototype(system, SYSTEMS / name)
     for bus in there.buses.values():

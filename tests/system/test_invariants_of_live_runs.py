@@ -56,7 +56,7 @@ def test_a_live_run_whose_invariants_hold_reports_it(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(("limit", "verdict"), [("10", Verdict.FAILED), ("50", Verdict.PASSED)])
-def test_a_scenario_on_the_target_local_judges_invariants(folder: Path, limit: str, verdict: Verdict) -> None:
+def test_a_scenario_on_the_target_local_checks_invariants(folder: Path, limit: str, verdict: Verdict) -> None:
     write_program(folder, limit)
     result = run_scenario(load_scenario(folder / "well.scenario.yaml"), Target("local"))
     assert result.verdict is verdict, result.reason

@@ -60,7 +60,7 @@ def test_a_running_system_is_checked_by_its_invariants(site: Path, limit: str, v
 
 
 @HOLDS
-def test_a_plant_is_judged_by_its_invariants(site: Path, limit: str, verdict: str) -> None:
+def test_a_plant_is_checked_by_its_invariants(site: Path, limit: str, verdict: str) -> None:
     write_program(site, limit)
     port = (site / "shed.yaml").read_text().split("127.0.0.1:")[1].split('"')[0]
     words = ("emulate", str(site / "well.yaml"), "--values", "level=42", "--on", f"tcp://127.0.0.1:{port}")
@@ -81,7 +81,7 @@ def test_with_a_users_controller_they_are_skipped_with_a_message(site: Path) -> 
     assert "invariants skipped: not judged: the controller is another program" in shown.out
 
 
-def test_a_network_on_this_host_is_judged_by_the_invariants_of_its_members(tmp_path: Path) -> None:
+def test_a_network_on_this_host_is_checked_by_the_invariants_of_its_members(tmp_path: Path) -> None:
     for path in (*SYSTEMS.glob("ocean*.yaml"), SYSTEMS / "adapt.st"):
         if not path.name.endswith(".scenario.yaml"):
             shutil.copy(path, tmp_path)

@@ -73,7 +73,7 @@ def held_by_file(audit: Path) -> list[float]:
 
 
 @pytest.mark.long
-def test_a_threads_process_that_is_killed_is_there_again_and_its_twin_misses_nothing(tmp_path: Path) -> None:
+def test_a_killed_thread_process_is_restarted_and_its_twin_misses_nothing(tmp_path: Path) -> None:
     """The thread process is restarted, because a plant loses events every second without it. It blocks no other process."""
     args = (*PROTOTYPE, "--instance", "t", "--thread", "tcp://127.0.0.1:0")
     with fieldtwin(tmp_path, *args) as run:

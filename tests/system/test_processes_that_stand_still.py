@@ -32,7 +32,7 @@ def good(status: dict[str, Any]) -> list[str]:
     return [name for name in WATCHED if status[name]["quality"] == "good"]
 
 
-def test_each_process_stands_still_for_ten_seconds(tmp_path: Path) -> None:
+def test_each_process_is_stopped_for_ten_seconds(tmp_path: Path) -> None:
     words = ("run", "observatory", "--prototype", "--commands", "none", "--instance", "s", "--json")
     with fieldtwin(tmp_path, *words, "--thread", "tcp://127.0.0.1:0") as run:
         ask = {name: run.control("s", name) for name in PROCESSES if name not in ("run", "twin")}

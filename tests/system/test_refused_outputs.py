@@ -52,7 +52,7 @@ def test_a_value_that_is_not_a_number_is_a_refused_output(tmp_path: Path) -> Non
     assert "nan_control.py:16" in error
 
 
-def test_a_value_that_is_wanted_for_one_scan_only_is_refused_visibly(tmp_path: Path) -> None:
+def test_a_value_that_is_requested_for_one_scan_only_is_refused_visibly(tmp_path: Path) -> None:
     """The gateway writes a tag at most ten times a second; a value that is replaced before its turn is never checked."""
     pulse = TOO_FAST.replace("VAR_OUTPUT", "VAR n : INT; END_VAR\nVAR_OUTPUT").replace(
         "  speed := 60.0;\n",
@@ -143,7 +143,7 @@ def test_a_read_only_plant_lists_its_unwritten_outputs_and_is_ok(tmp_path: Path)
     assert {e["tag"] for e in refused if e["action"] == "refuse"} == {"drive.speed", "drive.run"}
 
 
-def test_a_force_that_is_refused_is_on_record(tmp_path: Path) -> None:
+def test_a_refused_force_is_recorded(tmp_path: Path) -> None:
     with fieldtwin(tmp_path, "run", str(written(tmp_path)), "--prototype", "--instance", "f") as run:
         plc = run.control("f", "plc")
         wait_for(lambda: plc("ready")["ready"], 10)

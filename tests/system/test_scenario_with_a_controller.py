@@ -79,7 +79,7 @@ def judged(site: Path, *words: str, name: str = "test") -> tuple[int, list[dict[
     return ended.process.returncode, json.loads(ended.out), ended.err
 
 
-def test_one_command_judges_the_user_s_controller(site: Path) -> None:
+def test_one_command_tests_the_users_controller(site: Path) -> None:
     scenario = str(site / "valve.scenario.yaml")
     words = (scenario, str(site / "as_is.scenario.yaml"), "--json", "--with", "--", *controller(site))
     code, results, told = judged(site, *words)
@@ -167,7 +167,7 @@ def test_from_another_terminal_the_test_finds_the_only_field_simulator_of_the_sy
             assert code == 0, results
 
 
-def test_a_judge_that_is_killed_leaves_no_controller(site: Path) -> None:
+def test_a_killed_scenario_leaves_no_controller(site: Path) -> None:
     (site / "long.scenario.yaml").write_text(SCENARIO.format(start="") + "  - pause: 600s\n")
     words = ("test", str(site / "long.scenario.yaml"), "--with", "--", *controller(site))
     with fieldtwin(site, *words, name="killed") as judge:

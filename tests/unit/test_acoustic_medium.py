@@ -20,7 +20,7 @@ def s(seconds: float) -> int:
     return round(seconds * NS_PER_S)
 
 
-def test_neighbours_hear_it_later_and_others_not() -> None:
+def test_neighbours_receive_it_later_and_others_do_not() -> None:
     sea = AcousticMedium(WATER, ROW, seed=1)
     assert sea.neighbours("west") == ["middle"]
     assert sea.say("west", b"ahoy", 0)
@@ -33,7 +33,7 @@ def test_neighbours_hear_it_later_and_others_not() -> None:
         ("collision", "speaking", "chance", "fault"), 0)}  # fmt: skip
 
 
-def test_two_at_once_spoil_each_other_where_both_are_heard() -> None:
+def test_two_simultaneous_messages_collide_where_both_are_received() -> None:
     sea = AcousticMedium(WATER, ROW, seed=1)
     sea.say("west", b"one", 0)
     sea.say("east", b"two", s(0.3))
@@ -52,7 +52,7 @@ def test_a_sending_modem_receives_nothing() -> None:
     assert sea.take("east", s(10)) == b"two"
 
 
-def test_a_modem_waits_while_it_hears() -> None:
+def test_a_modem_waits_while_it_receives() -> None:
     sea = AcousticMedium(WATER, ROW, seed=1)
     sea.say("west", b"one", 0)
     sea.say("middle", b"two", s(2.2))  # in the middle of its reception, to 2.55 s

@@ -209,7 +209,7 @@ def test_without_an_order_they_stop_to_ask_for_one() -> None:
     assert ocean.periods() == [0, 0, 0]
 
 
-def test_a_front_of_which_nothing_is_heard_any_more_is_over_after_a_while() -> None:
+def test_a_front_without_further_records_is_over_after_a_while() -> None:
     ocean = Ocean(0.0, 1)
     ocean.order(10)
     ocean.run(60)

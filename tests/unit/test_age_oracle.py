@@ -23,7 +23,7 @@ EMULATED = frozenset({"d"})
         (b"a", 50, 90, False),  # no value was known at that time
     ],
 )
-def test_held_inside_its_age(raw: bytes, asked_ns: int, now_ns: int, right: bool) -> None:
+def test_values_held_inside_their_age(raw: bytes, asked_ns: int, now_ns: int, right: bool) -> None:
     oracle = AgeOracle()
     oracle.held("d.x", b"a", 100)
     oracle.held("d.x", b"b", 200)

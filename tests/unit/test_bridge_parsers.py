@@ -109,7 +109,7 @@ def test_frames_on_a_line_are_found_wherever_they_are_cut(frames: list[tuple[int
 
 
 @given(st.binary(max_size=600))
-def test_after_any_noise_and_a_silence_the_next_request_is_heard(noise: bytes) -> None:
+def test_after_any_noise_and_a_silence_the_next_request_is_received(noise: bytes) -> None:
     line = RtuRequests(86_000)
     line.feed(noise)
     line.silence()
@@ -173,7 +173,7 @@ def passed_on(pdu: str, reply: bytes, *, pieces: int = 1, silence: bool = False)
         ("08 0000 A537", "08 0000 A537"),
     ],
 )
-def test_replies_of_every_function_end_where_they_end(pdu: str, reply: str, pieces: int) -> None:
+def test_replies_of_every_function_end_at_their_length(pdu: str, reply: str, pieces: int) -> None:
     answer = bytes.fromhex(reply)
     assert passed_on(pdu, with_crc(b"\5" + answer), pieces=pieces) == answer
 

@@ -156,7 +156,7 @@ def test_a_unit_has_its_own_timeout_and_retries() -> None:
     run_virtually(main())
 
 
-def test_while_a_unit_has_its_pause_others_have_the_line() -> None:
+def test_while_a_unit_has_its_pause_others_use_the_line() -> None:
     """Unit 1 needs 80 ms between two requests; a group of it takes four. Unit 2 is still read every 20 ms."""
 
     async def main() -> None:
@@ -236,7 +236,7 @@ def test_a_write_to_a_unit_in_its_pause_lets_one_to_another_unit_go_first() -> N
     run_virtually(main())
 
 
-def test_a_write_to_a_unit_that_is_away_takes_nothing_from_the_line() -> None:
+def test_a_write_to_a_disconnected_unit_takes_no_time_of_the_line() -> None:
     async def main() -> None:
         def make(tags: TagTable) -> list[RegisterDriver]:
             return [one(1, tags), one(2, tags, p=FAR_APART)]
@@ -257,7 +257,7 @@ def test_a_write_to_a_unit_that_is_away_takes_nothing_from_the_line() -> None:
     run_virtually(main())
 
 
-def test_groups_of_one_period_stand_at_their_own_places_in_it() -> None:
+def test_groups_of_one_period_have_separate_places_in_it() -> None:
     """On the line: eight units, 400 ms; one states its phase."""
 
     async def main() -> None:

@@ -79,7 +79,7 @@ def test_its_pause_doubles_once_for_all_its_groups() -> None:
 
 
 @pytest.mark.parametrize("register", [0, 30])
-def test_one_register_that_is_always_busy_does_not_keep_the_others_waiting(register: int) -> None:
+def test_one_register_that_is_always_busy_does_not_delay_the_others(register: int) -> None:
     device = Device(lambda now_s, asked: now_s >= BUSY_FROM_S and asked == register)
     play(device, 12)
     for other in {0, 10, 20, 30} - {register}:

@@ -162,7 +162,7 @@ def test_from_active_to_bus_off_and_back() -> None:
     assert counters(bus, b) == (0, 30)  # 32 errors, two good frames
 
 
-def test_in_bus_off_a_node_neither_hears_nor_acknowledges_nor_sends() -> None:
+def test_in_bus_off_a_node_neither_receives_nor_acknowledges_nor_sends() -> None:
     bus, (a, b) = make(2, monitored=False)
     bus.disturb(spoil(Disturbance(at_bit=3), match=lambda f: f.can_id == 0, times=32))
     bus.submit(a, ZERO, 0)

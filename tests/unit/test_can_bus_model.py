@@ -225,9 +225,7 @@ submissions = st.lists(
 
 
 @given(submissions, st.lists(st.integers(0, 1_000_000), max_size=10))
-def test_how_often_time_is_looked_at_changes_nothing(
-    items: list[tuple[int, int, bytes, int]], looks: list[int]
-) -> None:
+def test_the_number_of_polls_changes_nothing(items: list[tuple[int, int, bytes, int]], looks: list[int]) -> None:
     def run(looks: list[int]) -> tuple[list[Delivery], CanBus]:
         bus = CanBus(1_000_000)
         nodes = [bus.join(0) for _ in range(3)]

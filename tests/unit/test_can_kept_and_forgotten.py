@@ -99,7 +99,7 @@ def test_a_heartbeat_of_another_period_is_sent_at_its_time() -> None:
     assert [at for at, _ in rig.advance(120)] == [50, 80, 110]
 
 
-def test_a_node_that_is_mute_asks_for_nothing_that_it_could_not_send() -> None:
+def test_a_mute_node_requests_nothing_that_it_could_not_send() -> None:
     rig = cyclic(100)
     rig.node.raise_error(0x5000, rig.now_ns)
     due_ns = rig.node.wake_at_ns()

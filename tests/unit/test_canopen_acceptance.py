@@ -28,7 +28,7 @@ def sdo(node: CanopenNode, text: str) -> None:
 
 @settings(max_examples=150)
 @given(st.integers(0, 0x7FF), st.binary(max_size=8), st.booleans())
-def test_a_frame_that_is_kept_out_would_have_done_nothing(can_id: int, data: bytes, remote: bool) -> None:
+def test_a_rejected_frame_would_have_had_no_effect(can_id: int, data: bytes, remote: bool) -> None:
     node, untouched = started(), started()
     frame = CanFrame(can_id, b"" if remote else data, remote=remote, dlc=len(data))
     if node.accepts(frame):

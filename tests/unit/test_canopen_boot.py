@@ -279,7 +279,7 @@ def test_tpdos_come_from_the_node_or_from_its_dcf(tmp_path: Path) -> None:
     run_virtually(main(CanopenNodeConfig(tpdos=from_dcf), False))
 
 
-def test_sync_and_time_are_produced_where_writing_is_allowed(tmp_path: Path) -> None:
+def test_sync_and_time_are_produced_if_writing_is_allowed(tmp_path: Path) -> None:
     async def main(allow_writes: bool, expected: tuple[int, int]) -> None:
         wanted = CanopenBusConfig(sync_ms=100, sync_counter=4, time_ms=500)
         async with rig(tmp_path, PeerBus([node()]), allow_writes=allow_writes, bus=wanted) as r:

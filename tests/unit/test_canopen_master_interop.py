@@ -177,7 +177,7 @@ def test_a_node_that_knows_no_block_transfer_is_asked_without() -> None:
     run(main())
 
 
-def test_its_boot_is_that_of_a_node_that_holds_no_date() -> None:
+def test_its_boot_is_that_of_a_node_without_a_date() -> None:
     async def main() -> None:
         async with pair() as p:
             expected = ExpectedIdentity(device_type=0x2019A, vendor=1, serial=4)

@@ -220,7 +220,7 @@ def test_the_drive_runs_and_a_lost_plc_stops_it(tmp_path: Path) -> None:
     run_virtually(main())
 
 
-def test_nothing_goes_to_a_node_that_is_not_operational_and_all_of_it_when_it_is_again(tmp_path: Path) -> None:
+def test_nothing_goes_to_a_node_that_is_not_operational_and_everything_when_it_is_again(tmp_path: Path) -> None:
     async def main() -> None:
         async with rig(tmp_path) as r:
             r.want(controlword=6, target_velocity=5)
@@ -351,7 +351,7 @@ def test_a_value_outside_its_limits_is_refused_and_the_rest_of_the_frame_goes(tm
     run_virtually(main())
 
 
-def test_the_nodes_own_rpdos_are_used_where_all_in_them_may_be_written(tmp_path: Path) -> None:
+def test_the_nodes_own_rpdos_are_used_if_everything_in_them_is_writable(tmp_path: Path) -> None:
     async def main() -> None:
         config = replace(MODULED, canopen=CanopenNodeConfig(adopt_rpdos=True))
         async with rig(tmp_path, config) as r:

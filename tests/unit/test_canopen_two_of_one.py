@@ -69,7 +69,7 @@ def test_scan_names_the_two_replies() -> None:
     run_virtually(main())
 
 
-def test_identify_is_certain_of_nothing_where_two_nodes_answer() -> None:
+def test_identify_is_certain_of_nothing_if_two_nodes_answer() -> None:
     async def main() -> None:
         async with can_bus(node(5, 0x191, 7)) as connector:
             other = await connector.open_can(_endpoint(), 0)
@@ -157,7 +157,7 @@ EVENLY = st.tuples(st.integers(2, 1000), st.integers(2, 4), st.lists(st.floats(-
 
 
 @given(EVENLY)
-def test_evenly_spaced_producers_are_noticed_where_the_cycle_period_is_known(
+def test_evenly_spaced_producers_are_detected_if_the_cycle_period_is_known(
     given_: tuple[int, int, list[float]],
 ) -> None:
     period_ms, producers, jitter = given_

@@ -71,7 +71,7 @@ def test_localnode_gets_the_verdicts_that_are_known(eds: Path) -> None:
     assert found == KNOWN["known"]
 
 
-def test_nothing_is_sent_to_a_node_that_another_master_speaks_with() -> None:
+def test_nothing_is_sent_to_a_node_that_another_master_uses() -> None:
     heard: list[CanFrame] = []
 
     async def master(connection: CanConnection, clock: VirtualClock) -> None:

@@ -151,7 +151,7 @@ ALONG = {
 
 
 @pytest.mark.parametrize("case_id", TWISTS)
-def test_a_wrong_node_fails_the_case_that_is_about_it(case_id: str, tmp_path: Path) -> None:
+def test_a_wrong_node_fails_the_case_for_its_error(case_id: str, tmp_path: Path) -> None:
     eds = tmp_path / "rig.eds"
     eds.write_text(LONG)
 

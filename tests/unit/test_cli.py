@@ -168,7 +168,7 @@ def test_two_devices_on_one_unit_id(invoke: Invoke, plant: Callable[..., str]) -
     assert "'ctd2' has unit 1 on 'line1', and so has 'ctd'" in err
 
 
-def test_a_key_that_stands_twice(invoke: Invoke, plant: Callable[..., str]) -> None:
+def test_a_duplicate_key(invoke: Invoke, plant: Callable[..., str]) -> None:
     path = plant("  lan:   {url", "  line1: {url")
     code, _, err = invoke("run", path, "--plant")
     assert code == 3
@@ -278,7 +278,7 @@ def test_schemas_are_json_and_refuse_unknown_keys(invoke: Invoke, kind: str) -> 
     assert refs <= set(schema.get("$defs", {}))
 
 
-def test_doctor_speaks_json(invoke: Invoke) -> None:
+def test_doctor_writes_json(invoke: Invoke) -> None:
     code, out, _ = invoke("doctor", "--json")
     checks = json.loads(out)
     assert code == (1 if any(c["verdict"] == "bad" for c in checks) else 0)

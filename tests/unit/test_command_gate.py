@@ -212,7 +212,7 @@ def test_errors_and_wrong_results_of_a_python_planner_are_refusals_and_the_twin_
     assert "expected a COMMAND or None; got int" in gave
 
 
-def test_a_plan_by_hand_waits_until_the_plant_was_heard_of_and_is_refused_when_it_never_is(
+def test_a_manual_plan_waits_for_the_plants_state_and_is_refused_if_it_never_arrives(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("FIELDTWIN_RUN", str(tmp_path))

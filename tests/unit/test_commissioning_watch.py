@@ -104,7 +104,7 @@ def test_a_dry_run_needs_no_device() -> None:
         (["can:fieldtwin/127.0.0.1:1", "1010h:01=1", "--type", "uint32", "--yes"], "--i-know"),
     ],
 )
-def test_a_write_that_is_not_meant_is_refused_before_anything_is_opened(args: list[str], says: str) -> None:
+def test_an_unconfirmed_write_is_refused_before_anything_is_opened(args: list[str], says: str) -> None:
     result = CliRunner().invoke(write_command.command, args, standalone_mode=False)
     assert isinstance(result.exception, UsageError)
     assert says in str(result.exception)

@@ -58,7 +58,7 @@ SETTINGS = st.lists(
 
 
 @given(SETTINGS, st.data())
-def test_there_and_back_and_nothing_that_is_cut(settings: list[Setting], data: st.DataObject) -> None:
+def test_values_round_trip_and_none_is_truncated(settings: list[Setting], data: st.DataObject) -> None:
     block = encode_concise(settings)
     assert decode_concise(block) == tuple(settings)
     cut = data.draw(st.integers(0, len(block) - 1))

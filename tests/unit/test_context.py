@@ -122,7 +122,7 @@ def test_endlessly_many_different_commands_are_refused() -> None:
 
 
 @pytest.mark.parametrize("policy", WhenUsedUp)
-def test_copies_begin_where_the_first_began_and_know_nothing_of_each_other(policy: WhenUsedUp) -> None:
+def test_copies_begin_at_the_first_start_and_are_independent(policy: WhenUsedUp) -> None:
     first = VirtualContext([A, B], [(A, recorded(1)), (B, recorded(9)), (A, recorded(2))], when_used_up=policy)
     second, third = first.copy(), first.copy().copy()
     assert taken(second, A, 2) == [1, 2]

@@ -94,7 +94,7 @@ def test_loop_starts_over_and_error_is_a_device_failure() -> None:
     assert error.counters.used_up == 1
 
 
-def test_tables_and_units_are_kept_apart() -> None:
+def test_tables_and_units_are_separate() -> None:
     replay = ExchangeReplay(
         [ok(read(0), reply(1)), ok(read(0, 1, 3), reply(2, function=3)), ok(read(0), reply(3), unit=2)]
     )
@@ -219,7 +219,7 @@ def test_endlessly_new_writes_cost_no_memory() -> None:
 # -- shapes -------------------------------------------------------------------------------------------------------
 
 
-def test_exceptions_come_where_they_were_recorded() -> None:
+def test_exceptions_come_at_their_recorded_place() -> None:
     replay = ExchangeReplay(
         [ok(read(0), reply(1)), ok(read(0), b"\x84\x06"), ok(read(0), reply(2)), ok(read(90), b"\x84\x02")]
     )
@@ -361,7 +361,7 @@ def test_half_a_counter_is_repeated_as_it_was_recorded() -> None:
 # -- as a unit, and from a file -----------------------------------------------------------------------------------
 
 
-def test_a_recorded_unit_stands_in_for_a_computed_one(tmp_path: Path) -> None:
+def test_a_recorded_unit_replaces_a_computed_one(tmp_path: Path) -> None:
     path = tmp_path / "r.jsonl"
     header = RecordingHeader(version=1, device="d", kind="exchanges", source="measured")
     with RecordingWriter(path, header) as writer:

@@ -76,7 +76,7 @@ async def ask(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, line: 
     return answer
 
 
-def test_a_verb_is_served_and_its_errors_keep_their_kind(tmp_path: Path) -> None:
+def test_a_command_is_served_and_its_errors_keep_their_kind(tmp_path: Path) -> None:
     async def main() -> None:
         async with serving(tmp_path / "s"):
             client = await ControlClient.connect_unix(tmp_path / "s")

@@ -270,7 +270,7 @@ def test_outputs_equal_the_programs_values(steps: list[Any]) -> None:
 # -- the image itself -------------------------------------------------------------------------------------------------------
 
 
-def test_a_reader_that_is_put_back_gets_its_messages_though_nothing_changed() -> None:
+def test_a_reader_that_is_reset_gets_its_messages_although_nothing_changed() -> None:
     image = one(RegionLayout("r", (message_tag("m", 8, 4),)))
     writer, reader = image.writer("r"), image.reader("r")
     good = [TagValue(0, Quality.GOOD)]

@@ -115,7 +115,7 @@ def test_a_new_sample_is_good_and_passed_on_once_and_unaltered() -> None:
     run(main())
 
 
-def test_the_first_count_that_is_seen_is_only_a_base_line() -> None:
+def test_the_first_count_is_only_a_reference() -> None:
     """A driver that starts in the middle does not know the age of the sample that it finds."""
 
     async def main() -> None:
@@ -317,7 +317,7 @@ def test_binary_coded_decimals_are_the_digits_that_one_reads(
     assert emulated.encode(10.0**digits, kind) == emulated.encode(10**digits - 1, kind)  # as much as it can show
 
 
-def test_a_coil_is_written_with_0fh_where_the_device_has_no_05() -> None:
+def test_a_coil_is_written_with_0fh_if_the_device_has_no_05() -> None:
     async def main(functions: str, expected: int) -> None:
         p = profile(f'limits: {{functions: {functions}}}\ntags:\n  c: {{at: "coil:3", type: bool, access: rw}}\n')
         bank = MapBank([Span("coil", 0, 8)])

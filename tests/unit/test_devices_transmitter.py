@@ -292,7 +292,7 @@ def test_a_plant_switched_to_local_takes_no_command_and_reports_it(tmp_path: Pat
     run(main())
 
 
-def test_a_mailbox_that_is_lent_to_a_thread_is_neither_read_nor_written(tmp_path: Path) -> None:
+def test_a_mailbox_assigned_to_a_thread_is_neither_read_nor_written(tmp_path: Path) -> None:
     """Messages over it are not commands; output of the control logic is not put there; commands of the thread are taken."""
 
     async def main() -> None:

@@ -437,7 +437,7 @@ rates = st.floats(10, 1e6)
 
 @settings(max_examples=60)
 @given(st.floats(-1e6, 1e6), st.floats(-1e5, 1e5), st.floats(1, 1e5), rates, rates)
-def test_a_way_ends_where_it_should_at_a_stand_and_within_its_limits(
+def test_a_motion_ends_at_its_target_at_standstill_and_within_its_limits(
     distance: float, v: float, cruise: float, up: float, down: float
 ) -> None:
     ramps = to_place(distance, v, cruise, up, down)

@@ -147,6 +147,6 @@ def test_the_address_of_a_software_bus_is_checked(channel: str) -> None:
         _ = Endpoint.parse(f"can:fieldtwin/{channel}").address
 
 
-def test_where_an_error_happened_leads_the_line() -> None:
+def test_a_message_starts_with_the_place_of_the_error() -> None:
     error = FieldtwinError("broke", expected="this", got="that", where="unit 1", hint="do it").at("line1")
     assert str(error) == "line1: unit 1: broke; expected this; got that (do it)"

@@ -216,7 +216,7 @@ def test_a_node_that_restarts_is_configured_again(tmp_path: Path) -> None:
     run(main())
 
 
-def test_a_lost_heartbeat_makes_the_values_bad_at_once_and_the_node_is_looked_for(tmp_path: Path) -> None:
+def test_a_lost_heartbeat_makes_the_values_bad_at_once_and_the_node_is_searched(tmp_path: Path) -> None:
     async def main() -> None:
         async with rig(tmp_path) as r:
             r.plug_node()

@@ -76,7 +76,7 @@ def test_a_dead_unit_costs_the_others_nothing_and_is_still_asked() -> None:
     run(main())
 
 
-def test_a_write_goes_before_every_poll_that_is_due() -> None:
+def test_a_write_goes_before_every_due_poll() -> None:
     """MB-063. Ten groups are overdue; the newest submitted job is next."""
 
     async def main() -> None:

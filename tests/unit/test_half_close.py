@@ -40,7 +40,7 @@ def test_the_bridge_answers_requests_that_are_followed_by_fin(tmp_path: Path) ->
     run(main())
 
 
-def test_the_bridge_carries_out_a_write_that_is_followed_by_fin_and_confirms_it(tmp_path: Path) -> None:
+def test_the_bridge_executes_a_write_followed_by_fin_and_confirms_it(tmp_path: Path) -> None:
     async def main() -> None:
         async with rig(tmp_path, BridgeConfig("b", ANY_PORT, to="line", policy=WRITERS), latency_s=0.05) as r:
             write = bytes.fromhex("0009 0000 0006 01 06 0003 1234")

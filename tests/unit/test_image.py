@@ -139,7 +139,7 @@ def test_a_restarted_writer_continues_where_the_dead_one_stopped_mid_write() -> 
     assert reader.retries == 0
 
 
-def test_a_slot_that_is_never_whole_gives_the_last_snapshot_counted() -> None:
+def test_a_slot_that_is_never_consistent_gives_the_last_snapshot_and_is_counted() -> None:
     image, _ = one_region(TagSpec("x", TagKind.INT))
     writer, reader = image.writer("r"), image.reader("r")
     writer.publish([good(1)], 1)

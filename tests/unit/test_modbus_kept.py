@@ -43,7 +43,7 @@ def test_a_changed_timeout_counts_from_the_next_request_on() -> None:
         loop.close()
 
 
-def test_a_cell_that_is_hooked_after_it_was_read_is_read_through_its_hook() -> None:
+def test_a_cell_that_is_hooked_after_a_read_is_read_through_its_hook() -> None:
     bank = MapBank([Span("holding", 10, 4)])
     bank.poke("holding", 10, 1, 2, 3, 4)
     assert list(bank.read("holding", 10, 4, 0)) == [1, 2, 3, 4]

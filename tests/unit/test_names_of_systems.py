@@ -26,7 +26,7 @@ from fieldtwin.twin.site.system import load_system
         ("obsrvatory", r"no system 'obsrvatory'.*did you mean 'observatory'\?"),
     ],
 )
-def test_a_system_that_is_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, told: str) -> None:
+def test_a_missing_system(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, told: str) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mysite.yaml").write_text("fieldtwin: 1\n")
     os.mkfifo(tmp_path / "pipe.yaml")
@@ -49,7 +49,7 @@ def test_a_site_without_a_prototype_reports_the_remedy(tmp_path: Path) -> None:
         ('{"started":"2026"}\n', "raw traffic: fieldtwin import"),
     ],
 )
-def test_a_file_of_another_verb_is_named(tmp_path: Path, line: str, told: str) -> None:
+def test_a_file_of_a_different_command_is_named(tmp_path: Path, line: str, told: str) -> None:
     (tmp_path / "given.jsonl").write_text(line)
     with pytest.raises(FileInvalid, match=told):
         RecordingReader(tmp_path / "given.jsonl")

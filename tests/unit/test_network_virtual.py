@@ -31,7 +31,7 @@ def run(seed: int, trace: Path | None = None) -> VirtualNetworkRun:
     return made
 
 
-def test_the_same_seed_is_the_same_run_and_everything_is_judged(tmp_path: Path) -> None:
+def test_the_same_seed_gives_the_same_run_and_everything_is_checked(tmp_path: Path) -> None:
     file = tmp_path / "trace.jsonl"
     first = run(5, file).summary()
     assert first["ok"], first

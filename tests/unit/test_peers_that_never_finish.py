@@ -329,7 +329,7 @@ def test_an_owner_that_is_silent_between_its_requests_stays(monkeypatch: pytest.
     run(main())
 
 
-def test_a_scrape_that_drips_ends_and_others_are_served(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_slow_scrape_is_ended_and_others_are_served(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(metrics_server, "PATIENCE_S", 0.5)
     monkeypatch.setattr(metrics_server, "MOST_CLIENTS", 4)
 
@@ -494,7 +494,7 @@ def test_a_long_object_of_an_ordinary_node_is_read_whole() -> None:
         step = made.feed(CanFrame(0x585, bytes([step.frame.data[0] & 0x10]) + bytes(7)), now_ns)
 
 
-def test_a_node_that_drips_does_not_hold_up_another_one() -> None:
+def test_a_slow_node_does_not_delay_another_one() -> None:
     async def main() -> None:
         ours, theirs = bus()
         answered = 0

@@ -119,7 +119,7 @@ def test_edges(levels: list[bool]) -> None:
 
 
 @given(st.lists(st.tuples(st.booleans(), st.booleans()), max_size=30))
-def test_bistables_differ_where_both_inputs_are_true(pairs: list[tuple[bool, bool]]) -> None:
+def test_bistables_differ_if_both_inputs_are_true(pairs: list[tuple[bool, bool]]) -> None:
     sr, rs, q_sr, q_rs = SR(), RS(), False, False
     for s, r in pairs:
         q_sr = s or (q_sr and not r)

@@ -354,7 +354,7 @@ def test_the_configuration_survives_json_and_a_wrong_one_is_refused(tmp_path: Pa
         PlcConfig.load(tmp_path / "nothing.json")
 
 
-def test_an_image_that_is_missing_empty_or_another_is_refused(tmp_path: Path) -> None:
+def test_a_missing_empty_or_foreign_image_is_refused(tmp_path: Path) -> None:
     config = config_in(tmp_path, RELAY)
     with pytest.raises(Unreachable, match="no process image"):
         plc_main(config)

@@ -64,7 +64,7 @@ def test_a_warm_start_continues_and_a_cold_one_starts_fresh(tmp_path: Path) -> N
     anew.close()
 
 
-def test_another_program_begins_cold_and_the_old_file_is_kept(tmp_path: Path) -> None:
+def test_a_different_program_starts_cold_and_the_old_file_is_kept(tmp_path: Path) -> None:
     path = tmp_path / "retain"
     kept = Retained(bound(Counter()), path)
     kept.save()

@@ -207,7 +207,7 @@ def test_forces_survive_a_restart_and_are_in_every_status(tmp_path: Path) -> Non
         rig.runner.why("d.n")
 
 
-def test_an_input_that_trips_stops_for_good(tmp_path: Path) -> None:
+def test_an_input_that_trips_stops_permanently(tmp_path: Path) -> None:
     rig = Rig(tmp_path, (TaskSpec("fast", 10),), ("Fast",), if_bad="trip")
     rig.runner.start()
     rig.until(20)

@@ -155,7 +155,7 @@ def test_an_output_never_set_or_not_a_number_is_not_good() -> None:
         (-1, TagValue(-1.0, Quality.SUBSTITUTED, Reason.TIMEOUT, 1 * MS)),
     ],
 )
-def test_the_policy_of_an_input_that_is_bad(policy: str | float, expected: TagValue) -> None:
+def test_the_policy_of_a_bad_input(policy: str | float, expected: TagValue) -> None:
     rig = Rig(x=policy)
     rig.feed(10, x=2.5)
     rig.execute(11)

@@ -142,7 +142,7 @@ def command(tag: str, value: str, yes: bool, instance: str) -> None:
 
 @pytest.mark.parametrize("number", ["-1", "-1.5", "-.5", "-0x10", "-1e3", "-inf", "5"])
 @pytest.mark.parametrize("yes", [True, False])
-def test_a_negative_number_is_a_value_wherever_it_stands(number: str, yes: bool) -> None:
+def test_a_negative_number_is_a_value_at_any_position(number: str, yes: bool) -> None:
     for args in (["t", number, "--yes"], ["--yes", "t", number], ["t", "--yes", "--instance", "x", "--", number]):
         given = [a for a in args if yes or a != "--yes"]
         done = CliRunner().invoke(command, given)

@@ -201,7 +201,7 @@ def test_a_value_that_is_not_good_does_not_start_a_program(tmp_path: Path, quali
     assert rig.status["state"] == "waiting"
 
 
-def test_an_input_has_to_be_good_once_and_not_at_the_same_time_as_the_others(tmp_path: Path) -> None:
+def test_an_input_must_be_good_once_and_not_at_the_same_time_as_the_others(tmp_path: Path) -> None:
     both = {"temperature": InputBinding("sensor.temperature", "hold"), "other": InputBinding("fan.mode")}
     rig = Rig(tmp_path, ProgramConfig("ping", "python: MODULE:Ping", both))
     rig.good("fan.mode", 1)

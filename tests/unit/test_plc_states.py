@@ -53,7 +53,7 @@ def scan(pump: Pump, number: int, start: bool = False, level: float | None = 10.
     return pump.state_name
 
 
-def test_a_machine_takes_the_first_transition_that_holds_one_a_scan() -> None:
+def test_a_machine_takes_the_first_enabled_transition_one_per_scan() -> None:
     pump = Pump()
     assert [scan(pump, 1), scan(pump, 2, start=True), scan(pump, 3)] == ["IDLE", "FILLING", "FILLING"]
     assert pump.valve
@@ -251,7 +251,7 @@ class Forgets(Watched):
         (Forgets, "every response leaves, waits or is"),
     ],
 )
-def test_a_relay_that_is_wrong_is_found_out(broken: type[Watched], invariant: str) -> None:
+def test_a_wrong_relay_is_detected(broken: type[Watched], invariant: str) -> None:
     result = prove(replace(PROOF, make=broken))
     assert result.broken.startswith(invariant)
     assert result.way

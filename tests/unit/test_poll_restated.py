@@ -121,7 +121,7 @@ def test_an_overdue_group_stays_due_and_a_new_one_is_read_at_once() -> None:
     assert schedule.missed == {"a": 0, "b": 0}
 
 
-def test_a_device_that_is_away_is_asked_nothing_sooner() -> None:
+def test_a_disconnected_device_is_not_asked_earlier() -> None:
     schedule = PollSchedule({"a": rate(1000)}, ())
     schedule.anchor(0)
     schedule.restate({"a": rate(500), "b": rate(300)}, (), 100, there=False)

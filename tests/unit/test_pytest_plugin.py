@@ -118,7 +118,7 @@ def pytest_collection_finish():
 """A user's environment with pytest and fieldtwin without its dependencies; nothing is imported before a test runs."""
 
 
-def test_the_docs_run_where_nothing_but_pytest_is_installed(pytester: pytest.Pytester) -> None:
+def test_the_docs_examples_run_with_nothing_but_pytest_installed(pytester: pytest.Pytester) -> None:
     blocks = re.findall(r"```python\n(.*?)```", (HERE / "docs/testing.md").read_text(), re.DOTALL)
     for block in blocks:
         assert len([line for line in block.splitlines() if line]) <= 10, block

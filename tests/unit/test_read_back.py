@@ -62,7 +62,7 @@ def test_a_register_that_can_only_be_written_gives_no_warning(tmp_path: Path) ->
     assert load_system(str(hall(tmp_path, writable="mode, lamp"))).warnings == ()
 
 
-def test_the_warning_is_shown_where_the_file_is_loaded(tmp_path: Path) -> None:
+def test_the_warning_is_shown_when_the_file_is_loaded(tmp_path: Path) -> None:
     system = hall(tmp_path)
     system.write_text(system.read_text().replace("    poll: {status: {every_ms: 500}}\n", ""))
     words = ("run", str(system), "--prototype", "--virtual", "--for", "2s", "--json")

@@ -51,7 +51,7 @@ def test_an_exception_of_one_register_does_not_take_its_neighbours_along() -> No
     assert all(name in table.stdout for name in found), table.stdout
 
 
-def test_a_device_that_is_silent_at_one_register_gives_the_others() -> None:
+def test_a_device_that_is_silent_at_one_register_returns_the_others() -> None:
     def one_is_silent(function: int, address: int, count: int) -> list[int] | int | None:
         return None if address <= 1 < address + count else list(range(address, address + count))
 

@@ -123,7 +123,7 @@ def test_a_device_that_accepts_less_than_its_profile_states_has_limits_and_no_ga
     assert plan.learnt.missing == []
 
 
-def test_mb_025_the_hole_between_two_values_is_learnt() -> None:
+def test_mb_025_the_gap_between_two_values_is_learned() -> None:
     plan = GroupPlan(profile_of([(0, "float32"), (3, "float32"), (2, "uint16")]), "values")
     assert [str(r.range) for r in plan.reads] == ["40001 (holding:0) x 10"]
     assert taught(plan, without({8})) == [5, 2]  # whole, its halves, the halves of one half; then two
@@ -139,7 +139,7 @@ def test_mb_025_a_profile_that_states_its_gap_is_never_asked_for_it() -> None:
     ]
 
 
-def test_a_value_that_was_missing_and_comes_is_read_with_the_others_again() -> None:
+def test_a_missing_value_that_appears_is_read_with_the_others_again() -> None:
     plan = GroupPlan(profile_of([(0, "uint16"), (0, "uint16"), (0, "uint16")]), "values")
     taught(plan, without({1}))
     assert plan.learnt.missing == ["t1"]
@@ -190,7 +190,7 @@ def test_an_invalid_range_is_refused(text: str) -> None:
         resolve_gap(text, "printed")
 
 
-def test_a_gap_where_a_value_stands_is_refused() -> None:
+def test_a_gap_at_the_place_of_a_value_is_refused() -> None:
     with pytest.raises(FileInvalid, match=r"holding:2\.\.5.*where the tag 't1' stands"):
         profile_of([(0, "uint16"), (4, "uint16")], gaps=["holding:1", "holding:2..5"])
 

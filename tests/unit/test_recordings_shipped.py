@@ -24,7 +24,7 @@ def make(out: Path, *arguments: str) -> None:
     subprocess.run([sys.executable, str(script), "--out", str(out), *arguments], check=True, capture_output=True)
 
 
-def test_the_script_makes_the_committed_bytes_and_another_seed_others(tmp_path: Path) -> None:
+def test_the_script_makes_the_committed_bytes_and_a_different_seed_other_bytes(tmp_path: Path) -> None:
     make(tmp_path)
     make(tmp_path / "other", "--seed", "2")
     for name in SHIPPED:

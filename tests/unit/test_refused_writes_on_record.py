@@ -102,7 +102,7 @@ def test_the_journal_keeps_the_newest_entries_and_counts_all(tmp_path: Path) -> 
     assert kept.describe()["faults"]["program"] == KEPT + 50
 
 
-def test_an_entry_whose_line_is_looked_up_holds_the_later_ones_back(tmp_path: Path) -> None:
+def test_an_entry_whose_line_is_being_looked_up_delays_the_later_ones(tmp_path: Path) -> None:
     kept, audit = journal(tmp_path / "a")
     kept.looks_up = True
     kept.note("d", "d.speed", 60.0, Cause.LIMIT, "too fast", "plc", 0)

@@ -87,7 +87,7 @@ def test_a_mapping_is_learned_from_writes() -> None:
     ]
 
 
-def test_a_mapping_that_was_refused_is_not_learnt() -> None:
+def test_a_refused_mapping_is_not_learned() -> None:
     refused = [can(0, "605#23001A0110002060"), can(1, "585#80001A0100000106")]
     assert exchanges(observatory(), [*refused, can(10, "185#9E013500")])[-1].tags["slope_long"] == 4.14
 

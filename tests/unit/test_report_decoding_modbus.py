@@ -201,7 +201,7 @@ def test_bits() -> None:
 
 
 @pytest.mark.parametrize("pdu", ["03 0000", "10 0001 0002 02 0001", "17 0003", "05 00"])
-def test_a_request_that_is_cut_off_is_malformed(pdu: str) -> None:
+def test_a_truncated_request_is_malformed(pdu: str) -> None:
     assert parse_request(bytes.fromhex(pdu)).problem == "malformed"
 
 

@@ -223,7 +223,7 @@ are accepted by every other reader and by newer versions of it."""
 
 
 @pytest.mark.parametrize("verdict", Verdict)
-def test_nothing_stands_in_it_that_its_schema_does_not_know(verdict: Verdict) -> None:
+def test_it_contains_only_content_that_its_schema_knows(verdict: Verdict) -> None:
     report = Report(
         "r", [result(verdict, requirements=("R-1",), trace_hash="ab")], seed=3, started="2026-11-21T12:00:00"
     )

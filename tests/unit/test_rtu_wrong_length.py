@@ -78,7 +78,7 @@ def test_noise_is_answered_only_if_its_check_sum_is_right(data: bytes, piece: in
 
 @pytest.mark.parametrize("hexadecimal", WRONG.values(), ids=WRONG)
 @pytest.mark.parametrize("piece", [256, 1])
-def test_the_bridge_passes_it_on_to_the_device_that_is_asked(hexadecimal: str, piece: int) -> None:
+def test_the_bridge_passes_it_on_to_the_requested_device(hexadecimal: str, piece: int) -> None:
     pdu = bytes.fromhex(hexadecimal)
     line = RtuRequests(500_000, [7])
     frame = with_crc(b"\x07" + pdu)

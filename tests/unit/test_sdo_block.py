@@ -103,7 +103,7 @@ def test_an_impossible_block_upload_is_an_error_of_the_caller(block: int, switch
         SdoBlockUpload(5, 0x2000, 0, TIMEOUT, block=block, switch_bytes=switch)
 
 
-def test_a_size_that_is_too_large_is_not_even_begun() -> None:
+def test_a_too_large_size_is_not_even_started() -> None:
     refused(feed(upload(max_bytes=10), "C2 00 20 00 0B 00 00 00"), 0x0504_0005)
 
 

@@ -56,7 +56,7 @@ def test_the_environment_is_taken(name: str, monkeypatch: pytest.MonkeyPatch) ->
     assert WORD not in f"{said.output}{said.exception}"
 
 
-def test_every_option_that_is_a_secret_is_one_of_these() -> None:
+def test_every_secret_option_is_one_of_these() -> None:
     """A password option that accepts its value directly would be a further exposure."""
     secret, plain = set(), set()
     for name in COMMANDS:
@@ -94,7 +94,7 @@ def test_a_password_in_a_url_is_refused_and_not_repeated(url: str) -> None:
     assert WORD not in str(refused.value)
 
 
-def test_the_brokers_password_may_stand_in_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_brokers_password_may_be_in_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     system = load_system(str(CHECKOUT / "profiles/systems/observatory.yaml"))
     monkeypatch.setenv("FIELDTWIN_MQTT_PASSWORD_FILE", str(tmp_path / "password"))
     with pytest.raises(UsageError, match="No such file"):

@@ -85,7 +85,7 @@ def test_errors_are_reported_with_their_place(tmp_path: Path, old: str, new: str
         load_prototype(load_system(changed(tmp_path, old, new)))
 
 
-def test_a_python_file_that_is_not_there(tmp_path: Path) -> None:
+def test_a_missing_python_file(tmp_path: Path) -> None:
     path = changed(tmp_path, "step_ms: 10", "step_ms: 10")
     file = tmp_path / "lab_vehicle.prototype.yaml"
     file.write_text(

@@ -128,7 +128,7 @@ def test_status_flags() -> None:
         assert adapter.say(b"F\rF\r") == 2 * flags  # a state lasts
 
 
-def test_a_full_queue_holds_the_command_back() -> None:
+def test_a_full_queue_delays_the_command() -> None:
     adapter = Adapter(room=1)
     assert adapter.say(b"t1000\rt2000\rV\r") == b"z\r"
     assert adapter.session.waiting

@@ -175,7 +175,7 @@ def test_data_has_aliases_times_quality_and_marks_historical_values() -> None:
     assert fresh.properties == ()
 
 
-def test_a_host_that_has_not_heard_the_birth_asks_for_it() -> None:
+def test_a_host_that_missed_the_birth_requests_it() -> None:
     edge, host = sides()
     edge.messages(HELLO, 5)
     data = Data(HELLO.tag, (Event(1, 5, 0, "ctd.pressure", 1.5),))

@@ -133,7 +133,7 @@ def test_bitwise(data: st.DataObject, kind: str, op: str) -> None:
     assert worked_out(kind, "NOT x0", (kind, a)) == 2**bits - 1 - a
 
 
-def test_constants_without_a_type_are_bit_strings_where_bits_are_asked_for() -> None:
+def test_untyped_constants_are_bit_strings_where_bits_are_required() -> None:
     assert value("INT", "2#1010 AND 2#1100") == 0b1000
     assert value("BYTE", "2#1010 OR 16#F0") == 0xFA
     assert value("WORD", "16#FF00 XOR 16#0FF0 AND 16#F") == 0xFF00

@@ -142,7 +142,7 @@ FUNCTION_BLOCK Add VAR_IN_OUT a, b : INT; END_VAR VAR_OUTPUT seen : INT; END_VAR
 """
 
 
-def test_a_variable_that_is_handed_over_twice_is_one_variable() -> None:
+def test_a_variable_that_is_passed_twice_is_one_variable() -> None:
     for variable in ("n", "s.n", "l[2]", "g", "p.a[2]"):
         got = run("n, r : INT; s, p : S; l : ARRAY[1..3] OF INT;", f"r := both({variable}, {variable});", HANDED)
         assert got["r"] == 22, variable
@@ -151,7 +151,7 @@ def test_a_variable_that_is_handed_over_twice_is_one_variable() -> None:
     assert run("l : ARRAY[1..2] OF INT; r : INT;", "r := both(l[1], l[2]);", HANDED)["l"] == [1, 10]
 
 
-def test_a_global_variable_that_is_handed_over_is_the_one_that_the_pou_sees() -> None:
+def test_a_global_variable_that_is_passed_is_the_one_that_the_pou_sees() -> None:
     made = program(HANDED + "PROGRAM p VAR r : INT; END_VAR r := twice(g); END_PROGRAM")
     scan(made)
     assert (made.st_resource.globals.v_g, made.st_body.v_r) == (1111, 1111)
@@ -161,7 +161,7 @@ def test_a_functions_own_variable_can_be_handed_over() -> None:
     assert run("r : INT;", "r := own(5);", HANDED)["r"] == 16 + 16 + 16
 
 
-def test_the_element_that_is_handed_over_is_the_one_at_the_beginning_of_the_call() -> None:
+def test_the_element_that_is_passed_is_the_one_at_the_beginning_of_the_call() -> None:
     before = HANDED + "FUNCTION move : INT VAR_IN_OUT i, e : INT; END_VAR i := 3; e := 7; move := 0; END_FUNCTION\n"
     got = run("i, r : INT := 1; l : ARRAY[1..3] OF INT;", "r := move(i, l[i]);", before)
     assert (got["i"], got["l"]) == (3, [7, 0, 0])

@@ -79,7 +79,7 @@ def test_errors_name_line_and_column_of_the_export(tmp_path: Path) -> None:
         assert (e.value.line, e.value.column) == (line, column)
 
 
-def test_methods_and_actions_are_refused_where_they_stand(tmp_path: Path) -> None:
+def test_methods_and_actions_are_refused_at_their_position(tmp_path: Path) -> None:
     text = (SHAPES / "codesys_shape.xml").read_text()
     assert text.count("<addData />") == 1
     path = tmp_path / "tank.xml"

@@ -66,7 +66,7 @@ def test_operands_skipped_by_and_then_and_or_else_are_not_evaluated(condition: s
     assert (got["r"], got["n"]) == (result, calls)
 
 
-def test_calls_with_outputs_in_conditions_are_made_each_time_they_are_looked_at() -> None:
+def test_calls_with_outputs_in_conditions_are_made_at_each_evaluation() -> None:
     body = """WHILE f(n < 3, n := n, o => o) DO s := s + o; END_WHILE;
               IF f(FALSE, n := m) THEN ; ELSIF f(TRUE, n := m) THEN e := m; ELSIF f(TRUE, n := m) THEN e := -1; END_IF;
               REPEAT k := k + 1; IF k < 3 THEN CONTINUE; END_IF; UNTIL f(k >= 3, n := c) END_REPEAT"""
@@ -170,7 +170,7 @@ def test_comments_nest_and_hide_whatever_is_in_them() -> None:
         ("PROGRAM p VAR i : INT; END_VAR\ni := 1e; END_PROGRAM", 2, 7, "not Structured Text"),
     ],
 )  # fmt: skip
-def test_refused_where_it_stands(text: str, line: int, column: int, told: str) -> None:
+def test_refused_at_their_position(text: str, line: int, column: int, told: str) -> None:
     with pytest.raises(FileInvalid, match=told) as e:
         program(text)
     assert (e.value.line, e.value.column) == (line, column)

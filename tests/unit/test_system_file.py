@@ -104,7 +104,7 @@ def test_invalid_names(name: str, tmp_path: Path) -> None:
         Instance(name, tmp_path)
 
 
-def test_where_instances_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_run_directories_of_instances(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("FIELDTWIN_RUN", str(tmp_path))
     monkeypatch.setenv("XDG_RUNTIME_DIR", "/run/user/5")
     assert runtime_root() == tmp_path

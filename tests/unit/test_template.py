@@ -97,7 +97,7 @@ def test_files_that_exist_only_on_this_computer_are_refused(dam: Path, tmp_path:
         packed(dam, tmp_path / "T.zip")
 
 
-def test_a_program_that_is_installed_elsewhere_cannot_be_packed(dam: Path, tmp_path: Path) -> None:
+def test_a_program_installed_elsewhere_cannot_be_packed(dam: Path, tmp_path: Path) -> None:
     text = dam.read_text().replace("programs:", "programs:\n    x: {source: 'python: antigravity:Program'}")
     dam.write_text(text)
     with pytest.raises(FileInvalid, match="installed on this computer"):

@@ -98,7 +98,7 @@ OPENS_NOTHING = {
 
 @pytest.mark.parametrize("form", ["a file inside", "a folder", "a zip"])
 @pytest.mark.parametrize("verb", list(VERBS))
-def test_every_verb_asks_before_anything_of_a_template_is_run_or_opened(site: Site, verb: str, form: str) -> None:
+def test_every_command_asks_before_anything_of_a_template_is_run_or_opened(site: Site, verb: str, form: str) -> None:
     named = {"a file inside": site.system, "a folder": site.folder, "a zip": site.zip}[form]
     done = fieldtwin(*(named if word == "X" else word for word in VERBS[verb]))
     assert isinstance(done.exception, NotAllowed), (done.output, done.exception)

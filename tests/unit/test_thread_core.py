@@ -242,7 +242,7 @@ def test_one_lost_frame_is_sent_again_as_soon_as_it_is_missed() -> None:
     assert first
 
 
-def test_a_new_link_that_has_heard_no_hello_asks_for_one() -> None:
+def test_a_new_link_without_a_hello_requests_one() -> None:
     net = Net(2)
     plant, shore = net.sides
     plant.log(value(0))

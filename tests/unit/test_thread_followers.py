@@ -64,7 +64,7 @@ def played(tmp_path: Path, main: Callable[[Place], Coroutine[Any, Any, None]]) -
         loop.close()
 
 
-def test_the_second_is_refused_while_the_first_answers_and_let_in_when_it_went(tmp_path: Path) -> None:
+def test_the_second_is_refused_while_the_first_answers_and_accepted_when_it_left(tmp_path: Path) -> None:
     async def main(place: Place) -> None:
         first, second = place.follower("first"), place.follower("second")
         await first.start()

@@ -82,7 +82,7 @@ def test_every_change_is_shared_and_constant_values_every_ten_seconds() -> None:
     assert [e.value for e in watched.look(2.0, REFRESH_MS)] == [2.0]
 
 
-def test_a_thread_that_is_thinned_out_has_a_value_a_second_and_whatever_matters_at_once() -> None:
+def test_a_thinned_thread_has_a_value_a_second_and_important_events_at_once() -> None:
     watched = Watched(every_ms=1000)
     assert [e.value for e in watched.look(1.0, 0)] == [1.0]
     assert watched.look(2.0, 500) == []

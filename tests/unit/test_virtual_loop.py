@@ -140,7 +140,7 @@ def test_a_deadlock_names_the_waiting_tasks() -> None:
         assert re.search(told, str(e.value)), str(e.value)
 
 
-def test_a_deadlock_names_the_task_that_is_waited_for() -> None:
+def test_a_deadlock_names_the_awaited_task() -> None:
     async def main(loop: VirtualLoop) -> None:
         await loop.create_task(waits(loop.create_future()), name="who never ends")
 
@@ -153,7 +153,7 @@ def test_a_deadlock_names_the_task_that_is_waited_for() -> None:
         run(main)
 
 
-def test_time_that_stands_still_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_time_without_progress_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("fieldtwin.emulators.virtual.loop.STUCK_AFTER", 1_000)
 
     async def main(loop: VirtualLoop) -> None:

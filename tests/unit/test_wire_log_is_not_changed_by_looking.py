@@ -74,7 +74,7 @@ def seen(device: Device, **like: object) -> list[Exchange]:
     return found
 
 
-def test_a_look_during_a_delayed_reply_shows_it_pending_and_changes_nothing(device: Device) -> None:
+def test_a_read_during_a_delayed_reply_shows_it_pending_and_changes_nothing(device: Device) -> None:
     with Client(device) as client, device.fault("delay", by_ms=300):
         client.send(1)
         looks = [seen(device)[0].problem]
@@ -170,7 +170,7 @@ def test_an_asynchronous_driver_can_be_awaited_during_expect(device: Device) -> 
     assert [e.problem for e in asyncio.run(test())] == [""]
 
 
-def test_an_sdo_transfer_that_is_looked_at_between_its_segments_stays_whole() -> None:
+def test_an_sdo_transfer_that_is_read_between_its_segments_stays_complete() -> None:
     wire = CanopenWire("can0", [])
     frames = [
         (0x605, "4000200000000000"), (0x585, "410020000a000000"), (0x605, "6000000000000000"),

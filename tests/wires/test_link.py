@@ -271,7 +271,7 @@ def test_a_far_side_that_finished_sending_still_gets_its_answer(tmp_path: Path) 
     run(main())
 
 
-def test_a_listening_side_lets_one_master_in_at_a_time(tmp_path: Path) -> None:
+def test_a_listening_side_accepts_one_client_at_a_time(tmp_path: Path) -> None:
     async def main() -> None:
         loop = asyncio.get_running_loop()
         listen = Endpoint.parse("tcp://127.0.0.1:0?listen=1")

@@ -123,7 +123,7 @@ def test_without_a_role_the_server_refuses_restricted_functions(pki: Pki) -> Non
         ("server", {"ca": "ca", "name": "elsewhere"}, "Hostname mismatch"),
     ],
 )
-def test_a_server_that_is_not_the_one_is_refused(pki: Pki, name: str, files: dict[str, str], says: str) -> None:
+def test_a_server_with_a_wrong_certificate_is_refused(pki: Pki, name: str, files: dict[str, str], says: str) -> None:
     async def main() -> None:
         async with server(pki, name, mutual=False) as (at, _):
             given_files = {k: pki.ca if v == "ca" else v for k, v in files.items()}

@@ -170,7 +170,7 @@ def test_closing_wakes_waiting_readers(tmp_path: Path) -> None:
     run(main())
 
 
-def test_a_flood_is_held_back_and_nothing_is_lost(tmp_path: Path) -> None:
+def test_a_flood_is_throttled_and_nothing_is_lost(tmp_path: Path) -> None:
     async def main() -> None:
         end = await PtyEnd.open(tmp_path / "line1", LINE)
         end.max_pending = 4

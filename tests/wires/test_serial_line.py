@@ -239,7 +239,7 @@ def test_a_write_waits_while_the_driver_is_full_and_loses_nothing(line: Line) ->
     run(main())
 
 
-def test_a_slow_reader_holds_the_line_back_and_loses_nothing(line: Line) -> None:
+def test_a_slow_reader_throttles_the_line_and_loses_nothing(line: Line) -> None:
     sent = bytes(n % 251 for n in range(300_000))
 
     async def main() -> None:

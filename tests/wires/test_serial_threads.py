@@ -88,7 +88,7 @@ def test_a_reader_that_rests_is_not_flooded(tmp_path: Path) -> None:
     run(main())
 
 
-def test_a_port_that_is_pulled_is_a_loss(tmp_path: Path) -> None:
+def test_a_pulled_port_is_a_loss(tmp_path: Path) -> None:
     async def main() -> None:
         link = tmp_path / "line"
         device = await PtyEnd.open(link, Endpoint.parse("pty:line"))
@@ -103,7 +103,7 @@ def test_a_port_that_is_pulled_is_a_loss(tmp_path: Path) -> None:
     run(main())
 
 
-def test_the_verbs_and_the_port_work_without_posix(tmp_path: Path) -> None:
+def test_the_commands_and_the_port_work_without_posix(tmp_path: Path) -> None:
     async def main() -> str:
         link = tmp_path / "line"
         device = await PtyEnd.open(link, Endpoint.parse("pty:line"))

@@ -183,7 +183,7 @@ def test_a_client_that_does_not_read_loses_frames_alone() -> None:
     run(main())
 
 
-def test_where_it_cannot_listen() -> None:
+def test_an_endpoint_that_cannot_listen() -> None:
     async def main() -> None:
         async with bench() as (server, port):
             with pytest.raises(EndpointBusy):

@@ -160,7 +160,7 @@ def test_a_client_that_does_not_read_is_waited_for_and_closed_in_bounded_time() 
     run(main())
 
 
-def test_a_client_that_floods_is_held_back() -> None:
+def test_a_flooding_client_is_throttled() -> None:
     gate = asyncio.Event()
 
     async def slow(connection: ByteConnection) -> None:

@@ -158,7 +158,7 @@ def test_a_write_waits_for_a_peer_that_does_not_read_and_loses_nothing() -> None
     run(main())
 
 
-def test_a_slow_reader_holds_the_peer_back_and_loses_nothing() -> None:
+def test_a_slow_reader_throttles_the_peer_and_loses_nothing() -> None:
     async def main() -> None:
         loop = asyncio.get_running_loop()
         async with connected(max_pending=4) as (connection, peer):

@@ -74,7 +74,7 @@ def test_a_flaw_is_refused_with_its_line_and_a_cut_off_line_is_not(line: str, tm
     assert len(list(read_capture(path))) == 1
 
 
-def test_a_capture_that_is_not_there_is_refused(tmp_path: Path) -> None:
+def test_a_missing_capture_is_refused(tmp_path: Path) -> None:
     with pytest.raises(FileInvalid, match="cannot read the capture"):
         list(read_capture(tmp_path / "nothing.jsonl"))
     with pytest.raises(FileInvalid, match="cannot write the pcap file"):

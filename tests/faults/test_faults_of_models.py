@@ -75,9 +75,8 @@ def test_registers_of_a_model_hold_the_set_value_and_their_own_again(
     assert list(seen.read("holding", 12, 1, 0)) == [123]
     assert list(seen.read("coil", 7, 1, 0)) == [1]
     seen.read("holding", 0, 2, 0)
-    assert (
-        decode(list(seen.read("holding", 0, 2, 2 * NS_PER_S)), "uint32") == 10150
-    )  # 995, and 20 more: 0.1 per second from 5 on
+    # 995, and 20 more: 0.1 per second from 5 on
+    assert decode(list(seen.read("holding", 0, 2, 2 * NS_PER_S)), "uint32") == 10150
     assert list(seen.read("holding", 1, 1, 2 * NS_PER_S)) == [10150]  # half of it
     bank.write("holding", 0, [0, 50], 3 * NS_PER_S)
     assert decode(list(seen.read("holding", 0, 2, 3 * NS_PER_S)), "uint32") == 350  # written values drift as well

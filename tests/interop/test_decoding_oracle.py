@@ -59,9 +59,8 @@ def test_modbus(bus: str, tmp_path: Path) -> None:
     for exchange, request, reply in zip(ours, packets[::2], packets[1::2], strict=True):
         assert numbers(request["modbus.func_code"]) == [exchange.function]
         at = numbers(request["modbus.reference_num"] + "," + request["modbus.read_reference_num"])
-        assert exchange.address in at or (
-            bus == "line1" and not at
-        )  # on RTU it cannot always distinguish a request from a reply
+        # on RTU it cannot always distinguish a request from a reply
+        assert exchange.address in at or (bus == "line1" and not at)
         counts = numbers(request["modbus.word_cnt"]) + numbers(request["modbus.bit_cnt"])
         assert not counts or exchange.count in counts
         assert numbers(reply["modbus.exception_code"]) == ([] if exchange.exception is None else [exchange.exception])

@@ -128,9 +128,8 @@ def test_a_missing_dry_run_protection_is_found_and_shrunk_and_the_repaired_progr
     assert failed.reason.startswith("within 1: not well.runs within 1 s after")
     cases = ET.parse("r.xml").getroot().findall(".//testcase")
     assert cases[0].get("name") == "the pump never runs dry [4 seeds]"
-    assert (
-        sum(case.find("failure") is not None for case in cases) >= 3
-    )  # the campaign, a seed, and the result of shrinking it
+    # the campaign, a seed, and the result of shrinking it
+    assert sum(case.find("failure") is not None for case in cases) >= 3
     assert any(
         "silence" in (one.get("value") or "") or "fault" in (one.get("name") or "")
         for one in ET.parse("r.xml").iter("property")

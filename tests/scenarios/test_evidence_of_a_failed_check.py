@@ -81,9 +81,8 @@ def test_terminal_json_and_junit_show_the_last_exchanges_and_how_many_were_left_
     lines = plain["on_the_wire"]
     assert len(lines) == MOST + 1
     assert lines[0] == heading[0]
-    assert int(heading[1]) + MOST == pytest.approx(
-        5 * (10 + 1), abs=3
-    )  # each second: ten polls of the level and one of the PIN
+    # each second: ten polls of the level and one of the PIN
+    assert int(heading[1]) + MOST == pytest.approx(5 * (10 + 1), abs=3)
     failed_s = plain["checks"][-1]["t_s"]
     for line in lines[1:]:
         at, request, _ = re.fullmatch(r"([\d.]+) s  (.+) -> (.+)", line).groups()  # type: ignore[union-attr]

@@ -175,9 +175,8 @@ def test_retries_are_reported_in_text_json_junit_and_html(tmp_path: Path, monkey
     assert (tmp_path / "r.html").read_text().count("attempt 1 of 2 was inconclusive: step 1: too late") == 1
     failed = ScenarioResult("a test", FAILED, earlier=("step <1>: too late",))
     page = render_html(Report("r", [failed]))
-    assert (
-        page.count("attempt 1 of 2 was inconclusive: step &lt;1&gt;: too late") == 2
-    )  # in the table, and at the failed step
+    # in the table, and at the failed step
+    assert page.count("attempt 1 of 2 was inconclusive: step &lt;1&gt;: too late") == 2
 
 
 def test_writes_to_a_plant_are_not_repeated(tmp_path: Path) -> None:

@@ -108,10 +108,8 @@ def test_a_master_on_a_line_reaches_tcp_units_of_a_prototype(tmp_path: Path) -> 
         assert status["bridge"]["door"]["noise_bytes"] == 0
         assert '"done"' in (tmp_path / "run" / "p" / "audit.jsonl").read_text("ascii")
         program.signal(signal.SIGINT)
-        assert program.wait(10) in (
-            0,
-            1,
-        )  # 1: no message came from the remote client, and no program takes messages here
+        # 1: no message came from the remote client, and no program takes messages here
+        assert program.wait(10) in (0, 1)
     no_tracebacks(tmp_path / "run")
 
 

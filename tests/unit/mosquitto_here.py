@@ -34,9 +34,8 @@ class Mosquitto:
         self.port = free_port()
         self._program = program()
         self._config = folder / "mosquitto.conf"
-        user = (
-            ["user root"] if os.getuid() == 0 else []
-        )  # otherwise it changes to a user that cannot read the test's folder
+        # otherwise it changes to a user that cannot read the test's folder
+        user = ["user root"] if os.getuid() == 0 else []
         self._config.write_text(
             "\n".join((f"listener {self.port} 127.0.0.1", "persistence false", *user, *settings)) + "\n"
         )

@@ -63,9 +63,8 @@ def test_a_missing_serial_port_is_not_a_path(tmp_path: Path) -> None:
             (tmp_path / "line").unlink()
             assert r.bus._client is not None
             await r.bus._client.aclose()
-            assert (
-                await refused(client, 1) == 0x0A
-            )  # nothing was sent, so it waited until the attempt to open the port failed
+            # nothing was sent, so it waited until the attempt to open the port failed
+            assert await refused(client, 1) == 0x0A
             assert await refused(client, 1) == 0x0A  # and now the failure is known
             assert r.bus.down is not None
 

@@ -293,9 +293,8 @@ def test_a_missed_period_is_skipped_and_counted_and_never_made_up_for() -> None:
             assert [round(g, 1) for g in gaps if g > 0.15] == [1.0] * 2
             assert min(gaps[1:]) > 0.02  # no burst: at once after the gap, and then on the grid again
             assert all(t % 0.1 < 0.03 or t % 0.1 > 0.099 for t in times if not 0 < t % 10 < 1.1)
-            assert (
-                v.bus.devices[0].schedule.missed["values"] - missed == 16
-            )  # the one that was late each time is not among them
+            # the one that was late each time is not among them
+            assert v.bus.devices[0].schedule.missed["values"] - missed == 16
 
         await run_bus(make, {1: unit(), 2: unit()}, scenario)
 

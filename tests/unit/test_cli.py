@@ -152,9 +152,8 @@ def test_a_wrong_system_file_is_reported_with_line_and_expected_content(
     assert out == ""
     assert f"{path}:" in err
     where = err.split(f"{path}:", 1)[1].split(" ", 1)[0]
-    assert int(where.split(":")[0]) in (line_of(path, line), line_of(path, line) + 1), (
-        err
-    )  # YAML reports some one line later
+    # YAML reports some one line later
+    assert int(where.split(":")[0]) in (line_of(path, line), line_of(path, line) + 1), err
     assert told in err
     assert not (tmp_path / "run").exists() or not list((tmp_path / "run").glob("*/*.log"))  # nothing was started
 

@@ -250,9 +250,8 @@ def test_another_device_than_expected_is_not_written(tmp_path: Path) -> None:
             await r.polls(1)
             assert r.writes == []
             r.cells.poke("holding", 100, 0x7879, 0x7A00)
-            r.cells.poke(
-                "holding", 0, 7
-            )  # differs from the safe value, because a device that already holds it is not written
+            # differs from the safe value, because a device that already holds it is not written
+            r.cells.poke("holding", 0, 7)
             await eventually(
                 lambda: len(r.writes) == 1, within_s=15
             )  # the pause before the next identity request grows

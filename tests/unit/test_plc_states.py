@@ -63,9 +63,8 @@ def test_a_machine_takes_the_first_enabled_transition_one_per_scan() -> None:
     assert scan(pump, 6, start=True, stop=True) == "IDLE"
     assert pump.scans_filling == 3
     assert scan(pump, 7, start=True) == "FILLING"
-    assert (
-        scan(pump, 20, level=85.0) == "IDLE"
-    )  # full just when it takes too long: only the first of the two transitions
+    # full just when it takes too long: only the first of the two transitions
+    assert scan(pump, 20, level=85.0) == "IDLE"
 
 
 def test_time_in_a_state_counts_from_the_scan_that_entered_it() -> None:

@@ -41,9 +41,8 @@ def test_no_poll_is_lost_or_doubled(old: int, new: int, phase: int, now_ms: int)
     other += times(schedule, "b", now_ns, end_ns)
     gaps = [(b - a) / NS_PER_MS for a, b in pairwise(read)]
     first = next(n for n, t in enumerate(read) if t >= now_ns)
-    assert (
-        min(gaps[1:first]) >= min(old, new) if first > 1 else True
-    )  # it is read when the device is connected, then at its place
+    # it is read when the device is connected, then at its place
+    assert min(gaps[1:first]) >= min(old, new) if first > 1 else True
     assert max(gaps) <= max(old, new)
     on_its_way, there = gaps[first : first + SOONER + 1], gaps[first + SOONER + 1 :]
     assert all(new * 7 / 8 <= gap <= new for gap in on_its_way)

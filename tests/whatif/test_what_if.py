@@ -80,9 +80,8 @@ def test_a_program_that_does_not_publish_its_period_gets_the_known_command() -> 
 def test_a_state_that_a_fork_could_not_begin_with_is_named_unless_a_command_came_first(
     system: str, program: str
 ) -> None:
-    known = KnownState(
-        {}, {program: {**of_period(10), "state": 2}}
-    )  # OFF with a period of 10 s: the state follows from the period
+    # OFF with a period of 10 s: the state follows from the period
+    known = KnownState({}, {program: {**of_period(10), "state": 2}})
     told = [answer(Fork(system, known, 3.0), plan).not_taken for plan in (Plan("go on"), Plan("", (Scripted(0, 5),)))]
     assert told == [[program], []]
 

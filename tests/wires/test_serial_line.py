@@ -65,9 +65,8 @@ async def collect(connection: SerialConnection, size: int) -> bytes:
 
 
 def test_every_byte_value_passes_unchanged_in_both_directions(line: Line) -> None:
-    every = (
-        bytes(range(256)) * 3
-    )  # XON, XOFF, ^C, CR, NL and 0xFF are the characters that a badly configured line removes
+    # XON, XOFF, ^C, CR, NL and 0xFF are the characters that a badly configured line removes
+    every = bytes(range(256)) * 3
 
     async def main() -> None:
         connection = await SerialConnection.open(line.endpoint)

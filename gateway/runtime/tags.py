@@ -18,6 +18,8 @@ from fieldtwin.gateway.core.values import NEVER, Quality, Reason, Scalar, TagVal
 FOREVER_NS = 2**63 - 1
 JOURNAL = 100_000
 """How many published values are kept for the store to fetch; the oldest are dropped and counted."""
+OnPut = Callable[[str, TagValue], None]
+"""Called with a tag's name and its new value. It must not raise."""
 _GOOD, _BAD = Quality.GOOD, Quality.BAD  # local names, because looking up an Enum's members is slow
 
 
@@ -58,9 +60,23 @@ class TagTable:
         self._held: dict[str, Held] = {}
         self._news: dict[str, Held] = {}
         self._journal: deque[tuple[str, TagValue]] = deque(maxlen=JOURNAL)
-        self.on_put: Callable[[str, TagValue], None] | None = None
-        """Called with every value whose sample, bytes or quality differ from the last one. It must not raise."""
+        self._subscriptions: dict[object, OnPut] = {}
+        self._subscribers: tuple[OnPut, ...] = ()
+        """The values of `_subscriptions`; a tuple, so that a subscriber may unsubscribe while it is called."""
         self.published = 0
+
+    def subscribe(self, on_put: OnPut) -> Callable[[], None]:
+        """Call `on_put` with every value whose sample, bytes or quality differ from the last one, after earlier
+        subscribers. Return the function that ends the subscription; it does nothing the second time."""
+        subscription = object()
+
+        def unsubscribe() -> None:
+            self._subscriptions.pop(subscription, None)
+            self._subscribers = tuple(self._subscriptions.values())
+
+        self._subscriptions[subscription] = on_put
+        self._subscribers = tuple(self._subscriptions.values())
+        return unsubscribe
 
     def _of(self, name: str) -> Held:
         held = self._held.get(name)
@@ -92,8 +108,9 @@ class TagTable:
         any other."""
         held = self._news[name] = self._of(name)
         before, held.value = held.value, value
-        if self.on_put is not None and value != before:
-            self.on_put(name, value)
+        if self._subscribers and value != before:
+            for on_put in self._subscribers:
+                on_put(name, value)
 
     @property
     def names(self) -> list[str]:
@@ -113,13 +130,15 @@ class TagTable:
         held.refreshed_ns = self._clock.monotonic_ns()
         self._news[name] = held
         if value.quality is not _GOOD:
-            if self.on_put is not None and value.quality is not before.quality:
-                self.on_put(name, value)
+            if value.quality is not before.quality:
+                for on_put in self._subscribers:
+                    on_put(name, value)
         elif value.t_ns != before.t_ns or value.raw != before.raw or before.quality is not _GOOD:
             self.published += 1
             self._journal.append((name, value))
-            if self.on_put is not None:
-                self.on_put(name, value)
+            if self._subscribers:  # costs less than a loop over an empty tuple
+                for on_put in self._subscribers:
+                    on_put(name, value)
 
     def put_bad(self, names: list[str], reason: Reason) -> None:
         """Mark the tags as bad from now on; their last value and its time stay readable."""
@@ -129,8 +148,8 @@ class TagTable:
             if before.quality is not _BAD or before.reason is not reason:
                 held.value = replace(before, quality=_BAD, reason=reason)
                 self._news[name] = held
-                if self.on_put is not None:
-                    self.on_put(name, held.value)
+                for on_put in self._subscribers:
+                    on_put(name, held.value)
 
     def current(self, name: str, now_ns: int) -> TagValue:
         """Return the value of a tag as of `now_ns`: bad with reason STALE if it was not refreshed in time.

@@ -131,8 +131,8 @@ async def winch(tmp_path: Path, loop: VirtualLoop) -> AsyncIterator[Rig]:
         node = run.field.devices["winch"].node
         assert node is not None
         rig = Rig(run, node, other)
-        run.gateway.tags.on_put = lambda name, value: (
-            rig.published.append((loop.now_ns, value.quality)) if name == "winch.position" else None
+        run.gateway.tags.subscribe(
+            lambda name, value: rig.published.append((loop.now_ns, value.quality)) if name == "winch.position" else None
         )
         await asyncio.sleep(3)
         yield rig

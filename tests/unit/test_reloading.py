@@ -348,7 +348,7 @@ def test_limits_hold_for_forces_and_for_writes(plant: Path, loop: VirtualLoop) -
 def test_a_fresh_value_is_not_made_stale_by_a_shorter_limit(plant: Path, loop: VirtualLoop) -> None:
     async def scenario(p: Running) -> None:
         stale: list[str] = []
-        p.run.gateway.tags.on_put = lambda name, value: stale.append(name) if not value.good else None
+        p.run.gateway.tags.subscribe(lambda name, value: stale.append(name) if not value.good else None)
         edit(plant, ("every_ms: 4000", "every_ms: 100"), ("stale_after_ms: 3000", "stale_after_ms: 300"))
         edit(plant, ("every_ms: 1000}", "every_ms: 90}"))
         await p.reload()

@@ -156,7 +156,7 @@ def test_a_prototype_whose_node_is_a_log(tmp_path: Path) -> None:
 
     async def main() -> None:
         async with VirtualPrototype(system, load_prototype(system), loop, tmp_path) as run:
-            run.gateway.tags.on_put = lambda name, value: seen.append(value.value) if name == "winch.offset" else None
+            run.gateway.tags.subscribe(lambda name, value: seen.append(value.value) if name == "winch.offset" else None)
             await asyncio.sleep(1)
 
     loop.run_until_complete(main())

@@ -66,7 +66,7 @@ class PTDigitalThreadProcess(DigitalThreadProcess):
     side = "physical"
 
     def put(self, name: str, value: TagValue) -> None:
-        """Share a tag's new value (`TagTable.on_put`)."""
+        """Share a tag's new value (a subscriber of `TagTable`)."""
         self.share(Kind.VALUE, name, value)
 
     def respond(self, program: str, response: RESPONSE) -> None:

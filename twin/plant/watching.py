@@ -31,6 +31,8 @@ class TagWatch:
         self._clock = clock
         self._changes: deque[Change] = deque(maxlen=MOST)
         self._number = 0
+        self._follows = False
+        """Whether changes are recorded: from the first question on."""
 
     def answer(self, args: dict[str, Any]) -> dict[str, Any]:
         """Return the answer to a `watch` question, with these keys:
@@ -41,8 +43,9 @@ class TagWatch:
 
         Raises `UsageError` for an unknown tag.
         """
-        if self._tags.on_put is None:
-            self._tags.on_put = self._changed
+        if not self._follows:
+            self._tags.subscribe(self._changed)
+            self._follows = True
         since, names, refused = args.get("since", 0), args.get("names", []), args.get("refused", 0)
         if type(since) is not int or type(refused) is not int or not isinstance(names, list):
             raise UsageError("what to watch", expected='{"since": NUMBER, "refused": NUMBER, "names": [TAG...]}')

@@ -39,7 +39,7 @@ class Probes:
         self.names = [name for probe in probes for name in probe.names]
         self._clock = clock
         self._tags = TagTable(clock)
-        self._tags.on_put = self._put
+        self._tags.subscribe(self._put)
         self._updates: dict[str, int] = {}
         self.on_change: Callable[[Kind, str, dict[str, Any]], None] | None = None
         """Called with each change as it occurs; if None, changes are kept for `changes`."""

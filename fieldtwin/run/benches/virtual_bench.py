@@ -109,7 +109,7 @@ class VirtualBench(Started):
 
     async def _start(self) -> None:
         await self._stack.enter_async_context(self.run)
-        self.run.gateway.tags.on_put = self._put
+        self.run.gateway.tags.subscribe(self._put)
         device = next(iter(self.run.field.far), None)
         if device is not None and self._far_end:
             self.shore = Shore(self.system, device, self.run.field.far[device], self.run.clock, self.run.net)

@@ -169,7 +169,7 @@ class VirtualRun(DrivenRun):
         self._judged = True
         self.mapping, self.far, self.shore = bench.run.mapping, bench.run.field.far, bench.shore
         self._emulated = frozenset(bench.run.field.devices)
-        bench.run.gateway.tags.on_put = self._watched(bench)
+        bench.run.gateway.tags.subscribe(self._watched(bench))
         if self.shore is not None:
             for pump in bench.run.gateway.pumps:
                 if pump.driver.config.name in self.far:
@@ -207,7 +207,7 @@ class VirtualRun(DrivenRun):
     # ---------------------------------------------------------------------------------------------------------
 
     def _watched(self, bench: VirtualBench) -> Callable[[str, TagValue], None]:
-        told, loop = bench.run.gateway.tags.on_put, bench.loop
+        loop = bench.loop
         asked_by_device = {
             name: bench.asked_ns[device.bus]
             for name, device in self.system.devices.items()
@@ -218,8 +218,6 @@ class VirtualRun(DrivenRun):
         """By tag: the times of requests on its bus; None for a message that a node sends by itself."""
 
         def put(name: str, value: TagValue) -> None:
-            if told is not None:
-                told(name, value)
             check_ages()
             if value.quality is _GOOD:
                 # A value is timed at the moment when its reply was complete; the device answered after the request. A

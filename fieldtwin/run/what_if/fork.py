@@ -142,7 +142,7 @@ class _ForkRun:
         )
         async with AsyncExitStack() as stack:
             await stack.enter_async_context(run)
-            run.gateway.tags.on_put = self.outcome.saw_tag
+            unsubscribe = run.gateway.tags.subscribe(self.outcome.saw_tag)
             if self.plan.commands or run.field.far:  # without a topside controller, the modems would stay full
                 nursery = await stack.enter_async_context(Nursery())
                 nursery.start(self._shore().run(list(self.plan.commands)), "far end")
@@ -153,7 +153,8 @@ class _ForkRun:
                 self.outcome.error = f"the PLC stopped ({run.plc.stop_reason.value}): {run.plc.error or 'on request'}"
             self.outcome.ends(loop.now_ns)
             # The end of the run (safe outputs) is not part of the plan.
-            run.gateway.tags.on_put, self._over = None, True
+            unsubscribe()
+            self._over = True
             for requirement, expression in self._at_the_end:
                 self._judge(requirement, expression)
 

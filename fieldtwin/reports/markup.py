@@ -1,6 +1,6 @@
-"""HTML and SVG as values: text is escaped unless it is markup already, so that a name from a file cannot become markup.
+"""SVG as values: text is escaped unless it is markup already, so that a name from a file cannot become markup.
 
-This module knows elements, and nothing about reports.
+This module knows elements, and nothing about reports. Pages are made from templates (fieldtwin.reports.pages).
 """
 
 from __future__ import annotations
@@ -9,16 +9,10 @@ import re
 from collections.abc import Iterable
 from html import escape
 
-
-class Markup(str):
-    """Text that is HTML. Only this module and constants of the code may create it."""
-
-    __slots__ = ()
-
+from markupsafe import Markup as Markup  # for those who make or annotate markup with this module
 
 Child = str | Iterable["Child"] | None
 
-_VOID = frozenset({"br", "hr", "meta", "link", "img", "col"})
 _SVG_EMPTY = frozenset({"rect", "path", "line", "circle", "polyline", "use"})
 _UNSEEN = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\ud800-\udfff\ufffe\uffff\u202a-\u202e\u2066-\u2069]")
 """Characters that no document may hold, or that change the direction of reading: shown as a replacement character."""
@@ -57,22 +51,6 @@ def el(name: str, /, *children: Child, **attributes: object) -> Markup:
             shown = f"{value:.1f}".removesuffix(".0") if isinstance(value, float) else text(value)
             parts.append(f'{attribute}="{shown}"')
     head = " ".join(parts)
-    if name in _VOID:
-        return Markup(f"<{head}>")
     if name in _SVG_EMPTY and not children:
         return Markup(f"<{head}/>")
     return Markup(f"<{head}>{join(children)}</{name}>")
-
-
-def page(title: str, style: Markup, body: Child) -> str:
-    """Return a whole HTML document with the style sheet `style`; the parts of `body` follow each other in its main
-    element.
-    """
-    head = el(
-        "head",
-        el("meta", charset="utf-8"),
-        el("meta", name="viewport", content="width=device-width, initial-scale=1"),
-        el("title", title),
-        el("style", style),
-    )
-    return f"<!doctype html>\n{el('html', head, el('body', el('main', body)), lang='en')}\n"

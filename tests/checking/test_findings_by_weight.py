@@ -33,7 +33,8 @@ from fieldtwin.emulators.virtual.clock import VirtualClock
 from fieldtwin.gateway.core.connection import ByteConnection
 from fieldtwin.gateway.core.errors import ConnectionLost
 from fieldtwin.gateway.protocols.modbus.crc import crc16, with_crc
-from fieldtwin.reports.conformance.device import overall, render_html
+from fieldtwin.reports.conformance.device import render_html
+from fieldtwin.reports.conformance.page import overall
 from fieldtwin.reports.junit import render_junit
 from fieldtwin.results.model import Verdict
 from fieldtwin.results.subject import Subject

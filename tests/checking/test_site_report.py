@@ -238,6 +238,7 @@ def test_the_report_of_a_check_shows_bytes_and_escapes_text_of_devices() -> None
         "danger",
         "A. Fitter",
         "failed",
+        f"--unit 17 --only {CASES[1].id}",
     ):
         assert said in seen, said
     assert f"For other wires: {CASES[3].id}." in seen

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
+from dataclasses import dataclass
 
-from fieldtwin.reports.markup import Markup, el, join
 from fieldtwin.results.model import Report, Verdict
 
 MOST_COLUMNS = 16
@@ -27,55 +27,57 @@ def requirement_verdicts(report: Report) -> dict[str, Verdict | None]:
     return found
 
 
-def requirement_section(report: Report) -> Markup:
-    """Return the matrix, or a list if there are many scenarios."""
+@dataclass(frozen=True)
+class Row:
+    """A requirement; `verdict` is None if no scenario names it. `cells` have a verdict and a text for each scenario."""
+
+    id: str
+    text: str
+    verdict: Verdict | None
+    cells: list[tuple[Verdict | None, str]]
+    listed: str
+
+
+@dataclass(frozen=True)
+class Matrix:
+    """The requirements as rows, the scenarios as columns; without columns each row lists its scenarios."""
+
+    met: int
+    total: int
+    uncovered: int
+    columns: list[str]
+    rows: list[Row]
+
+
+def requirement_matrix(report: Report) -> Matrix | None:
+    """Return the matrix, or a list if there are many scenarios; None without any requirement."""
     verdicts = requirement_verdicts(report)
     if not verdicts:
-        return el("p", "No scenario names a requirement, and none is to be covered.")
+        return None
     cells: dict[tuple[str, str], Counter[Verdict]] = {}
     for scenario in report.scenarios:
         for id in scenario.requirements:
             cells.setdefault((id, scenario.name), Counter())[scenario.verdict] += 1
     names = list(dict.fromkeys(name for _, name in cells))
-    uncovered = [id for id, verdict in verdicts.items() if verdict is None]
-    met = sum(v is Verdict.PASSED for v in verdicts.values())
-    said = f"{met} of {len(verdicts)} met" + (f", {len(uncovered)} covered by no scenario" if uncovered else "")
-    matrix = len(names) <= MOST_COLUMNS
+    columns = names if len(names) <= MOST_COLUMNS else []
     rows = [
-        _row(report, id, verdict, cells, names, matrix=matrix) for id, verdict in list(verdicts.items())[:MOST_ROWS]
-    ]
-    columns = [el("th", n, cls="tilt") for n in names] if matrix else [el("th", "scenarios")]
-    head = el("tr", el("th", "requirement", colspan=2), el("th", "verdict"), columns)
-    more = len(verdicts) - MOST_ROWS
-    return join(
-        [
-            el("p", said, cls="small"),
-            el("div", el("table", el("thead", head), el("tbody", rows), cls="grid matrix"), cls="wide"),
-            el("p", f"and {more} more", cls="small") if more > 0 else "",
-        ]
-    )
+        Row(id, report.requirements.get(id, ""), verdict, [_cell(cells.get((id, name))) for name in columns],
+            "" if columns else _listed(id, names, cells))
+        for id, verdict in list(verdicts.items())[:MOST_ROWS]
+    ]  # fmt: skip
+    known = list(verdicts.values())
+    return Matrix(known.count(Verdict.PASSED), len(known), known.count(None), columns, rows)
 
 
-def _row(report: Report, id: str, verdict: Verdict | None, cells: Cells, names: list[str], *, matrix: bool) -> Markup:
-    if verdict is None:
-        word = el("td", "not covered", cls="missing")
-    else:
-        word = el("td", verdict.value, cls=verdict.value)
-    text = el("td", report.requirements.get(id, ""), cls="left")
-    head = [el("th", id, scope="row"), text, word]
-    if matrix:
-        return el("tr", head, [_cell(cells.get((id, name))) for name in names])
+def _listed(id: str, names: list[str], cells: Cells) -> str:
     own = [(name, cells[id, name]) for name in names if (id, name) in cells]
     own.sort(key=lambda item: _WORST.index(_worst(item[1])))
-    listed = ", ".join(f"{name} ({_count(count)})" for name, count in own[:MOST_NAMED])
     more = f" and {len(own) - MOST_NAMED} more" if len(own) > MOST_NAMED else ""
-    return el("tr", head, el("td", listed + more, cls="left"))
+    return ", ".join(f"{name} ({_count(count)})" for name, count in own[:MOST_NAMED]) + more
 
 
-def _cell(count: Counter[Verdict] | None) -> Markup:
-    if not count:
-        return el("td", "")
-    return el("td", _count(count), cls=_worst(count).value)
+def _cell(count: Counter[Verdict] | None) -> tuple[Verdict | None, str]:
+    return (_worst(count), _count(count)) if count else (None, "")
 
 
 def _count(count: Counter[Verdict]) -> str:

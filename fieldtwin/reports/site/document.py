@@ -61,6 +61,11 @@ class Piece:
     tables: tuple[Table, ...] = ()
     command: str = ""
 
+    @property
+    def good(self) -> bool:
+        """Whether the action ended as it should."""
+        return self.verdict in ("passed", "whole", "sampled", "met")
+
 
 @dataclass(frozen=True, slots=True)
 class Source:
@@ -99,6 +104,11 @@ class Device:
         for piece in sorted(self.pieces, key=lambda piece: piece.when):
             said.update(piece.identity)
         return said
+
+    @property
+    def deviation_count(self) -> int:
+        """Return the number of deviations of all pieces."""
+        return sum(found.weight == "deviation" for piece in self.pieces for found in piece.deviations)
 
     @property
     def serial(self) -> str:

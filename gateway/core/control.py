@@ -15,7 +15,9 @@ import hmac
 import json
 from collections.abc import Awaitable, Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+import msgspec
 
 from fieldtwin.gateway.core.errors import (
     Bug,
@@ -38,14 +40,16 @@ After it, the client is dropped. Without this limit, clients that send nothing, 
 place.
 """
 
+S = TypeVar("S", bound=msgspec.Struct)
 Verb = Callable[[dict[str, Any]], Awaitable[Any]]
 
 
 class ControlServer:
     """A server for the registered commands on a Unix socket and, if configured, on TCP.
 
-    `verbs` maps a name to ``async (args) -> JSON-able result``. A `FieldtwinError` from a command becomes an error
-    answer. Any other exception also does, reported as a bug of fieldtwin, and the connection stays open.
+    `verbs` maps a name to ``async (args) -> result``: data for JSON, or a `msgspec.Struct` of such. A `FieldtwinError`
+    from a command becomes an error answer. Any other exception also does, reported as a bug of fieldtwin, and the
+    connection stays open.
     """
 
     def __init__(self, verbs: dict[str, Verb], token: str = "") -> None:
@@ -177,8 +181,12 @@ def _parse(line: bytes) -> dict[str, Any]:
 
 
 def _encode(request_id: Any, answer: dict[str, Any]) -> bytes:
-    text = json.dumps({"v": VERSION, "id": request_id, **answer}, separators=(",", ":"), default=str)
+    text = json.dumps({"v": VERSION, "id": request_id, **answer}, separators=(",", ":"), default=_jsonable)
     return text.encode() + b"\n"
+
+
+def _jsonable(value: object) -> object:
+    return msgspec.structs.asdict(value) if isinstance(value, msgspec.Struct) else str(value)
 
 
 async def _refuse_if_alive(path: Path) -> None:
@@ -201,6 +209,10 @@ class RemoteError(FieldtwinError):
         super().__init__(message)
         self.kind = kind
         self.remote_exit_code = exit_code
+
+
+class OtherVersion(FieldtwinError):
+    """The other process answered with data of a different form."""
 
 
 class ControlClient:
@@ -254,6 +266,19 @@ class ControlClient:
             return answer.get("result")
         error = answer.get("error") or {}
         raise RemoteError(error.get("kind", "?"), error.get("message", "?"), error.get("exit_code", 70))
+
+    async def ask(self, verb: str, kind: type[S], timeout_s: float = 5.0, **args: Any) -> S:
+        """Send the command `verb` and return its result as a `kind`. Raises as `call`, and `OtherVersion` for a result
+        that is not one."""
+        answer = await self.call(verb, timeout_s, **args)
+        try:
+            return msgspec.convert(answer, kind)
+        except msgspec.ValidationError as e:
+            raise OtherVersion(
+                f"the answer to {verb!r} is not as expected: {e}",
+                where=self._where,
+                hint="both processes need the same version of fieldtwin",
+            ) from e
 
     async def _read_answer(self, request_id: int) -> dict[str, Any]:
         while True:

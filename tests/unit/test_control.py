@@ -11,11 +11,12 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 from support import eventually, run
 
 from fieldtwin.gateway.core import control
-from fieldtwin.gateway.core.control import ControlClient, ControlServer, RemoteError
+from fieldtwin.gateway.core.control import ControlClient, ControlServer, OtherVersion, RemoteError
 from fieldtwin.gateway.core.errors import (
     ConnectionLost,
     EndpointBusy,
@@ -47,6 +48,23 @@ async def never(args: dict[str, Any]) -> Any:
 
 
 VERBS = {"echo": echo, "refuse": refuse, "broken": broken, "unspeakable": unspeakable, "never": never}
+
+
+class Part(msgspec.Struct):
+    count: int
+
+
+class Whole(msgspec.Struct):
+    name: str
+    parts: dict[str, Part]
+    added_later: list[str] = []
+
+
+async def whole(args: dict[str, Any]) -> Any:
+    return Whole("w", {"a": Part(3)})
+
+
+VERBS["whole"] = whole
 
 
 @contextlib.asynccontextmanager
@@ -226,6 +244,37 @@ def test_closing_the_server_ends_a_hanging_command_and_informs_its_caller(tmp_pa
             await server.aclose()
             with pytest.raises(ConnectionLost):
                 await call
+            await client.aclose()
+
+    run(main())
+
+
+def test_a_struct_is_sent_as_a_json_object_and_read_as_a_struct(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with serving(tmp_path / "c"):
+            client = await ControlClient.connect_unix(tmp_path / "c")
+            told = {"name": "w", "parts": {"a": {"count": 3}}, "added_later": []}
+            assert json.dumps(await client.call("whole")) == json.dumps(told)  # in this order
+            assert await client.ask("whole", Whole) == Whole("w", {"a": Part(3)})
+            older: dict[str, Any] = {"name": "w", "parts": {}}
+            assert await client.ask("echo", Whole, **older, unknown=1) == Whole("w", {})
+            await client.aclose()
+
+    run(main())
+
+
+@pytest.mark.parametrize(
+    ("args", "text"),
+    [({"parts": {}}, "missing required field `name`"), ({"name": "w", "parts": {"a": {"count": "3"}}}, "parts")],
+)
+def test_an_answer_of_a_different_form_is_a_different_version(tmp_path: Path, args: dict[str, Any], text: str) -> None:
+    async def main() -> None:
+        async with serving(tmp_path / "c"):
+            client = await ControlClient.connect_unix(tmp_path / "c")
+            with pytest.raises(OtherVersion, match=text) as raised:
+                await client.ask("echo", Whole, **args)
+            assert "the same version of fieldtwin" in str(raised.value)
+            assert await client.call("echo", a=1) == {"a": 1}  # the connection goes on
             await client.aclose()
 
     run(main())

@@ -26,7 +26,7 @@ class Field:
 
     def __init__(self, system: System, life: str, far: str = "tcp://127.0.0.1:5") -> None:
         self.status = {
-            "life": life, "system": system.name, "system_hash": system.hash, "listening": {}, "far": {"modem": far}
+            "life": life, "system": system.name, "system_hash": system.hash, "devices": {}, "listening": {}, "far": {"modem": far}
         }  # fmt: skip
         self.held: dict[str, list[Any]] = {}
         self.server = ControlServer({"get": self._get, "held": self._held})
@@ -106,7 +106,9 @@ def test_one_with_another_system_file_is_not_taken(system: System) -> None:
         await eventually(lambda: "another version" in back.trouble)
         assert back.client is None
         assert not returns
-        other.status["system_hash"] = system.hash
+        other.status["devices"] = 5
+        await eventually(lambda: "the same version of fieldtwin" in back.trouble)
+        other.status |= {"system_hash": system.hash, "devices": {}}
         await eventually(lambda: returns == [True])
         assert not back.trouble
         watching.cancel()

@@ -266,7 +266,7 @@ def test_a_prototype_of_a_device_without_a_recording(tmp_path: Path) -> None:
         "valve": True,
     }
     assert run.field_status is not None
-    assert run.field_status["devices"]["tank"]["counters"]["exceptions"] > 3, "busy, and the gaps between its tags"
+    assert run.field_status.devices["tank"].counters["exceptions"] > 3, "busy, and the gaps between its tags"
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Awaitable, Callable, Mapping, Sized
 from pathlib import Path
-from typing import Any
 
 from fieldtwin.emulators.canopen.node import CanopenNode
 from fieldtwin.emulators.canopen.remarks import Remark
@@ -46,6 +45,7 @@ from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.gateway.core.files.profile import DeviceProfile
 from fieldtwin.gateway.devices.config import DeviceConfig
 from fieldtwin.twin.prototype.field_faults import FieldFaults
+from fieldtwin.twin.prototype.field_status import FieldStatus, SimulatedDeviceStatus
 from fieldtwin.twin.prototype.file import EmulatedBus, EmulatedDevice, Prototype
 from fieldtwin.twin.prototype.simulations import Simulations
 from fieldtwin.twin.site.system import System
@@ -450,32 +450,32 @@ class FieldSide:
 
     # -- what others see ------------------------------------------------------------------------------------------------
 
-    def status(self) -> dict[str, Any]:
+    def status(self) -> FieldStatus:
         """Return counters by device, for the control channel."""
-        return {
-            "system": self.system.name,
-            "system_hash": self.system.hash,
-            "devices": {
-                name: {
-                    "profile": d.emulated.profile.name,
-                    "recording": str(d.emulated.recording or d.emulated.form.simulation or d.emulated.form.model),
-                    "plays": d.plays,
-                    "remarks": d.remarks,
-                    "commands": sorted(d.command_list),
-                    "executed": d.executed(),
-                    "unlisted": d.unit.unlisted if d.unit is not None else 0,
-                    "counters": d.counters(),
-                    "held": d.journal.number,
-                    "held_dropped": d.journal.dropped,
-                }
+        return FieldStatus(
+            system=self.system.name,
+            system_hash=self.system.hash,
+            devices={
+                name: SimulatedDeviceStatus(
+                    profile=d.emulated.profile.name,
+                    recording=str(d.emulated.recording or d.emulated.form.simulation or d.emulated.form.model),
+                    plays=d.plays,
+                    remarks=d.remarks,
+                    commands=sorted(d.command_list),
+                    executed=d.executed(),
+                    unlisted=d.unit.unlisted if d.unit is not None else 0,
+                    counters=d.counters(),
+                    held=d.journal.number,
+                    held_dropped=d.journal.dropped,
+                )
                 for name, d in self.devices.items()
             },
-            "clients": self._clients_by_bus(),
-            "faults": self.faults.describe(),
-            "struck": self.faults.history.describe(),
-            "listening": {bus: str(endpoint) for bus, endpoint in self.listening.items()},
-            "far": {device: str(endpoint) for device, endpoint in self.far.items()},
-            "links": {
+            clients=self._clients_by_bus(),
+            faults=self.faults.describe(),
+            struck=self.faults.history.describe(),
+            listening={bus: str(endpoint) for bus, endpoint in self.listening.items()},
+            far={device: str(endpoint) for device, endpoint in self.far.items()},
+            links={
                 name: {
                     "sent": p.up.sent + p.down.sent,
                     "resent": p.up.resent + p.down.resent,
@@ -483,8 +483,9 @@ class FieldSide:
                 }
                 for name, p in self._pairs.items()
             },
-            "buses": {str(bus.bound): stats for bus in self._buses if (stats := bus.stats())},
-        }
+            buses={str(bus.bound): stats for bus in self._buses if (stats := bus.stats())},
+            set=self.faults.values_set(),
+        )
 
     def held_since(self, numbers: dict[str, int]) -> dict[str, list[tuple[int, str, str, int]]]:
         """Return the values that each device held after the given journal numbers: (number, tag, hex, monotonic ns)."""

@@ -37,6 +37,7 @@ from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.twin.plant.child_main import child_main
 from fieldtwin.twin.prototype.field import FieldSide
 from fieldtwin.twin.prototype.field_leases import LEASE_S, FieldLeases
+from fieldtwin.twin.prototype.field_status import FieldStatus
 from fieldtwin.twin.prototype.file import Prototype, load_prototype
 from fieldtwin.twin.prototype.prototype import DigitalTwinPrototype
 from fieldtwin.twin.site.system import System, load_system
@@ -224,13 +225,9 @@ class FieldProcess:
     async def _ready(self, args: dict[str, Any]) -> dict[str, Any]:
         return {"ready": True, "pid": os.getpid()}
 
-    async def _get(self, args: dict[str, Any]) -> dict[str, Any]:
-        return {
-            "life": self._life,
-            **self._field.status(),
-            "set": self._field.faults.values_set(),
-            "lease": self._leases.describe(self._clock.monotonic_ns()),
-        }
+    async def _get(self, args: dict[str, Any]) -> FieldStatus:
+        lease = self._leases.describe(self._clock.monotonic_ns())
+        return msgspec.structs.replace(self._field.status(), life=self._life, lease=lease)
 
     async def _held(self, args: dict[str, Any]) -> dict[str, Any]:
         """Return at most `HELD_AT_ONCE` entries per device, the oldest first; a caller that needs more asks again."""
@@ -299,7 +296,7 @@ class FieldProcess:
         await asyncio.shield(self._fresh_done)
         return {"life": self._life, "now_ns": self._clock.monotonic_ns()}
 
-    async def _request_stop(self, args: dict[str, Any]) -> dict[str, Any]:
+    async def _request_stop(self, args: dict[str, Any]) -> FieldStatus:
         asyncio.get_running_loop().call_later(0.05, self._stop.set)
         return self._field.status()
 

@@ -17,6 +17,7 @@ from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.run.processes.field_contact import connect_control, reachable
 from fieldtwin.run.processes.topside import Shore, parse_periods, script
+from fieldtwin.twin.prototype.field_status import FieldStatus
 from fieldtwin.twin.site.system import System, load_system
 
 
@@ -110,7 +111,7 @@ async def _run(
 async def _ask_field(device: str, field_host: str, token: str) -> Endpoint:
     client, host = await connect_control(field_host, token)
     try:
-        far = (await client.call("get"))["far"]
+        far = (await client.ask("get", FieldStatus)).far
     finally:
         await client.aclose()
     if device not in far:

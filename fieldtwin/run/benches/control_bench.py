@@ -44,6 +44,7 @@ from fieldtwin.run.processes.with_program import environment_from
 from fieldtwin.scenarios.bench import Can, Reading, Stopped, variable
 from fieldtwin.scenarios.language.probe_form import Probe
 from fieldtwin.twin.plant.physical import attached, gateway_lost_ms, image_layout
+from fieldtwin.twin.prototype.field_status import FieldStatus
 from fieldtwin.twin.site.system import System
 
 PLC_EVERY_S = 0.25
@@ -242,7 +243,7 @@ class ControlBench(Started):
     async def _open_field(self) -> None:
         if self._where.field_host or self._where.field_socket or self._field_socket.exists():
             self._field = await self._connect_field()
-            status = await self._field.call("get")
+            status = await self._field.ask("get", FieldStatus)
             check_same(self.system, status)
             self._env = {**environment_from(status, self.system, self._field_at, self._field_socket), **self._where.env}
 
@@ -259,7 +260,7 @@ class ControlBench(Started):
     async def _far_of_field(self) -> Endpoint | None:
         if self._field is None:
             return None
-        far = (await self._field.call("get"))["far"]
+        far = (await self._field.ask("get", FieldStatus)).far
         return next((reachable(Endpoint.parse(url), self._field_at) for url in far.values()), None)
 
     @property

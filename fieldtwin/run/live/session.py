@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
+from collections.abc import Awaitable, Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import msgspec
 
@@ -19,7 +20,7 @@ from fieldtwin.console import talk
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.concurrency.async_resource import Started
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
-from fieldtwin.gateway.core.control import ControlClient
+from fieldtwin.gateway.core.control import ControlClient, OtherVersion
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import FieldtwinError, ReplyTimeout, Unreachable, UsageError
 from fieldtwin.gateway.wallclock import WallClock
@@ -38,6 +39,7 @@ from fieldtwin.twin.plant.controller import ControllerConfig
 from fieldtwin.twin.plant.instance import Instance
 from fieldtwin.twin.plant.mapping import mapping_to_json
 from fieldtwin.twin.plant.physical import PhysicalTwin
+from fieldtwin.twin.prototype.field_status import FieldStatus
 from fieldtwin.twin.site.schema import NONE_STATED
 from fieldtwin.twin.site.system import System, load_system
 from fieldtwin.twin.thread.place import MODEM, lent_transmitter
@@ -62,6 +64,8 @@ MAX_ERRORS = 100
 SETTLE_S = 4.0
 FIELD_LINGER_S = 1.5
 """Time in seconds that the emulators remain after this process was killed, in which the gateway makes its outputs safe."""
+
+T = TypeVar("T")
 
 
 class RunSession(Started):
@@ -103,7 +107,7 @@ class RunSession(Started):
         self.shore: Shore | None = None
         self.gateway_status: dict[str, Any] | None = None
         self.plc_status: dict[str, Any] | None = None
-        self.field_status: dict[str, Any] | None = None
+        self.field_status: FieldStatus | None = None
         self.outputs_confirmed_safe: bool | None = None
         self.thread_place = ""
         self.thread_status: dict[str, Any] | None = None
@@ -430,26 +434,37 @@ class RunSession(Started):
 
     async def _refresh_field(self) -> None:
         """Refresh the field simulator's status; after `start: fresh` its journals and counters begin again."""
-        self.field_status = await self._get(self._field_client, "" if self.field_return is not None else "field")
-        if self._field is None or self.field_status is None or self.field_status["life"] == self._field.life:
+        self.field_status = await self._ask_field("" if self.field_return is not None else "field")
+        if self._field is None or self.field_status is None or self.field_status.life == self._field.life:
             return
-        self._field.life = self.field_status["life"]
+        self._field.life = self.field_status.life
         self.made_anew += 1
         self.oracle.begin_again()
         self.counted_before, self.clients_before = {}, {}
 
     async def _get(self, client: ControlClient | None, name: str, **args: Any) -> dict[str, Any] | None:
         """Return the status of a process, and record an error without an answer; `name` is empty if monitored elsewhere."""
+        return await self._answer(client, name, lambda c: c.call("get", ANSWERS_WITHIN_S, **args))
+
+    async def _ask_field(self, name: str) -> FieldStatus | None:
+        """Return the status of the field simulator; `name` as for `_get`."""
+        return await self._answer(self._field_client, name, lambda c: c.ask("get", FieldStatus, ANSWERS_WITHIN_S))
+
+    async def _answer(
+        self, client: ControlClient | None, name: str, ask: Callable[[ControlClient], Awaitable[T]]
+    ) -> T | None:
         if client is None:
             return None
         try:
-            answer: dict[str, Any] = await client.call("get", timeout_s=ANSWERS_WITHIN_S, **args)
+            return await ask(client)
+        except OtherVersion as e:
+            self.note_error(str(e))
+            return None
         except FieldtwinError as e:
             self._maybe_lost(client, e)
             if isinstance(e, ReplyTimeout) and name and not self._stood_still():
                 self.note_error(f"{name}: the process did not answer within {ANSWERS_WITHIN_S:g} s")
             return None  # it is ending or gone: _notice_deaths reports it with its reason
-        return answer
 
     def _stood_still(self) -> bool:
         """Return whether this process itself was stopped, or got no processor time: then it cannot tell if others answered."""
@@ -512,7 +527,7 @@ class RunSession(Started):
                 self.outputs_confirmed_safe, self.gateway_status = answer["safe"], answer["status"]
             except FieldtwinError as e:
                 self.note_error(f"the gateway did not stop in order: {e}")
-        self.field_status = await self._get(self._field_client, "") or self.field_status
+        self.field_status = await self._ask_field("") or self.field_status
         await self._judge()
         if self.field_return is not None and (trouble := self.field_return.trouble):
             self.note_error(trouble)

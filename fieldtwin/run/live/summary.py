@@ -11,6 +11,7 @@ from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.plc.task import StopReason
 from fieldtwin.results.trace import refusal_text
 from fieldtwin.run.processes.states import SeenStates, expected_states
+from fieldtwin.twin.prototype.field_status import FieldStatus
 from fieldtwin.twin.site.system import System
 
 MOST_REFUSED = 10
@@ -34,7 +35,7 @@ class RunFacts:
     gateway: Mapping[str, Any] | None
     """The last status of the gateway; None if it did not answer at the end. `plc` and `field` likewise."""
     plc: Mapping[str, Any] | None
-    field: Mapping[str, Any] | None
+    field: FieldStatus | None
     counted_before: Mapping[str, Mapping[str, int]]
     """Per device, the requests and replies that its emulator had counted before the run; `clients_before` per bus and client."""
     clients_before: Mapping[str, Mapping[str, Mapping[str, int]]]
@@ -71,7 +72,7 @@ NOT_CALM = "whether devices and outputs were good at the end, because faults wer
 
 def summarise(run: RunFacts) -> dict[str, Any]:
     """Return plain data for `--json` and for printing. `ok` is False when any check failed; `errors` lists the reasons."""
-    gateway, plc, field = run.gateway or {}, run.plc or {}, run.field or {}
+    gateway, plc, field = run.gateway or {}, run.plc or {}, run.field
     exchanges = _exchanges(run)
     checks = [*_plc_checks(plc), *_loss_checks(gateway)]
     if run.gateway is None:
@@ -97,7 +98,7 @@ def summarise(run: RunFacts) -> dict[str, Any]:
         "states": {program: list(seen) for program, seen in run.states.sequences.items()},
         "transitions": {p: [[round(t, 3), s] for t, s in seen] for p, seen in run.states.transitions.items()},
         "exchanges": exchanges,
-        "faults": field.get("struck", []),
+        "faults": field.struck if field is not None else [],
         "published": {"values": gateway.get("published"), **run.published},
         "mailboxes": gateway.get("mailboxes", {}),
         "far_end": run.topside,
@@ -135,19 +136,20 @@ def summarise(run: RunFacts) -> dict[str, Any]:
     }
 
 
-def _devices(gateway: Mapping[str, Any], field: Mapping[str, Any]) -> dict[str, Any]:
+def _devices(gateway: Mapping[str, Any], field: FieldStatus | None) -> dict[str, Any]:
     """Return the state of each device, and the model or recording that replaced it, if any."""
-    emulated = field.get("devices", {})
+    emulated = field.devices if field is not None else {}
     return {
         name: {"state": "good" if d["online"] else "bad", "error": d["error"]}
-        | ({"plays": emulated[name]["plays"]} if name in emulated else {})
+        | ({"plays": emulated[name].plays} if name in emulated else {})
         for name, d in gateway.get("devices", {}).items()
     }
 
 
 def _exchanges(run: RunFacts) -> dict[str, Any]:
     """Return the requests and replies per bus, as counted by the gateway and by its emulators."""
-    gateway, field = run.gateway or {}, run.field or {}
+    gateway, field = run.gateway or {}, run.field
+    emulated = field.devices if field is not None else {}
     out: dict[str, Any] = {}
     for name, bus in gateway.get("buses", {}).items():
         counters = bus["counters"]
@@ -165,17 +167,18 @@ def _exchanges(run: RunFacts) -> dict[str, Any]:
         if can:
             row["gateway"]["pdos"] = counters.get("pdos", 0)
             row["gateway"]["heartbeats"] = counters.get("heartbeats", 0)
-        devices = [d for d in run.system.devices_on(name) if d.name in field.get("devices", {})]
+        devices = [d for d in run.system.devices_on(name) if d.name in emulated]
         if devices:
             row["unanswered_at_stop"] = unanswered_at_stop(row, len(devices))
             row["emulators"] = {
                 what: sum(
-                    field["devices"][d.name]["counters"][what] - run.counted_before.get(d.name, {}).get(what, 0)
-                    for d in devices
+                    emulated[d.name].counters[what] - run.counted_before.get(d.name, {}).get(what, 0) for d in devices
                 )
                 for what in ("requests", "replies")
             }
-            others = _others(bus, field.get("clients", {}).get(name, {}), run.clients_before.get(name, {}))
+            others = _others(
+                bus, field.clients.get(name, {}) if field is not None else {}, run.clients_before.get(name, {})
+            )
             if any(others.values()):
                 row["others"] = others
                 # The bus counts a request when it is sent, the node when it receives it. A third party is not stopped

@@ -8,13 +8,13 @@ carried over TCP, and an emulated connection (`fieldtwin link`) is started on th
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from fieldtwin.gateway.core.control import ControlClient
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.run.processes.link_child import LinkChild
 from fieldtwin.twin.plant.mapping import mapped_endpoint
+from fieldtwin.twin.prototype.field_status import FieldStatus
 from fieldtwin.twin.site.system import System
 
 DEFAULT_CONTROL_PORT = 7420
@@ -73,15 +73,15 @@ async def contact_elsewhere(host_port: str, token: str, system: System, run_dir:
 
 
 async def _contact(client: ControlClient, system: System, host: str, run_dir: Path) -> FieldContact:
-    status = await client.call("get")
+    status = await client.ask("get", FieldStatus)
     check_same(system, status)
     contact = FieldContact(client, {}, {})
-    contact.life, contact.listening, contact.far_said = status["life"], status["listening"], status["far"]
-    contact.clients_before = status.get("clients", {})
-    contact.remarks = [f"{name}: {text}" for name, device in status["devices"].items() for text in device["remarks"]]
-    contact.counted_before = {name: dict(device["counters"]) for name, device in status["devices"].items()}
+    contact.life, contact.listening, contact.far_said = status.life, status.listening, status.far
+    contact.clients_before = status.clients
+    contact.remarks = [f"{name}: {text}" for name, device in status.devices.items() for text in device.remarks]
+    contact.counted_before = {name: device.counters for name, device in status.devices.items()}
     try:
-        for bus_name, url in status["listening"].items():
+        for bus_name, url in status.listening.items():
             plant = system.buses[bus_name].endpoint
             listening = reachable(Endpoint.parse(url), host)
             if plant.is_serial and listening.scheme != "pty":
@@ -90,24 +90,24 @@ async def _contact(client: ControlClient, system: System, host: str, run_dir: Pa
                 await link.ready()
                 listening = Endpoint("pty", path=str(run_dir / bus_name))
             contact.mapping[plant] = mapped_endpoint(plant, listening)
-        contact.far = {device: reachable(Endpoint.parse(url), host) for device, url in status["far"].items()}
+        contact.far = {device: reachable(Endpoint.parse(url), host) for device, url in status.far.items()}
     except BaseException:
         await contact.aclose()
         raise
     for name, bus in system.buses.items():
-        if name not in status["listening"]:
+        if name not in status.listening:
             contact.mapping[bus.endpoint] = bus.endpoint  # the prototype file has `plant` for this bus
     return contact
 
 
-def check_same(system: System, status: dict[str, Any]) -> None:
+def check_same(system: System, status: FieldStatus) -> None:
     """Raise `FileInvalid` if the status of a field simulator has a different version of the system file."""
-    if status["system_hash"] != system.hash:
+    if status.system_hash != system.hash:
         raise FileInvalid(
             f"the field side runs another version of {system.name!r}",
             path=str(system.path),
             expected=f"the same file (hash {system.hash})",
-            got=f"{status['system']!r} (hash {status['system_hash']})",
+            got=f"{status.system!r} (hash {status.system_hash})",
         )
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from fieldtwin.gateway.core.control import ControlClient
 from fieldtwin.gateway.core.errors import FieldtwinError, UsageError
+from fieldtwin.twin.prototype.field_status import FieldStatus
 from fieldtwin.twin.site.system import System
 
 DEFAULT_HOST = "field"
@@ -60,7 +61,7 @@ async def _is_of(path: Path, system: System) -> bool:
     except FieldtwinError:
         return False  # its process was killed
     try:
-        return bool((await client.call("get"))["system_hash"] == system.hash)
+        return (await client.ask("get", FieldStatus)).system_hash == system.hash
     except FieldtwinError:
         return False
     finally:

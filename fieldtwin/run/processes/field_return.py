@@ -11,10 +11,11 @@ import asyncio
 from collections.abc import Awaitable, Callable
 from typing import Any
 
-from fieldtwin.gateway.core.control import ControlClient
+from fieldtwin.gateway.core.control import ControlClient, OtherVersion
 from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid, ReplyTimeout, Unreachable
 from fieldtwin.gateway.runtime.buses.backoff import Backoff
 from fieldtwin.run.processes.field_contact import FieldContact, check_same, connect_control
+from fieldtwin.twin.prototype.field_status import FieldStatus
 from fieldtwin.twin.site.system import System
 
 FIRST_S, LIMIT_S = 0.25, 4.0
@@ -86,17 +87,17 @@ class FieldReturn:
         try:
             async with asyncio.timeout(CONNECT_S):
                 client, _ = await connect_control(self._where, self._token)
-                status = await client.call("get")
+                status = await client.ask("get", FieldStatus)
             self._check(status)
             await self._contact.client.aclose()
-            another = status["life"] != self._contact.life
+            another = status.life != self._contact.life
             self._contact.client, client = client, None
             await self._returned(another)
-            self._contact.life = status["life"]
+            self._contact.life = status.life
             self._reason = ""
             self._gone.clear()
         except (FieldtwinError, TimeoutError) as e:
-            if isinstance(e, FileInvalid):
+            if isinstance(e, FileInvalid | OtherVersion):
                 self._reason = f"the field side at {self._where} came back otherwise: {e}"
             return False
         finally:
@@ -104,10 +105,10 @@ class FieldReturn:
                 await client.aclose()
         return True
 
-    def _check(self, status: dict[str, Any]) -> None:
+    def _check(self, status: FieldStatus) -> None:
         check_same(self._system, status)
         was = {**self._contact.listening, **{f"far end of {d}": url for d, url in self._contact.far_said.items()}}
-        now = {**status["listening"], **{f"far end of {d}": url for d, url in status["far"].items()}}
+        now = {**status.listening, **{f"far end of {d}": url for d, url in status.far.items()}}
         elsewhere = [
             f"{name} at {now.get(name, 'nothing')}, not {url}" for name, url in was.items() if now.get(name) != url
         ]

@@ -27,6 +27,7 @@ from fieldtwin.run.processes.field_contact import FieldContact, contact_here, re
 from fieldtwin.twin.plant.instance import Instance
 from fieldtwin.twin.plant.mapping import mapped_endpoint
 from fieldtwin.twin.prototype.field_process import FieldConfig, resolve
+from fieldtwin.twin.prototype.field_status import FieldStatus
 from fieldtwin.twin.site.system import System, load_system
 
 FIELD_LINGER_S = 0.5
@@ -50,10 +51,10 @@ def environment(contact: FieldContact, system: System, control: Path) -> dict[st
     return env
 
 
-def environment_from(status: Mapping[str, Any], system: System, host: str, control: Path) -> dict[str, str]:
+def environment_from(status: FieldStatus, system: System, host: str, control: Path) -> dict[str, str]:
     """Return the same from the answer of a field simulator on `host` to `get`. Ports that cannot be reached are omitted."""
     env: dict[str, str] = {}
-    for bus, url in status["listening"].items():
+    for bus, url in status.listening.items():
         with suppress(UsageError):  # a virtual serial port on another host
             endpoint = mapped_endpoint(system.buses[bus].endpoint, reachable(Endpoint.parse(url), host))
             env |= _of_endpoint(_word(bus), endpoint)
@@ -154,7 +155,7 @@ async def _inside(
             tell(env)
             status = await _run_program(argv, env)
             if faults and child.failure() is None:
-                tell_struck((await contact.client.call("get"))["struck"])
+                tell_struck((await contact.client.ask("get", FieldStatus)).struck)
         finally:
             await contact.aclose()
         failed = child.failure()

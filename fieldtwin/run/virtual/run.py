@@ -35,6 +35,7 @@ from fieldtwin.run.virtual.message_oracle import MessageOracle
 from fieldtwin.scenarios.judging.runner import TICK_S
 from fieldtwin.twin.prototype.field import FieldSide
 from fieldtwin.twin.prototype.field_process import FieldConfig, resolve
+from fieldtwin.twin.prototype.field_status import FieldStatus
 
 SETTLE_S = 10.0
 """Time in seconds for a command in progress after the end of the run."""
@@ -102,7 +103,7 @@ class VirtualRun(DrivenRun):
         self._stated = InvariantWatch(self.system)
         self.gateway_status: dict[str, Any] | None = None
         self.plc_status: dict[str, Any] | None = None
-        self.field_status: dict[str, Any] | None = None
+        self.field_status: FieldStatus | None = None
         self.may_refuse: tuple[str, ...] = ()
         """Tags of which a scenario expects that their outputs are refused."""
         self.outputs_confirmed_safe: bool | None = None

@@ -1,0 +1,64 @@
+"""The status of the field simulator on the control channel: the answer to `get`, for sender and receivers.
+
+The fields are the keys of the JSON object, in this order. A field that later versions add has a default, so that an
+older field simulator in another container can still be read. This module must not import emulators: a run of a plant
+has none.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+
+Counts = dict[str, int]
+
+
+class SimulatedDeviceStatus(msgspec.Struct, frozen=True, kw_only=True):
+    """One simulated device. Counters begin with 0 when the device is made."""
+
+    profile: str
+    recording: str
+    """The recording, simulation or model that gives the device its values; "None" if it has none."""
+    plays: str
+    """The same for a reader, in words."""
+    remarks: list[str] = []
+    """Differences from a node's data sheet."""
+    commands: list[str] = []
+    executed: Counts = {}
+    """By command: the number of times that it was executed."""
+    unlisted: int = 0
+    """The number of requests that are not in the device's list of commands."""
+    counters: Counts = {}
+    held: int = 0
+    """The number of values that the device has held so far."""
+    held_dropped: int = 0
+    """The number of those values that were dropped from the journal."""
+
+
+class FieldStatus(msgspec.Struct, frozen=True, kw_only=True):
+    """All simulated devices of a system, and the faults on them."""
+
+    life: str = ""
+    """The identity of these devices; devices that are made anew have a different one."""
+    system: str
+    system_hash: str
+    devices: dict[str, SimulatedDeviceStatus]
+    clients: dict[str, dict[str, Counts]] = {}
+    """By bus and client: the requests that reached a device, and the replies."""
+    faults: list[dict[str, Any]] = []
+    """The active faults (`FieldFaults.describe`)."""
+    struck: list[dict[str, Any]] = []
+    """Every fault so far (`FaultHistory.describe`)."""
+    listening: dict[str, str] = {}
+    """By bus: the URL at which its simulated devices listen."""
+    far: dict[str, str] = {}
+    """By transmitter: the URL of the modem at the other end of its link."""
+    links: dict[str, Counts] = {}
+    """By transmitter: messages sent, sent again and delivered over the modems' link."""
+    buses: dict[str, dict[str, Any]] = {}
+    """By URL: the statistics of a CAN bus that this process serves."""
+    set: dict[str, Any] = {}
+    """The values that were set by hand or by a test, by DEVICE.TAG."""
+    lease: dict[str, Any] = {}
+    """The lease of a test runner (`FieldLeases.describe`)."""

@@ -64,7 +64,7 @@ class Declarations:
             return None
         kind = self.type_of(v.type)
         compiler = self._expressions()
-        value = compiler.settled(compiler.value(v.initial), v.initial.pos)
+        value = compiler.settled(compiler.value(v.initial, kind), v.initial.pos)
         text = compiler.coerced(value, kind, v.initial.pos, "an initial value")
         if value.constant is None or len(text) > MAX_REPEATED or isinstance(kind, ty.String):
             return None
@@ -246,7 +246,7 @@ class Declarations:
         if isinstance(init, t.InitStruct):
             return self._initial_struct(kind, init)
         compiler = self._expressions()
-        code = compiler.coerced(compiler.value(init), kind, init.pos, "an initial value")
+        code = compiler.coerced(compiler.value(init, kind), kind, init.pos, "an initial value")
         if compiler.out.lines:
             self.env.fail(init.pos, "too deep an expression for an initial value")
         return code

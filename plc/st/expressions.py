@@ -42,6 +42,8 @@ class Expressions:
         self.pou = pou
         self.only_constants = False
         """Whether variables and a user's functions are refused: in initial values and limits of types."""
+        self.wanted: ty.Type | None = None
+        """The type that the context demands of the expression which is being compiled, if that is known."""
         self._deep = 0
         self.controls: list[str] = []
         """The control variables of the FOR loops around the statement."""
@@ -105,12 +107,15 @@ class Expressions:
 
     # -- expressions ------------------------------------------------------------------------------------------------------
 
-    def value(self, expr: t.Expr) -> Value:
+    def value(self, expr: t.Expr, wanted: ty.Type | None = None) -> Value:
+        """Compile `expr`. `wanted` is the type that its context demands: an untyped literal in a shift, NOT or choice takes
+        that type (IEC 61131-3, 6.3.2). The caller still has to coerce the value."""
         if isinstance(expr, t.Literal):
             return self._literal(expr)
         if self._deep >= MAX_DEEP:
             self.env.fail(expr.pos, "an expression nested too deep", expected=f"at most {MAX_DEEP} levels")
         self._deep += 1
+        before, self.wanted = self.wanted, wanted
         try:
             if isinstance(expr, t.Ref):
                 return self.reference(expr)
@@ -119,6 +124,33 @@ class Expressions:
             return self._flat(self._unary(expr) if isinstance(expr, t.Unary) else self._binary(expr), expr.pos)
         finally:
             self._deep -= 1
+            self.wanted = before
+
+    def declared(self, *exprs: t.Expr) -> ty.Type | None:
+        """Return the type of the first of `exprs` that is a variable or literal of a bit string type or BOOL, or None."""
+        for expr in exprs:
+            if isinstance(expr, t.Literal | t.Ref):
+                kind = self._literal(expr).type if isinstance(expr, t.Literal) else self.type_of(expr)
+                if kind is not None and ty.of_bits(kind):
+                    return kind
+        return None
+
+    def type_of(self, ref: t.Ref) -> ty.Type | None:
+        """Return the type of a variable or of its part without compiling it, or None if it has no such part."""
+        symbol = self.symbols.get(ref.name.lower()) or self.env.globals.get(ref.name.lower())
+        kind = symbol.type if symbol is not None else None
+        for selector in ref.selectors:
+            if isinstance(selector, t.Bit):
+                kind = ty.BOOL
+            elif isinstance(selector, t.Index):
+                kind = kind.of if isinstance(kind, ty.Array) else None
+            else:
+                name = selector.name.lower()
+                members = kind.fields if isinstance(kind, ty.Struct) else {}
+                if isinstance(kind, ty.Block):
+                    members = {**kind.inputs, **kind.outputs}
+                kind = members[name][1] if name in members else None
+        return kind
 
     def _flat(self, value: Value, pos: t.Pos) -> Value:
         """Return `value`; if Python cannot parse that many nested brackets, compute it on a line before."""
@@ -157,9 +189,12 @@ class Expressions:
         return Value(repr(number), enum, number)
 
     def _unary(self, expr: t.Unary) -> Value:
-        value = self.value(expr.operand)
+        wanted = self.wanted
+        value = self.value(expr.operand, wanted)
         kind = ty.plain(value.type)
         if expr.op == "NOT":
+            if isinstance(kind, ty.AnyInt) and ty.takes_bits(wanted, kind):
+                value, kind = Value(self.coerced(value, wanted, expr.pos), wanted), wanted
             if ty.is_kind(kind, "bool"):
                 return Value(f"(not {value.code})", ty.BOOL, None if value.constant is None else not value.constant)
             if isinstance(kind, ty.Elementary) and kind.kind == "bits":
@@ -180,14 +215,16 @@ class Expressions:
         while isinstance(first, t.Binary):
             chain.append(first)
             first = first.left
-        value = self.value(first)
+        wanted = self.wanted if expr.op in _LOGIC else None
+        value = self.value(first, wanted or self.declared(*(link.right for link in reversed(chain))))
         for link in reversed(chain):
             value = self._flat(self._joined(link, value), link.pos)
         return value
 
     def _joined(self, expr: t.Binary, left: Value) -> Value:
         mark = len(self.out.lines)
-        right = self.value(expr.right)
+        wanted = left.type if ty.of_bits(left.type) else self.wanted if expr.op in _LOGIC else None
+        right = self.value(expr.right, wanted)
         if expr.op in ("AND_THEN", "OR_ELSE") and len(self.out.lines) > mark:
             left, right = self._only_if_needed(expr, left, right, self.out.since(mark))
         if expr.op in _LOGIC:
@@ -384,7 +421,7 @@ class Expressions:
         for p in signature.inputs:
             expr = _value_of(given.get(p.name.lower()))
             codes.append(
-                p.initial if expr is None else self.coerced(self.value(expr), p.type, expr.pos, _into(p, signature))
+                p.initial if expr is None else self.coerced(self.value(expr, p.type), p.type, expr.pos, _into(p, signature))
             )
         cells: dict[str, str] = {}
         for p in signature.in_outs:

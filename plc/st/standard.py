@@ -75,14 +75,17 @@ def _number(x: Compiling, expr: t.Expr, *kinds: str) -> Value:
 
 def _meeting(x: Compiling, exprs: list[t.Expr]) -> tuple[list[str], ty.Type]:
     """Return all arguments converted to their common type, and that type."""
-    found = [x.value(e) for e in exprs]
+    wanted = ty.plain(x.wanted) if x.wanted is not None else None
+    found = [x.value(e, wanted or x.declared(*exprs)) for e in exprs]
     kind = found[0].type
     for value, expr in zip(found[1:], exprs[1:], strict=True):
         meeting = ty.common(kind, value.type)
         if meeting is None:
             x.env.fail(expr.pos, "arguments of types that do not meet", got=f"{kind} and {value.type}")
         kind = meeting
-    if isinstance(kind, ty.AnyInt):  # the narrowest type that holds all of them
+    if isinstance(kind, ty.AnyInt) and isinstance(wanted, ty.Elementary) and all(ty.fits(v.type, wanted) for v in found):
+        kind = wanted
+    elif isinstance(kind, ty.AnyInt):  # the narrowest type that holds all of them
         kind = next(k for k in (ty.INT, ty.DINT, ty.LINT, ty.ULINT) if all(ty.fits(v.type, k) for v in found))
     elif isinstance(kind, ty.AnyReal):
         return [repr(float(v.constant)) if v.constant is not None else v.code for v in found], kind
@@ -129,7 +132,7 @@ def _operator(x: Compiling, call: t.Call, given: list[t.Expr]) -> Value:
     made, *rest = given
     for operand in rest:
         made = t.Binary(call.pos, op, made, operand)
-    return x.value(made)
+    return x.value(made, x.wanted)
 
 
 @FUNCTIONS.add(*_SEQUENCES, takes=_SOME)
@@ -207,7 +210,7 @@ def _mux(x: Compiling, call: t.Call, given: list[t.Expr]) -> Value:
 
 @FUNCTIONS.add("MOVE", takes=_ONE)
 def _move(x: Compiling, call: t.Call, given: list[t.Expr]) -> Value:
-    return x.value(given[0])
+    return x.value(given[0], x.wanted)
 
 
 _SHIFTS = {"SHL": "shift_left", "SHR": "shift_right", "ROL": "rotate_left", "ROR": "rotate_right"}
@@ -216,9 +219,18 @@ _SHIFTS = {"SHL": "shift_left", "SHR": "shift_right", "ROL": "rotate_left", "ROR
 @FUNCTIONS.add(*_SHIFTS, takes=Formals(("IN", "N")))
 def _shift(x: Compiling, call: t.Call, given: list[t.Expr]) -> Value:
     what, by = given
-    value, count = _number(x, what, "bits"), _number(x, by, "int")
+    wanted = ty.plain(x.wanted) if x.wanted is not None else None
+    value, count = x.value(what, wanted), _number(x, by, "int")
     kind = ty.plain(value.type)
-    assert isinstance(kind, ty.Elementary)
+    if isinstance(kind, ty.AnyInt):
+        if not ty.takes_bits(wanted, kind) or wanted.kind == "bool":
+            x.env.fail(
+                what.pos, "the width of this literal is unknown here", expected="a bit string", got=str(kind),
+                hint="write its type before it, such as WORD#16#0001",
+            )  # fmt: skip
+        value, kind = Value(x.coerced(value, wanted, what.pos), wanted), wanted
+    if not isinstance(kind, ty.Elementary) or kind.kind != "bits":
+        x.env.fail(what.pos, "an argument", expected="bits", got=str(value.type))
     return Value(f"_v.{_SHIFTS[call.ref.name.upper()]}({value.code}, {count.code}, {kind.bits})", kind)
 
 

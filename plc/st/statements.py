@@ -43,7 +43,7 @@ class Statements(Expressions):
     # -- assignment and calls -----------------------------------------------------------------------------------------
 
     def _assign(self, s: t.Assign) -> None:
-        self.assign(s.target, self.value(s.value), s.value.pos)
+        self.assign(s.target, self.value(s.value, self.type_of(s.target)), s.value.pos)
 
     def _callstatement(self, s: t.CallStatement) -> None:
         call = s.call
@@ -70,7 +70,7 @@ class Statements(Expressions):
             assert argument.value is not None
             if name in block.inputs:
                 member, kind = block.inputs[name]
-                value = self.coerced(self.value(argument.value), kind, argument.pos, f"{member} of {block}")
+                value = self.coerced(self.value(argument.value, kind), kind, argument.pos, f"{member} of {block}")
                 self.out.line(f"{code}.{_attribute(block, name, member)} = {value}", call.pos)
             else:
                 member, kind = block.in_outs[name]

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from math import prod
+from typing import TypeGuard
 
 from fieldtwin.plc.blocks import FunctionBlock
 
@@ -240,6 +241,16 @@ def _widens(source: Elementary, target: Elementary) -> bool:
     if source.kind == "int" and target.kind == "real":
         return source.bits <= (16 if target.bits == 32 else 32)
     return source.kind == "bool" and target.kind == "bits"
+
+
+def of_bits(kind: Type | None) -> TypeGuard[Elementary]:
+    """Return whether it is a bit string type or BOOL."""
+    return isinstance(kind, Elementary) and kind.kind in ("bits", "bool")
+
+
+def takes_bits(target: Type | None, source: AnyInt) -> TypeGuard[Elementary]:
+    """Return whether an integer constant becomes a bit string (or a BOOL) where `target` is demanded."""
+    return of_bits(target) and fits(source, target)
 
 
 def common(a: Type, b: Type) -> Type | None:

@@ -19,6 +19,7 @@ from wrong_devices import twisted
 
 from fieldtwin.cli.system.report_command import command as report
 from fieldtwin.cli.test.check_view import style_of
+from fieldtwin.cli.test.fail_on import bases_of
 from fieldtwin.conformance.core.case import Basis, failed, passed
 from fieldtwin.conformance.core.results import exit_code
 from fieldtwin.conformance.devices.canopen import cases as canopen_cases
@@ -33,6 +34,7 @@ from fieldtwin.emulators.virtual.clock import VirtualClock
 from fieldtwin.gateway.core.connection import ByteConnection
 from fieldtwin.gateway.core.errors import ConnectionLost
 from fieldtwin.gateway.protocols.modbus.crc import crc16, with_crc
+from fieldtwin.reports.conformance.client import render_master_html
 from fieldtwin.reports.conformance.device import render_html
 from fieldtwin.reports.conformance.page import overall
 from fieldtwin.reports.junit import render_junit
@@ -42,6 +44,7 @@ from fieldtwin.results.subject import Subject
 CASES: tuple[DeviceCase[object], ...] = (*modbus_cases.CASES, *canopen_cases.CASES)  # type: ignore[arg-type]
 CLAUSE = re.compile(r"^(?:(?:SL|AP|TG) )?\d+(?:\.\d+)*(?:$|[;,])")
 SUBJECT = Subject("modbus", "rtu:/dev/ttyUSB0", 1, {}, "2026-11-21T10:00:00+00:00", command="fieldtwin check modbus")
+HEADLINE = re.compile(r'class="pill (\w+) big"')
 BY_ID = {case.id: case for case in modbus_cases.CASES}
 
 
@@ -104,9 +107,21 @@ def test_only_a_required_case_is_red_and_gives_exit_code_1() -> None:
     page = render_html(SUBJECT, [good, field], "fieldtwin check")
     assert '<span class="pill inconclusive">! field problem</span>' in page
     assert '"pill failed' not in page
+    robust_counts = bases_of("robustness")
+    assert exit_code([good, robust], robust_counts) == 1
+    assert _headline(render_html(SUBJECT, [good, robust], "fieldtwin check", robust_counts)) == "failed"
+    assert _headline(render_html(SUBJECT, [good, robust], "fieldtwin check")) == "passed"
+    assert _headline(render_master_html([good, robust], "x", ["check"], "2027-01-01", robust_counts)) == "failed"
     junit = render_junit(as_report(SUBJECT, [good, field, deviation], "fieldtwin check"))
     assert b'failures="1"' in junit
     assert b"field problem finding: answers twice" in junit
+
+
+def _headline(page: str) -> str:
+    """Return the verdict at the top of a report."""
+    found = HEADLINE.search(page)
+    assert found is not None
+    return found[1]
 
 
 @pytest.mark.parametrize("version", [1, 2])

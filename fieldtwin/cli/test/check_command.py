@@ -363,7 +363,7 @@ def _write(
     if files.junit is not None:
         write_junit(as_report(results, title, argv, began, fail_on), files.junit, Flavour(files.junit_flavour))
     if files.html is not None:
-        write_master_html(results, title, argv, began, files.html)
+        write_master_html(results, title, argv, began, files.html, fail_on)
     if files.out is not None:
         put(files.out, document)
 

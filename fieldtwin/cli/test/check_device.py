@@ -134,7 +134,7 @@ class Check:
         if self.options["html"] is not None:
             from fieldtwin.reports.conformance.device import write_html
 
-            write_html(subject, results, self.words, self.options["html"])
+            write_html(subject, results, self.words, self.options["html"], fail_on)
         if self.options["as_json"]:
             json.dump(document, sys.stdout, indent=2)
             sys.stdout.write("\n")

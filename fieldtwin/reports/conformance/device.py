@@ -8,7 +8,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from fieldtwin.conformance.core.case import Basis
 from fieldtwin.conformance.core.evidence import Line
+from fieldtwin.conformance.core.results import ONLY_REQUIRED
 from fieldtwin.conformance.devices.device_case import DeviceResult
 from fieldtwin.gateway.core.clock import NS_PER_MS
 from fieldtwin.gateway.core.connection import Direction
@@ -20,13 +22,24 @@ MOST_LINES = 60
 """Maximum number of lines of one case's bytes."""
 
 
-def write_html(subject: Subject, results: Sequence[DeviceResult], reproduce: str, path: Path) -> None:
+def write_html(
+    subject: Subject,
+    results: Sequence[DeviceResult],
+    reproduce: str,
+    path: Path,
+    fail_on: frozenset[Basis] = ONLY_REQUIRED,
+) -> None:
     """Write the report; raises `FileInvalid` where that is not possible."""
-    put(path, render_html(subject, results, reproduce))
+    put(path, render_html(subject, results, reproduce, fail_on))
 
 
-def render_html(subject: Subject, results: Sequence[DeviceResult], reproduce: str) -> str:
-    """Return the whole page. `reproduce` is the command that repeats all cases."""
+def render_html(
+    subject: Subject, results: Sequence[DeviceResult], reproduce: str, fail_on: frozenset[Basis] = ONLY_REQUIRED
+) -> str:
+    """Return the whole page. `reproduce` is the command that repeats all cases.
+
+    The headline is failed if a case failed whose basis is one of `fail_on`, as the exit code is.
+    """
     facts = [
         ("device", subject.name),
         *subject.identity.items(),
@@ -44,6 +57,7 @@ def render_html(subject: Subject, results: Sequence[DeviceResult], reproduce: st
         does="sent",
         frames_of=_frames,
         repeat=lambda id: f"{reproduce} --only {id}",
+        fail_on=fail_on,
     )
 
 

@@ -12,7 +12,7 @@ from typing import TypeVar
 
 from fieldtwin.conformance.core.case import OTHER_WIRE, Basis
 from fieldtwin.conformance.core.evidence import Line
-from fieldtwin.conformance.core.results import CaseResult, called, summary
+from fieldtwin.conformance.core.results import ONLY_REQUIRED, CaseResult, called, counts_as_failed, summary
 from fieldtwin.reports.pages import fill
 from fieldtwin.results.model import Verdict
 
@@ -45,11 +45,12 @@ def render_page(
     does: str,
     frames_of: Callable[[R], Sequence[Line]],
     repeat: Callable[[str], str],
+    fail_on: frozenset[Basis] = ONLY_REQUIRED,
 ) -> str:
     """Return the whole page about `name`.
 
     `again` is the command that repeats all cases, and `repeat` returns the one for a case's id. `does` is the heading of the
-    actions in a case.
+    actions in a case. `fail_on` are the bases whose failed cases make the headline failed.
     """
     found = sorted(
         (r for r in results if r.verdict.bad or r.verdict is Verdict.INCONCLUSIVE),
@@ -61,7 +62,7 @@ def render_page(
         "conformance.html.j2",
         name=name,
         summary=summary(results),
-        overall=overall(results),
+        overall=overall(results, fail_on),
         counts={verdict: counts[verdict] for verdict in ORDER},
         facts=facts,
         again=again,
@@ -80,10 +81,13 @@ def render_page(
     )
 
 
-def overall(results: Sequence[CaseResult]) -> Verdict:
-    """Return the verdict of the check: failed if a required case failed, passed if a case passed and no required one failed."""
+def overall(results: Sequence[CaseResult], fail_on: frozenset[Basis] = ONLY_REQUIRED) -> Verdict:
+    """Return the verdict of the check, which agrees with its exit code.
+
+    It is failed if a case failed whose basis is one of `fail_on`, else passed if a case passed, and else inconclusive.
+    """
     verdicts = {r.verdict for r in results}
-    if any(r.deviates or r.verdict is Verdict.ERROR for r in results):
+    if any(counts_as_failed(r, fail_on) for r in results):
         return Verdict.FAILED
     return Verdict.PASSED if Verdict.PASSED in verdicts else Verdict.INCONCLUSIVE
 

@@ -84,6 +84,9 @@ class CanopenDriver(DeviceDriver):
         """The TPDOs that the driver listens to, by number."""
         self._listening: dict[int, PdoCallback] = {}
         self._by_change: frozenset[str] = frozenset()
+        self.unmapped: tuple[str, ...] = ()
+        """Tags of the configured `tpdo1` that the node's own mapping lacks, found when the driver may not write it: they are
+        read over SDO."""
         self._rpdos: dict[str, Rpdo] = {}
         self._started = False
 
@@ -112,7 +115,7 @@ class CanopenDriver(DeviceDriver):
     @property
     def pdo_tags(self) -> list[str]:
         """The full names of the tags that TPDOs bring."""
-        names = list(self.config.tpdo1.tags) if self.config.tpdo1 else []
+        names = [n for n in self.config.tpdo1.tags if n not in self.unmapped] if self.config.tpdo1 else []
         mapped = [(e.index, e.subindex) for seen in self.tpdos for e in seen.mapping.entries]
         names += [self._by_object[o].name for o in mapped if o in self._by_object]
         return [f"{self.config.name}.{name}" for name in dict.fromkeys(names)]
@@ -152,7 +155,7 @@ class CanopenDriver(DeviceDriver):
         """Use `master`, which communicates over `connection`, from now on."""
         self.attach(connection)
         self._master = master
-        self.tpdos, self._listening = (), {}
+        self.tpdos, self._listening, self.unmapped = (), {}, ()
         self._rpdos, self._started = {}, False
         consumer_ms = self.config.heartbeat.consumer_ms if self.config.heartbeat else 0
         master.add_node(
@@ -230,12 +233,34 @@ class CanopenDriver(DeviceDriver):
         await self._take_rpdos()
 
     async def adopt(self) -> None:
-        """Use the TPDOs as the node or its DCF has them, and listen. This only reads."""
+        """Use the TPDOs as the node or its DCF has them, and listen. This only reads.
+
+        A tag of the configured `tpdo1` that none of them carries is in `unmapped` afterwards.
+        """
         tpdos = await self._other_tpdos()
         if self.config.tpdo1 is not None:
             held = await read_tpdo(self.master, self.node, 1)
             tpdos += [held] if held.enabled else []
         self._listen(tpdos)
+        brought = {name for seen in self.tpdos for name in seen.tags}
+        wanted = self.config.tpdo1.tags if self.config.tpdo1 is not None else ()
+        self.unmapped = tuple(name for name in wanted if name not in brought)
+
+    @property
+    def unmapped_ms(self) -> int:
+        """The period in which `read_unmapped` is due: half of the time for which a value is good, but 100 ms at least."""
+        shortest = min((self.stale_after_ms(self.profile.tags[n]) or 1000 for n in self.unmapped), default=1000)
+        return max(100, shortest // 2)
+
+    async def read_unmapped(self) -> None:
+        """Read the tags over SDO that the node's TPDOs should carry and do not. A tag that the node refuses has no value."""
+        for name in self.unmapped:
+            if self.profile.tags[name].poll in self.config.poll:
+                continue  # its poll group reads it
+            try:
+                await self._upload(self.profile.tags[name])
+            except SdoAborted:
+                self.sink.put_bad([f"{self.config.name}.{name}"], Reason.REFUSED)
 
     async def to_be_halted(self) -> bool:
         """Return whether the node has to be put into PRE-OPERATIONAL first, because its configuration will change and

@@ -100,13 +100,14 @@ async def rig(
     serial: str = "1005",
     canopen: CanopenBusConfig | None = None,
     heartbeat: Heartbeat = HEARTBEAT,
+    tpdo1: Tpdo = Tpdo(("slope_long", "slope_lateral"), 20),  # noqa: B008 -- it is frozen
 ) -> AsyncIterator[Rig]:
     clock = WallClock()
     server = await SoftBusServer.open(Endpoint.parse("can:fieldtwin/127.0.0.1:0"), 125_000, paced=False)
     tags = TagTable(clock)
     config = DeviceConfig(
         "incl", PROFILE, "can0", NODE, expect={"serial": serial} if serial else {}, stale_after_ms=400,
-        heartbeat=heartbeat, tpdo1=Tpdo(("slope_long", "slope_lateral"), 20), start=True,
+        heartbeat=heartbeat, tpdo1=tpdo1, start=True,
     )  # fmt: skip
     driver = CanopenDriver(config, tags, clock)
     tags.declare(driver.pdo_tags, 400)
@@ -269,6 +270,23 @@ def test_without_permission_the_mapping_is_adopted_and_nothing_is_written(tmp_pa
             assert node.counters.nmt_commands == 1  # the operator's
             await r.bus.halt(0.2)
             assert [f.data for f in r.frames if f.can_id == 0] == [bytes([1, NODE])]
+
+    run(main())
+
+
+def test_a_read_only_plant_reads_tags_over_sdo_that_the_nodes_tpdo_does_not_carry(tmp_path: Path) -> None:
+    """Defect: the mapping of `tpdo1` may not be written, so that no message brought the tag, and programs waited for ever."""
+
+    async def main() -> None:
+        async with rig(tmp_path, allow_writes=False, serial="", tpdo1=Tpdo(("slope_long", "serial"), 20)) as r:
+            r.plug_node()
+            await eventually(lambda: r.quality("serial") == ("good", "none"))
+            assert r.status.driver.unmapped == ("serial",)
+            assert r.quality("slope_long")[0] == "bad"  # the node's TPDO carries it, and no master started the node
+            first = r.tags.current("incl.serial", WallClock().monotonic_ns()).t_ns
+            await eventually(lambda: r.tags.current("incl.serial", WallClock().monotonic_ns()).t_ns > first)
+            uploads = [f.data[0] >> 5 for f in r.frames if f.can_id == SDO_TO_NODE]
+            assert set(uploads) == {2}  # SDO uploads, and not one download
 
     run(main())
 

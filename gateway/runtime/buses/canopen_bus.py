@@ -272,6 +272,8 @@ class CanopenBus:
                         nursery.start(self._keep_up(status), f"{name} bring-up")
                         nursery.start(status.writes.run_downloads(), f"{name} downloads")
                         nursery.start(status.writes.run_rpdos(), f"{name} RPDOs")
+                        if status.driver.config.tpdo1 is not None and not self._allow_writes:
+                            nursery.start(self._poll_unmapped(status), f"{name} tags without a TPDO")
                         if status.driver.config.poll:
                             status.polling = nursery.start(self._poll(status), f"{name} polls")
                     for producer in self._producers():
@@ -389,6 +391,21 @@ class CanopenBus:
             if self._coming is not None:
                 self._take_over(status)
                 self._taken_over()
+
+    async def _poll_unmapped(self, status: NodeStatus) -> None:
+        """Read tags of an unwritten `tpdo1` over SDO while the node is up: on a read-only plant no TPDO may ever bring them."""
+        driver = status.driver
+        while True:
+            await status.up.wait()
+            if driver.unmapped and driver.master.node_state(driver.node) is not NmtState.STOPPED:
+                try:
+                    await driver.read_unmapped()
+                except ConnectionLost:
+                    raise
+                except FieldtwinError as e:
+                    status.poll_errors += 1
+                    self._tags.put_bad([f"{driver.config.name}.{name}" for name in driver.unmapped], reason_of(e))
+            await self._clock.sleep_until_ns(self._clock.monotonic_ns() + driver.unmapped_ms * NS_PER_MS)
 
     async def _read_group(self, status: NodeStatus, group: str) -> None:
         driver, master = status.driver, status.driver.master

@@ -421,7 +421,9 @@ class Expressions:
         for p in signature.inputs:
             expr = _value_of(given.get(p.name.lower()))
             codes.append(
-                p.initial if expr is None else self.coerced(self.value(expr, p.type), p.type, expr.pos, _into(p, signature))
+                p.initial
+                if expr is None
+                else self.coerced(self.value(expr, p.type), p.type, expr.pos, _into(p, signature))
             )
         cells: dict[str, str] = {}
         for p in signature.in_outs:

@@ -83,7 +83,11 @@ def _meeting(x: Compiling, exprs: list[t.Expr]) -> tuple[list[str], ty.Type]:
         if meeting is None:
             x.env.fail(expr.pos, "arguments of types that do not meet", got=f"{kind} and {value.type}")
         kind = meeting
-    if isinstance(kind, ty.AnyInt) and isinstance(wanted, ty.Elementary) and all(ty.fits(v.type, wanted) for v in found):
+    if (
+        isinstance(kind, ty.AnyInt)
+        and isinstance(wanted, ty.Elementary)
+        and all(ty.fits(v.type, wanted) for v in found)
+    ):
         kind = wanted
     elif isinstance(kind, ty.AnyInt):  # the narrowest type that holds all of them
         kind = next(k for k in (ty.INT, ty.DINT, ty.LINT, ty.ULINT) if all(ty.fits(v.type, k) for v in found))

@@ -33,6 +33,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from msgspec import structs
+
 from fieldtwin.gateway.core.control import ControlServer
 from fieldtwin.gateway.core.errors import FileInvalid, Unreachable, UsageError
 from fieldtwin.gateway.core.image.image import Image
@@ -41,6 +43,7 @@ from fieldtwin.plc.config import PlcConfig
 from fieldtwin.plc.realtime import RealtimeReport, StuckAlarm, monotonic_ns, prepare, run_task, utc_ns
 from fieldtwin.plc.runner import Runner
 from fieldtwin.plc.sources import changed
+from fieldtwin.plc.status import PlcStatus, WholePlcStatus
 from fieldtwin.plc.tag_view import TagView
 from fieldtwin.plc.task import StopReason
 
@@ -110,38 +113,36 @@ class PlcProcess:
     # -- commands ---------------------------------------------------------------------------------------------------
 
     async def _ready(self, args: dict[str, Any]) -> dict[str, Any]:
-        return {"ready": True, "state": self._runner.describe()["state"], "pid": os.getpid()}
+        return {"ready": True, "state": self._runner.status().state, "pid": os.getpid()}
 
     async def _stop(self, args: dict[str, Any]) -> dict[str, Any]:
         self._runner.stop()  # stop before the answer, because the client may rely on it
         self._loop.call_later(0.02, self._end)  # end after the answer, so that it is sent
-        return {"state": self._runner.describe()["state"]}
+        return {"state": self._runner.status().state}
 
     def _end(self) -> None:
         self._stopping = True
         self._loop.stop()
 
-    async def _get(self, args: dict[str, Any]) -> dict[str, Any]:
+    async def _get(self, args: dict[str, Any]) -> PlcStatus:
         now_ns, runner = monotonic_ns(), self._runner
-        brief = {
-            **runner.describe(),
-            "pid": os.getpid(),
-            "gateway_alive": runner.gateway_alive,
-            "counters": runner.counters(),
-            "realtime": self._realtime.describe(),
-            "acts": dict(self._acts.counts),
-            "programs": {p.name: type(p.program).__name__ for p in runner.programs},
-        }
+        brief = structs.replace(
+            runner.status(),
+            pid=os.getpid(),
+            realtime=self._realtime.status(),
+            acts=dict(self._acts.counts),
+            programs={p.name: type(p.program).__name__ for p in runner.programs},
+        )
         if args.get("brief") is True:
             return brief
         outputs = runner.outputs.last()
-        return {
-            **brief,
-            "retained": runner.retained.values(),
-            "inputs": {tag: value.describe(now_ns) for tag, value in runner.inputs().items()},
-            "outputs": outputs,
-            "variables": {f"{p.name}.{v.name}": outputs[tag] for p in runner.programs for v, tag in p.published()},
-        }
+        return WholePlcStatus(
+            **structs.asdict(brief),
+            retained=runner.retained.values(),
+            inputs={tag: value.describe(now_ns) for tag, value in runner.inputs().items()},
+            outputs=outputs,
+            variables={f"{p.name}.{v.name}": outputs[tag] for p in runner.programs for v, tag in p.published()},
+        )
 
     async def _tags(self, args: dict[str, Any]) -> dict[str, Any]:
         if "tags" not in args:

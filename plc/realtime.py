@@ -37,6 +37,7 @@ from typing import Any
 
 from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
 from fieldtwin.plc.program import ScanStuck
+from fieldtwin.plc.status import RealtimeStatus
 from fieldtwin.plc.task import Driven
 
 GUARD_NS = 2 * NS_PER_MS
@@ -86,9 +87,9 @@ class RealtimeReport:
     granted: tuple[str, ...]
     refused: tuple[tuple[str, str], ...]
 
-    def describe(self) -> dict[str, Any]:
-        """Return the report as data for JSON."""
-        return {"granted": list(self.granted), "refused": dict(self.refused)}
+    def status(self) -> RealtimeStatus:
+        """Return the report for the control channel."""
+        return RealtimeStatus(granted=list(self.granted), refused=dict(self.refused))
 
 
 def prepare(priority: int = 10) -> RealtimeReport:

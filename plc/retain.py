@@ -25,6 +25,7 @@ import msgspec
 
 from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid, Unreachable
 from fieldtwin.plc.binding import BoundProgram
+from fieldtwin.plc.status import RetainStatus
 
 _MAGIC = b"FTRETN1\n"
 _HEAD = struct.Struct("<8sQ32s")
@@ -229,12 +230,9 @@ class Retained:
             self._file.close()
             self._file = None
 
-    def describe(self) -> dict[str, Any]:
-        """Return the kind of start and the number of saves, as data for JSON."""
-        return {
-            "start": self.start,
-            "saves": self._file.saves if self._file else 0,
-        }
+    def status(self) -> RetainStatus:
+        """Return the kind of start and the number of saves."""
+        return RetainStatus(start=self.start, saves=self._file.saves if self._file else 0)
 
     def values(self) -> dict[str, Any]:
         """Return the present retained values by program and variable, as plain data."""

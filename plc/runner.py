@@ -30,6 +30,7 @@ from fieldtwin.plc.retain import Retained
 from fieldtwin.plc.scan import Scan
 from fieldtwin.plc.sources import Source, sources
 from fieldtwin.plc.start import InputsMissing, Starts
+from fieldtwin.plc.status import PlcStatus, StopsStatus, TaskStatus
 from fieldtwin.plc.task import CyclicTask, Guard, StopReason, TaskConfig, TaskState
 
 RESTARTABLE = (StopReason.WATCHDOG, StopReason.STUCK)
@@ -457,9 +458,8 @@ class Runner:
                 total[name] = count if name == "mailbox_waits" else total.get(name, 0) + count
         return total
 
-    def describe(self) -> dict[str, Any]:
-        """Return the state as data for JSON: the first task's figures for the whole PLC, and each task's own
-        figures."""
+    def status(self) -> PlcStatus:
+        """Return the state: the first task's figures for the whole PLC, and each task's own figures."""
         now_ns = self._now_ns()
         shown = self._stopped or self.entries[0]
         described = shown.task.describe()
@@ -467,20 +467,23 @@ class Runner:
             described["state"] = "waiting"
         if described["state"] == "waiting" and (error := self.starts.error):
             described["error"] = str(error)
-        return {
+        return PlcStatus(
             **described,
-            **self.starts.describe(now_ns),
-            "restarts": self.restarts,
-            "stops": {"count": self._stops, "last": self._last_stop},
-            "stepping": self.stepping,
-            "restart_in_ms": max(0.0, (self._restart_ns - now_ns) / 1e6) if self._restart_ns < _NEVER_NS else None,
-            "retain": self.retained.describe(),
-            "forces": self.forces.describe(now_ns),
-            "tasks": {
-                e.spec.name: {"priority": e.spec.priority, "single": e.single, **e.task.describe()}
+            waiting=self.starts.waiting_statuses(now_ns),
+            started_without=self.starts.started_without(),
+            restarts=self.restarts,
+            stops=StopsStatus(count=self._stops, last=self._last_stop),
+            stepping=self.stepping,
+            restart_in_ms=max(0.0, (self._restart_ns - now_ns) / 1e6) if self._restart_ns < _NEVER_NS else None,
+            retain=self.retained.status(),
+            forces=self.forces.describe(now_ns),
+            tasks={
+                e.spec.name: TaskStatus(**e.task.describe(), priority=e.spec.priority, single=e.single)
                 for e in self.entries
             },
-        }
+            gateway_alive=self.gateway_alive,
+            counters=self.counters(),
+        )
 
 
 def _inside(spec: TagSpec, value: Scalar) -> None:

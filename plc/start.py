@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
 from fieldtwin.gateway.core.errors import Blame, FieldtwinError
@@ -26,6 +26,7 @@ from fieldtwin.gateway.core.values import Quality, Reason
 from fieldtwin.plc.binding import BoundProgram
 from fieldtwin.plc.forces import Forces
 from fieldtwin.plc.program import Role
+from fieldtwin.plc.status import WaitingStatus
 
 TIMEOUT_MS = 10_000.0
 """How long a program waits for its inputs before its policy decides, in ms, if the configuration does not set it."""
@@ -113,18 +114,18 @@ class ProgramStart:
             "program has commanded it needs `at_timeout: start_anyway`",
         )
 
-    def describe(self, now_ns: int) -> dict[str, Any]:
-        """Return plain data for JSON, while the program waits."""
+    def status(self, now_ns: int) -> WaitingStatus:
+        """Return the status of a program that waits."""
         since_ns = now_ns if self.since_ns is None else self.since_ns
-        return {
-            "inputs": {tag: str(self.missing[tag]) for tag in self.needed},
-            "programs": [p.name for p in self.waits_for],
-            "reason": self.reason(),
-            "since_s": (now_ns - since_ns) / NS_PER_S,
-            "timeout_s": self.policy.timeout_ms / 1000,
-            "at_timeout": self.policy.at_timeout,
-            "overdue": self.overdue,
-        }
+        return WaitingStatus(
+            inputs={tag: str(self.missing[tag]) for tag in self.needed},
+            programs=[p.name for p in self.waits_for],
+            reason=self.reason(),
+            since_s=(now_ns - since_ns) / NS_PER_S,
+            timeout_s=self.policy.timeout_ms / 1000,
+            at_timeout=self.policy.at_timeout,
+            overdue=self.overdue,
+        )
 
 
 class Starts:
@@ -200,16 +201,16 @@ class Starts:
         """The error of the first program that is overdue; None if no program is."""
         return next((start.error() for start in self.waiting if start.overdue), None)
 
-    def describe(self, now_ns: int) -> dict[str, Any]:
-        """Return plain data for JSON: ``waiting`` by program, and ``started_without``, the inputs that were missing at
-        its start."""
+    def waiting_statuses(self, now_ns: int) -> dict[str, WaitingStatus]:
+        """Return the programs that wait."""
+        return {start.name: start.status(now_ns) for start in self.missing_something}
+
+    def started_without(self) -> dict[str, dict[str, str]]:
+        """Return, by program, the inputs that were missing when it started, with the reason."""
         return {
-            "waiting": {start.name: start.describe(now_ns) for start in self.missing_something},
-            "started_without": {
-                name: {tag: str(reason) for tag, reason in start.without.items()}
-                for name, start in self.all.items()
-                if start.without
-            },
+            name: {tag: str(reason) for tag, reason in start.without.items()}
+            for name, start in self.all.items()
+            if start.without
         }
 
     def release(self) -> None:

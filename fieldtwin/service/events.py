@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any
 
+from fieldtwin.plc.status import PlcStatus
 from fieldtwin.service.metrics import Snapshot
 
 Status = Mapping[str, Any]
@@ -93,17 +94,16 @@ def _devices(before: Mapping[str, Status], now: Mapping[str, Status]) -> list[Ev
     return found
 
 
-def _plc(before: Status | None, now: Status | None) -> list[Event]:
+def _plc(before: PlcStatus | None, now: PlcStatus | None) -> list[Event]:
     if now is None:
         return []
-    was, waiting = before or {}, now.get("waiting", {})
-    if now["state"] == was.get("state") and now["error"] == was.get("error"):
+    if before is not None and (now.state, now.error) == (before.state, before.error):
         return []
-    healthy = now["state"] == "running" or (now["state"] == "waiting" and not now["error"])
+    healthy = now.state == "running" or (now.state == "waiting" and not now.error)
     priority = Priority.NOTICE if healthy else Priority.ERROR
-    why = now["error"] or "; ".join(f"program {program} for {start['reason']}" for program, start in waiting.items())
-    text = f"PLC: {now['state']}" + (f": {why}" if why else "")
-    return [Event(priority, "plc_state", text, {"state": now["state"], "error": now["error"]})]
+    why = now.error or "; ".join(f"program {program} for {start.reason}" for program, start in now.waiting.items())
+    text = f"PLC: {now.state}" + (f": {why}" if why else "")
+    return [Event(priority, "plc_state", text, {"state": now.state, "error": now.error})]
 
 
 def _reloaded(before: Status | None, now: Status | None) -> list[Event]:

@@ -17,6 +17,7 @@ from fieldtwin.__about__ import __version__
 from fieldtwin.gateway.core.values import Quality
 from fieldtwin.gateway.protocols.canopen.sdo_channel import Counters as CanopenCounters
 from fieldtwin.gateway.protocols.modbus.client import ClientCounters
+from fieldtwin.plc.status import PlcStatus, ScanStatus, Spread
 from fieldtwin.service.exposition import Family
 
 MOST_DEVICES = 1000
@@ -42,7 +43,7 @@ class Snapshot:
     mode: str
     uptime_s: float
     gateway: Status | None
-    plc: Status | None
+    plc: PlcStatus | None
     children: Mapping[str, bool]
     asked_ago_s: float
     thread: Status | None = None
@@ -197,35 +198,44 @@ def _watchers(page: Page, gateway: Status) -> None:
     )
 
 
-def _plc(page: Page, plc: Status) -> None:
-    per_task: list[tuple[str, str, Callable[[Status], Any]]] = [
-        ("scans", "Scans of a task.", lambda t: t["scans"]),
-        ("missed_periods", "Periods in which a task's scan did not begin.", lambda t: t["missed_periods"]),
-        ("overruns", "Scans that took longer than their period.", lambda t: t["overruns"]),
+def _plc(page: Page, plc: PlcStatus) -> None:
+    per_task: list[tuple[str, str, Callable[[ScanStatus], Any]]] = [
+        ("scans", "Scans of a task.", lambda t: t.scans),
+        ("missed_periods", "Periods in which a task's scan did not begin.", lambda t: t.missed_periods),
+        ("overruns", "Scans that took longer than their period.", lambda t: t.overruns),
     ]
-    tasks = dict(_some(plc.get("tasks") or {"main": plc}))
+    tasks: dict[str, ScanStatus] = dict(_some(plc.tasks or {"main": plc}))
     for name, text, of in per_task:
         counted = page.counter(f"plc_{name}", text)
         for task, status in tasks.items():
             counted.add(of(status), task=task)
-    for name, key, text in (
-        ("plc_lateness_seconds", "lateness_us", "How late scans began, since the start, by quantile; 1 is the worst."),
-        ("plc_scan_seconds", "duration_us", "How long scans took, since the start, by quantile; 1 is the longest."),
-    ):
+    spreads: list[tuple[str, str, Callable[[ScanStatus], Spread]]] = [
+        (
+            "plc_lateness_seconds",
+            "How late scans began, since the start, by quantile; 1 is the worst.",
+            lambda t: t.lateness_us,
+        ),
+        (
+            "plc_scan_seconds",
+            "How long scans took, since the start, by quantile; 1 is the longest.",
+            lambda t: t.duration_us,
+        ),
+    ]
+    for name, text, spread_of in spreads:
         gauge = page.gauge(name, text)
         for task, status in tasks.items():
             for quantile, part in (("0.5", "p50"), ("0.99", "p99"), ("0.999", "p999"), ("1", "max")):
-                gauge.add(status[key][part] / 1e6, task=task, quantile=quantile)
+                gauge.add(spread_of(status)[part] / 1e6, task=task, quantile=quantile)
     running = page.gauge("plc_running", "Whether a task runs; 0 is stopped or failed.")
     for task, status in tasks.items():
-        running.add(int(status["state"] == "running"), task=task)
+        running.add(int(status.state == "running"), task=task)
     page.gauge("plc_programs_waiting", "Programs that wait for their inputs and have not started.").add(
-        len(plc.get("waiting", {}))
+        len(plc.waiting)
     )
-    page.counter("plc_restarts", "Restarts of the PLC's program after a failure.").add(plc["restarts"])
-    page.gauge("plc_forces", "Variables that are forced.").add(len(plc["forces"]))
+    page.counter("plc_restarts", "Restarts of the PLC's program after a failure.").add(plc.restarts)
+    page.gauge("plc_forces", "Variables that are forced.").add(len(plc.forces))
     counted = page.counter("plc_events", "What the PLC counted of its image and its messages, by event.")
-    for event, count in plc["counters"].items():
+    for event, count in plc.counters.items():
         counted.add(count, event=event)
 
 

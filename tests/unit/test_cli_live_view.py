@@ -6,9 +6,11 @@ from io import StringIO
 from typing import Any
 
 import pytest
+from msgspec import structs
 from rich.console import Console
 
 from fieldtwin.cli.run.live_view import age_text, interference, line, render, troubles, value_text
+from fieldtwin.plc.status import PlcStatus, Spread
 from fieldtwin.run.live.options import RunOptions
 from fieldtwin.run.live.session import RunSession
 
@@ -42,8 +44,8 @@ def session() -> RunSession:
         "plc": {"alive": False},
         "logged": 5,
     }
-    late = {"p50": 70.0, "p99": 2060.0, "max": 21270.0}
-    made.plc_status = {"cycle_ms": 10.0, "scans": 707, "missed_periods": 2, "state": "running", "lateness_us": late}
+    late: Spread = {"p50": 70.0, "p99": 2060.0, "max": 21270.0}
+    made.plc_status = PlcStatus(cycle_ms=10.0, scans=707, missed_periods=2, state="running", lateness_us=late)
     return made
 
 
@@ -90,10 +92,8 @@ def test_without_a_terminal_there_is_no_escape_and_one_line(session: RunSession)
 def test_a_paused_plc_and_forces_are_in_sight(session: RunSession) -> None:
     assert session.plc_status is not None
     assert interference(session) == []
-    session.plc_status |= {
-        "state": "paused",
-        "forces": {f"ctd.tag{n}": {"value": n / 3, "by": "ada" if n else "", "age_ms": 5.0} for n in range(8)},
-    }
+    forces = {f"ctd.tag{n}": {"value": n / 3, "by": "ada" if n else "", "age_ms": 5.0} for n in range(8)}
+    session.plc_status = structs.replace(session.plc_status, state="paused", forces=forces)
     assert line(session).endswith("PLC PAUSED FORCED=" + ",".join(f"ctd.tag{n}" for n in range(8)) + " PLC LOST")
     top = " ".join(" ".join(shown(session, 80)[:20]).split())
     assert "PAUSED: the PLC executes nothing, its outputs stay as they are" in top
@@ -105,7 +105,8 @@ def test_every_trouble_is_named_once(session: RunSession) -> None:
     session.note_error("plc: ended with signal 9")
     assert troubles(session) == ["plc: ended with signal 9", f"line1: {NOBODY}", f"modem: {SILENT}"]
     assert session.plc_status is not None
-    session.plc_status["error"] = "program pump, pump.st:8: LogicError: division by zero"
+    error = "program pump, pump.st:8: LogicError: division by zero"
+    session.plc_status = structs.replace(session.plc_status, error=error)
     assert troubles(session)[-1] == "PLC: program pump, pump.st:8: LogicError: division by zero"
     session.gateway_status = session.plc_status = None
     assert troubles(session) == ["plc: ended with signal 9"]

@@ -52,7 +52,7 @@ def test_a_restart_of_the_programs_writes_nothing(tmp_path: Path) -> None:
     async def restart(run: VirtualPrototype) -> None:
         run.plc.restart()
         await run.clock.sleep_until_ns(run.loop.now_ns + 3 * NS_PER_S)
-        assert run.plc.describe()["state"] == "running"
+        assert run.plc.status().state == "running"
 
     VirtualHall(hall(tmp_path), tmp_path).run(5, restart)
     assert writes(tmp_path) == []

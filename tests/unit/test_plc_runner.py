@@ -122,7 +122,7 @@ def test_a_single_task_runs_once_at_each_rising_edge(tmp_path: Path) -> None:
     rig.until(60, go=False)
     rig.until(70, go=True)
     assert [ms for name, ms in rig.ran() if name == "Event"] == [40, 70]
-    assert rig.runner.describe()["tasks"]["event"]["single"] == "d.go"
+    assert rig.runner.status().tasks["event"].single == "d.go"
 
 
 def test_a_trigger_may_be_an_output_of_another_program(tmp_path: Path) -> None:
@@ -185,7 +185,7 @@ def test_paused_tasks_hold_their_outputs_and_step_on_request(tmp_path: Path) -> 
     rig.runner.step(2)
     rig.until(200)
     assert rig.ran() == [("Fast", 10), ("Fast", 20), ("Fast", 110), ("Fast", 120)]
-    assert rig.runner.describe()["state"] == "paused"
+    assert rig.runner.status().state == "paused"
     rig.runner.pause(False)
     rig.until(230)
     assert len(rig.ran()) == 7
@@ -201,7 +201,7 @@ def test_forces_survive_a_restart_and_are_in_every_status(tmp_path: Path) -> Non
     rig.runner.restart(cold=True)
     rig.until(60)
     assert rig.reader.snapshot().value("fast.count").value == 77
-    assert rig.runner.describe()["forces"]["fast.count"]["by"] == "somebody"
+    assert rig.runner.status().forces["fast.count"]["by"] == "somebody"
     assert rig.runner.why("fast.count")[0]["forced"]
     with pytest.raises(UsageError, match="no program writes"):
         rig.runner.why("d.n")

@@ -6,6 +6,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import click
+import msgspec
 import pytest
 from click.testing import CliRunner
 from test_plc_runner import MS, Rig
@@ -59,7 +60,7 @@ def test_each_task_may_be_late_by_its_own_limit(tmp_path: Path) -> None:
     rig.runner.start()
     rig.until(1000)
     assert rig.runner.running
-    shown = rig.runner.describe()["tasks"]
+    shown = msgspec.to_builtins(rig.runner.status())["tasks"]
     assert (shown["fast"]["late_ms"], shown["slow"]["late_ms"]) == (5.0, 50)
 
 

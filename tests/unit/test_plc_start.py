@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
 from fieldtwin.gateway.core.image.image import INPUTS, OUTPUTS, TagKind, TagSpec, message_tag
@@ -131,7 +132,7 @@ class Rig:
 
     @property
     def status(self) -> dict[str, Any]:
-        return self.runner.describe()
+        return dict(msgspec.to_builtins(self.runner.status()))
 
 
 def fan(source: str = "python: MODULE:Fan", if_bad: str | float = "pass", **policy: Any) -> ProgramConfig:

@@ -14,6 +14,7 @@ from support import run
 
 from fieldtwin.gateway.core.errors import EndpointBusy, UsageError
 from fieldtwin.gateway.core.latency import BOUNDS_MS, Latencies
+from fieldtwin.plc.status import PlcStatus, Spread, TaskStatus
 from fieldtwin.service.exposition import CONTENT_TYPE, Family, render
 from fieldtwin.service.metrics import MOST_DEVICES, Snapshot, families
 from fieldtwin.service.metrics_server import MOST_CLIENTS, MetricsServer, parse_place
@@ -71,17 +72,13 @@ def gateway_status(devices: int = 1) -> dict[str, Any]:
     }
 
 
-def plc_status() -> dict[str, Any]:
-    shape = {"count": 4, "min": 1.0, "p50": 10.0, "p99": 20.0, "p999": 30.0, "above_1ms": 0.0, "max": 40.0}
-    task = {
-        "state": "running",
-        "scans": 442,
-        "missed_periods": 1,
-        "overruns": 2,
-        "lateness_us": shape,
-        "duration_us": shape,
-    }
-    return {**task, "tasks": {"main": task}, "restarts": 3, "forces": {"a": 1}, "counters": {"messages_missed": 2}}
+def plc_status() -> PlcStatus:
+    shape: Spread = {"count": 4, "min": 1.0, "p50": 10.0, "p99": 20.0, "p999": 30.0, "above_1ms": 0.0, "max": 40.0}
+    counts = {"state": "running", "scans": 442, "missed_periods": 1, "overruns": 2}
+    task: dict[str, Any] = {**counts, "lateness_us": shape, "duration_us": shape}
+    forces: dict[str, dict[str, Any]] = {"a": {"value": 1}}
+    tasks = {"main": TaskStatus(**task)}
+    return PlcStatus(**task, tasks=tasks, restarts=3, forces=forces, counters={"messages_missed": 2})
 
 
 def seen(**changed: Any) -> Snapshot:

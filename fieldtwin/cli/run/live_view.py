@@ -17,6 +17,7 @@ from rich.text import Text
 
 from fieldtwin.cli.run.plc_views import acts_text, waiting_texts, without_texts
 from fieldtwin.console import data, talk
+from fieldtwin.plc.status import PlcStatus
 from fieldtwin.results.trace import refusal_text
 from fieldtwin.run.live.session import RunSession
 
@@ -151,8 +152,8 @@ def troubles(session: RunSession) -> list[str]:
     for name, device in gateway.get("devices", {}).items():
         if device["error"] and device["error"] != closed.get(device["bus"]):
             found.append(f"{name}: {device['error']}")
-    if error := (session.plc_status or {}).get("error"):
-        found.append(f"PLC: {error}")
+    if session.plc_status is not None and session.plc_status.error:
+        found.append(f"PLC: {session.plc_status.error}")
     found += refused(gateway)
     thread = session.thread_status or {}
     found += [f"{what}: {text}" for what, key in THREAD_TROUBLES if (text := thread.get(key))]
@@ -174,18 +175,20 @@ def refused(gateway: dict[str, Any]) -> list[str]:
 
 def interference(session: RunSession) -> list[str]:
     """Return why the PLC does not follow its programs: it is paused, a program waits for its start, or a tag is forced."""
-    plc = session.plc_status or {}
-    found = ["PAUSED: the PLC executes nothing, its outputs stay as they are"] if plc.get("state") == "paused" else []
-    found += waiting_texts(plc)
-    if forces := plc.get("forces"):
-        found.append(f"FORCED: {forces_text(forces)}")
+    plc = session.plc_status
+    if plc is None:
+        return []
+    found = ["PAUSED: the PLC executes nothing, its outputs stay as they are"] if plc.state == "paused" else []
+    found += waiting_texts(plc.waiting)
+    if plc.forces:
+        found.append(f"FORCED: {forces_text(plc.forces)}")
     return found
 
 
 def _waiting_once(session: RunSession) -> list[str]:
     """Return the waiting programs without the seconds, so that a log reports each once."""
-    waiting = (session.plc_status or {}).get("waiting", {})
-    return [f"program {program} has not started; missing {start['reason']}" for program, start in waiting.items()]
+    waiting = session.plc_status.waiting if session.plc_status is not None else {}
+    return [f"program {program} has not started; missing {start.reason}" for program, start in waiting.items()]
 
 
 def forces_text(forces: dict[str, Any]) -> str:
@@ -200,7 +203,7 @@ def forces_text(forces: dict[str, Any]) -> str:
 
 def line(session: RunSession) -> str:
     """Return the state of the run as one line."""
-    gateway, plc = session.gateway_status or {}, session.plc_status or {}
+    gateway, plc = session.gateway_status or {}, session.plc_status
     parts = [f"t={session.elapsed_s:.0f}s"]
     parts += [f"{program}={state}" for program, state in session.states.current.items()]
     for name, device in gateway.get("devices", {}).items():
@@ -209,15 +212,15 @@ def line(session: RunSession) -> str:
     parts.append(f"tags_good={sum(t['quality'] == 'good' for t in tags.values())}/{len(tags)}")
     requests = sum(_requests(bus) for bus in gateway.get("buses", {}).values())
     parts.append(f"requests={requests}")
-    if plc:
-        parts.append(f"scans={plc.get('scans')} late_p99_us={_p99(plc)}")
+    if plc is not None:
+        parts.append(f"scans={plc.scans} late_p99_us={_p99(plc)}")
     parts.append(f"errors={len(session.errors)}")
-    if plc.get("state") == "paused":
+    if plc is not None and plc.state == "paused":
         parts.append("PLC PAUSED")
-    if plc.get("waiting"):
-        parts.append(f"PLC WAITING={','.join(plc['waiting'])}")
-    if plc.get("forces"):
-        parts.append(f"FORCED={','.join(plc['forces'])}")
+    if plc is not None and plc.waiting:
+        parts.append(f"PLC WAITING={','.join(plc.waiting)}")
+    if plc is not None and plc.forces:
+        parts.append(f"FORCED={','.join(plc.forces)}")
     if not gateway.get("plc", {}).get("alive", True):
         parts.append("PLC LOST")
     return " ".join(parts)
@@ -227,8 +230,8 @@ def _requests(bus: dict[str, Any]) -> int:
     return int(bus["counters"].get("requests", 0) or bus["counters"].get("sdo_requests", 0))
 
 
-def _p99(plc: dict[str, Any]) -> str:
-    value = plc.get("lateness_us", {}).get("p99")
+def _p99(plc: PlcStatus) -> str:
+    value = plc.lateness_us.get("p99")
     return "-" if value is None else f"{value:.0f}"
 
 
@@ -315,14 +318,14 @@ def age_text(age_s: float | None) -> str:
 
 
 def _foot(session: RunSession) -> Text:
-    gateway, plc = session.gateway_status or {}, session.plc_status or {}
+    gateway, plc = session.gateway_status or {}, session.plc_status
     text = Text()
-    if plc:
-        late = plc.get("lateness_us", {})
+    if plc is not None:
+        late = plc.lateness_us
         lateness = " ".join(f"{key} {_us(late, key)}" for key in ("p50", "p99", "max"))
         text.append("scan ", "dim")
-        text.append(f"{plc.get('cycle_ms', 0):g} ms  #{plc.get('scans')}  late {lateness}")
-        text.append(f"  missed {plc.get('missed_periods')}  {plc.get('state')}")
+        text.append(f"{plc.cycle_ms:g} ms  #{plc.scans}  late {lateness}")
+        text.append(f"  missed {plc.missed_periods}  {plc.state}")
     elif session.children.get("plc"):
         text.append("PLC: no answer", "bold red")
     for name, box in gateway.get("mailboxes", {}).items():
@@ -372,7 +375,7 @@ def print_summary(summary: dict[str, Any]) -> None:
         data.print(f"  thread         {_thread_text(thread)}", soft_wrap=True, markup=False, highlight=False)
     for name, learnt in summary["learnt"].items():
         data.print(f"  {name:<14} {_learnt_text(learnt, kind)}", soft_wrap=True, markup=False)
-    for text in without_texts(summary["plc"]):
+    for text in without_texts(summary["plc"].get("started_without", {})):
         data.print(f"  [yellow]start[/yellow]          {text}", soft_wrap=True, highlight=False)
     if acts := summary["plc"].get("acts"):
         left = summary["plc"].get("forces")

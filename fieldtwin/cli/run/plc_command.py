@@ -8,12 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import click
+import msgspec
 
 from fieldtwin.cli.options import NegativeNumbers, json_option, profiles_option
 from fieldtwin.cli.output_files import write_text
 from fieldtwin.cli.template_question import consent, trust_option
 from fieldtwin.console import talk
 from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.plc.status import PlcStatus
 from fieldtwin.twin.site.system import System, load_system
 
 instance_option = click.option(
@@ -84,7 +86,7 @@ def status(instance: str, as_json: bool) -> int:
     found = _status(instance, brief=not as_json)
     if as_json:
         return _emit({**found, "tags": tags_as_data(_tags(instance, ()))})
-    print_status(found)
+    print_status(msgspec.convert(found, PlcStatus))
     return 0
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from fieldtwin.console import data, talk
 from fieldtwin.gateway.core.control import ControlClient
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.plc.prove import Proof, Result
+from fieldtwin.plc.status import PlcStatus, RealtimeStatus, WaitingStatus
 from fieldtwin.plc.tag_view import MAX_AT_ONCE, matches
 
 REFRESH_S = 0.25
@@ -140,18 +142,18 @@ async def watch_live(path: Path, patterns: tuple[str, ...]) -> None:
         await client.aclose()
 
 
-def print_status(status: dict[str, Any]) -> None:
-    head = f"{status['state']}"
-    if status["stop_reason"] != "none":
-        head += f" ({status['stop_reason']})"
-    if status["restart_in_ms"] is not None:
-        head += f", restarts in {status['restart_in_ms'] / 1000:.1f} s"
+def print_status(status: PlcStatus) -> None:
+    head = status.state
+    if status.stop_reason != "none":
+        head += f" ({status.stop_reason})"
+    if status.restart_in_ms is not None:
+        head += f", restarts in {status.restart_in_ms / 1000:.1f} s"
     data.print(f"PLC: {head}", markup=False)
-    if status["error"]:
-        data.print(f"  {status['error']}", markup=False, soft_wrap=True)
-    for text in [*waiting_texts(status), *without_texts(status)]:
+    if status.error:
+        data.print(f"  {status.error}", markup=False, soft_wrap=True)
+    for text in [*waiting_texts(status.waiting), *without_texts(status.started_without)]:
         data.print(f"  {text}", style="yellow", markup=False, soft_wrap=True)
-    data.print(f"gateway: {'alive' if status['gateway_alive'] else 'DEAD: every input is bad'}", markup=False)
+    data.print(f"gateway: {'alive' if status.gateway_alive else 'DEAD: every input is bad'}", markup=False)
     table = Table(box=None, pad_edge=False)
     for name in (
         "task",
@@ -168,47 +170,49 @@ def print_status(status: dict[str, Any]) -> None:
     ):
         is_text = name in ("task", "every")
         table.add_column(name, justify="left" if is_text else "right", no_wrap=not is_text, overflow="fold")
-    for name, task in status["tasks"].items():
-        late, took = task["lateness_us"], task["duration_us"]
-        every = f"on {task['single']}" if task["single"] else f"{task['cycle_ms']:g} ms"
+    for name, task in status.tasks.items():
+        late, took = task.lateness_us, task.duration_us
+        every = f"on {task.single}" if task.single else f"{task.cycle_ms:g} ms"
         table.add_row(
-            name, every, str(task["scans"]), str(task["missed_periods"]), str(task["overruns"]),
+            name, every, str(task.scans), str(task.missed_periods), str(task.overruns),
             *(_us(late[k]) for k in ("p50", "p99", "max")), *(_us(took[k]) for k in ("p50", "p99", "max")),
         )  # fmt: skip
     _print_table(table)
-    data.print(f"restarts: {status['restarts']}; {status['retain']['start']}", markup=False)
-    granted, refused = status["realtime"]["granted"], status["realtime"]["refused"]
-    data.print("granted: " + (", ".join(granted) or "nothing"), markup=False, soft_wrap=True)
-    if refused:
-        data.print("refused: " + ", ".join(f"{k} ({v})" for k, v in refused.items()), markup=False, soft_wrap=True)
-    counters = {name: count for name, count in status["counters"].items() if count}
+    data.print(f"restarts: {status.restarts}; {status.retain.start}", markup=False)
+    realtime = status.realtime or RealtimeStatus()
+    data.print("granted: " + (", ".join(realtime.granted) or "nothing"), markup=False, soft_wrap=True)
+    if realtime.refused:
+        data.print(
+            "refused: " + ", ".join(f"{k} ({v})" for k, v in realtime.refused.items()), markup=False, soft_wrap=True
+        )
+    counters = {name: count for name, count in status.counters.items() if count}
     if counters:
         data.print("counted: " + ", ".join(f"{n} {c}" for n, c in counters.items()), markup=False)
-    if status["acts"]:
-        data.print("done to it: " + acts_text(status["acts"]), markup=False)
-    if status["forces"]:
-        data.print(f"FORCED: {len(status['forces'])}", style="yellow")
-        for tag, force in status["forces"].items():
+    if status.acts:
+        data.print("done to it: " + acts_text(status.acts), markup=False)
+    if status.forces:
+        data.print(f"FORCED: {len(status.forces)}", style="yellow")
+        for tag, force in status.forces.items():
             by = f" by {force['by']}" if force["by"] else ""
             data.print(f"  {tag} = {force['value']}{by}, {_age(force['age_ms'])} ago", style="yellow", markup=False)
     else:
         data.print("nothing is forced")
 
 
-def waiting_texts(plc: dict[str, Any]) -> list[str]:
+def waiting_texts(waiting: Mapping[str, WaitingStatus]) -> list[str]:
     """Return one line for each program that has not started: its missing inputs, the time waited, the timeout's effect."""
     return [
-        f"WAITING: program {program} starts after its inputs have been good once; missing {start['reason']}; "
-        f"{start['since_s']:.0f} s so far, {AT_TIMEOUT[start['at_timeout']].format(start['timeout_s'])}"
-        for program, start in plc.get("waiting", {}).items()
+        f"WAITING: program {program} starts after its inputs have been good once; missing {start.reason}; "
+        f"{start.since_s:.0f} s so far, {AT_TIMEOUT[start.at_timeout].format(start.timeout_s)}"
+        for program, start in waiting.items()
     ]
 
 
-def without_texts(plc: dict[str, Any]) -> list[str]:
+def without_texts(started_without: Mapping[str, Mapping[str, str]]) -> list[str]:
     """Return one line for each program that started although inputs were missing."""
     return [
         f"program {program} started without " + ", ".join(f"{tag} ({reason})" for tag, reason in missing.items())
-        for program, missing in plc.get("started_without", {}).items()
+        for program, missing in started_without.items()
     ]
 
 

@@ -29,6 +29,7 @@ from fieldtwin.gateway.core.errors import ConnectionLost, FieldtwinError, Unreac
 from fieldtwin.gateway.core.image.image import OUTPUTS
 from fieldtwin.gateway.core.image.region import RegionReader
 from fieldtwin.gateway.wallclock import WallClock
+from fieldtwin.plc.status import PlcStatus
 from fieldtwin.results.fault_counts import struck_of
 from fieldtwin.results.model import Struck
 from fieldtwin.results.trace import FAR_END, Event, Kind, Trace, refusal_data
@@ -453,13 +454,14 @@ class ControlBench(Started):
     async def _ask_plc(self) -> None:
         """Query the lateness of scans since the last query: a new maximum, or an overrun of the limit."""
         assert self._plc is not None
-        told = await self._plc.call("get", brief=True)
+        told = await self._plc.ask("get", PlcStatus, brief=True)
         self._stopped = self._what_stopped(told)
-        waiting = told.get("waiting", {})  # an older PLC has none
-        self._not_started = "; ".join(f"program {name} waits for {start['reason']}" for name, start in waiting.items())
-        tasks = told["tasks"].values()
-        worst_us = max(task["lateness_us"]["max"] for task in tasks)
-        overruns = sum(task["overruns"] for task in tasks)
+        self._not_started = "; ".join(
+            f"program {name} waits for {start.reason}" for name, start in told.waiting.items()
+        )
+        tasks = told.tasks.values()
+        worst_us = max(task.lateness_us["max"] for task in tasks)
+        overruns = sum(task.overruns for task in tasks)
         if self._overruns >= 0:
             limit_ms = float(self.system.plc.watchdog.late_ms) if overruns > self._overruns else 0.0
             self._late_ms = max(worst_us / 1000 if worst_us > self._worst_us else 0.0, limit_ms)
@@ -470,20 +472,20 @@ class ControlBench(Started):
         if self._field is not None:
             await self._field.call("ready")  # raises if the field simulator is gone
 
-    def _what_stopped(self, told: dict[str, Any]) -> Stopped | None:
+    def _what_stopped(self, told: PlcStatus) -> Stopped | None:
         """Return the stopped part according to the PLC's status: the PLC itself, or the gateway, whose heartbeat it monitors."""
         starting = self.now_s() < STARTING_S
-        state, late_s = told["state"], float(self.system.plc.watchdog.late_ms) / 1000
+        state, late_s = told.state, float(self.system.plc.watchdog.late_ms) / 1000
         if state == "stopped":
-            watchdog = told["stop_reason"] == "watchdog"
-            what = f"the PLC stopped ({told['stop_reason']}): {told['error'] or 'on request'}"
-            return Stopped("plc", what, told.get("error_at", ""), late_s if watchdog else 0.0)
+            watchdog = told.stop_reason == "watchdog"
+            what = f"the PLC stopped ({told.stop_reason}): {told.error or 'on request'}"
+            return Stopped("plc", what, told.error_at, late_s if watchdog else 0.0)
         if state == "paused" or (state == "ready" and not starting):
             return Stopped("plc", "the PLC is paused" if state == "paused" else "the PLC was not started")
-        if state == "waiting" and told["error"]:  # its time is over
-            return Stopped("plc", told["error"])
-        self._gateway_seen |= told["gateway_alive"]
-        if told["gateway_alive"] or (starting and not self._gateway_seen):
+        if state == "waiting" and told.error:  # its time is over
+            return Stopped("plc", told.error)
+        self._gateway_seen |= told.gateway_alive
+        if told.gateway_alive or (starting and not self._gateway_seen):
             return None
         what = "the PLC does not see the gateway's heartbeat"
         return Stopped("gateway", what, bound_s=gateway_lost_ms(self.system) / 1000)

@@ -11,6 +11,7 @@ from typing import Any
 
 from fieldtwin.gateway.core.control import ControlClient
 from fieldtwin.gateway.core.errors import ReplyTimeout
+from fieldtwin.plc.status import PlcStatus
 from fieldtwin.run.benches.field_lease import FieldLease
 
 BY = "fieldtwin test, start: fresh"
@@ -44,7 +45,11 @@ async def programs_scan(plc: ControlClient) -> None:
     """
     loop = asyncio.get_running_loop()
     deadline_s = loop.time() + SCANS_WITHIN_S
-    while (await plc.call("get", brief=True))["state"] in ("ready", "paused", "waiting") and loop.time() < deadline_s:
+    while (await plc.ask("get", PlcStatus, brief=True)).state in (
+        "ready",
+        "paused",
+        "waiting",
+    ) and loop.time() < deadline_s:
         await asyncio.sleep(LOOK_EVERY_S)
 
 

@@ -24,6 +24,7 @@ from fieldtwin.gateway.core.control import ControlClient, OtherVersion
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import FieldtwinError, ReplyTimeout, Unreachable, UsageError
 from fieldtwin.gateway.wallclock import WallClock
+from fieldtwin.plc.status import PlcStatus
 from fieldtwin.results.trace import Trace
 from fieldtwin.run.live.options import RunOptions
 from fieldtwin.run.live.oracle import Oracle
@@ -106,7 +107,7 @@ class RunSession(Started):
         self.states = StateWatch(self.system)
         self.shore: Shore | None = None
         self.gateway_status: dict[str, Any] | None = None
-        self.plc_status: dict[str, Any] | None = None
+        self.plc_status: PlcStatus | None = None
         self.field_status: FieldStatus | None = None
         self.outputs_confirmed_safe: bool | None = None
         self.thread_place = ""
@@ -422,7 +423,9 @@ class RunSession(Started):
     async def refresh(self) -> None:
         """Ask every process for its status."""
         self.gateway_status = await self._get(self._clients.get("gateway"), "gateway")
-        self.plc_status = await self._get(self._clients.get("plc"), "plc", brief=True)
+        self.plc_status = await self._answer(
+            self._clients.get("plc"), "plc", lambda c: c.ask("get", PlcStatus, ANSWERS_WITHIN_S, brief=True)
+        )
         await self._refresh_field()
         for name, status in (("gateway", self.gateway_status), ("plc", self.plc_status)):
             if status is not None:

@@ -6,8 +6,11 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import msgspec
+
 from fieldtwin.__about__ import __version__
 from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.plc.status import PlcStatus
 from fieldtwin.plc.task import StopReason
 from fieldtwin.results.trace import refusal_text
 from fieldtwin.run.processes.states import SeenStates, expected_states
@@ -34,7 +37,7 @@ class RunFacts:
     """The errors that the run noted while it ran."""
     gateway: Mapping[str, Any] | None
     """The last status of the gateway; None if it did not answer at the end. `plc` and `field` likewise."""
-    plc: Mapping[str, Any] | None
+    plc: PlcStatus | None
     field: FieldStatus | None
     counted_before: Mapping[str, Mapping[str, int]]
     """Per device, the requests and replies that its emulator had counted before the run; `clients_before` per bus and client."""
@@ -72,7 +75,7 @@ NOT_CALM = "whether devices and outputs were good at the end, because faults wer
 
 def summarise(run: RunFacts) -> dict[str, Any]:
     """Return plain data for `--json` and for printing. `ok` is False when any check failed; `errors` lists the reasons."""
-    gateway, plc, field = run.gateway or {}, run.plc or {}, run.field
+    gateway, plc, field = run.gateway or {}, run.plc, run.field
     exchanges = _exchanges(run)
     checks = [*_plc_checks(plc), *_loss_checks(gateway)]
     if run.gateway is None:
@@ -82,6 +85,7 @@ def summarise(run: RunFacts) -> dict[str, Any]:
         checks = [*_device_checks(gateway, disturbed), *_output_checks(gateway), *checks]
     if run.prototype:
         checks += _published_checks(run) + ([] if run.disturbed else exchange_checks(exchanges) + _state_checks(run))
+    told = msgspec.to_builtins(plc) if plc is not None else {}
     refusals = gateway.get("refusals", {})
     checks += _refusal_checks(refusals, run.may_refuse, disturbed=disturbed)
     errors = [*run.errors, *run.invariant_errors, *checks]
@@ -111,7 +115,7 @@ def summarise(run: RunFacts) -> dict[str, Any]:
         "invariants": list(run.invariants),
         "outputs_safe": run.outputs_confirmed_safe,
         "plc": {
-            k: plc[k]
+            k: told[k]
             for k in (
                 "state",
                 "stop_reason",
@@ -127,7 +131,7 @@ def summarise(run: RunFacts) -> dict[str, Any]:
                 "waiting",
                 "started_without",
             )
-            if k in plc
+            if told.get(k) is not None
         },
         "tags": gateway.get("tags", {}),
         "errors": errors,
@@ -290,20 +294,18 @@ def _refusal_checks(refusals: Mapping[str, Any], expected: Collection[str], *, d
     return told
 
 
-def _plc_checks(plc: Mapping[str, Any]) -> list[str]:
-    if not plc:
+def _plc_checks(plc: PlcStatus | None) -> list[str]:
+    if plc is None:
         return []  # its death is in the run's errors already
     # A stopped PLC still lists the programs that never ran.
     failed = [
-        f"PLC: program {program} has not started: it waits for {start['reason']}"
-        for program, start in plc.get("waiting", {}).items()
+        f"PLC: program {program} has not started: it waits for {start.reason}" for program, start in plc.waiting.items()
     ]
-    stops = plc.get("stops", {"count": 0})
-    if stops["count"]:
-        times = "once" if stops["count"] == 1 else f"{stops['count']} times"
-        failed.append(f"PLC: stopped by itself {times}, and began again after that; the last time: {stops['last']}")
-    error = plc.get("error")
-    told = failed and (plc.get("state") == "waiting" or plc.get("stop_reason") == StopReason.NOT_STARTED.value)
+    if plc.stops.count:
+        times = "once" if plc.stops.count == 1 else f"{plc.stops.count} times"
+        failed.append(f"PLC: stopped by itself {times}, and began again after that; the last time: {plc.stops.last}")
+    error = plc.error
+    told = failed and (plc.state == "waiting" or plc.stop_reason == StopReason.NOT_STARTED.value)
     return [f"PLC: {error}", *failed] if error and not told else failed
 
 

@@ -22,6 +22,7 @@ from fieldtwin.gateway.core.values import Quality, TagValue
 from fieldtwin.gateway.runtime.buses.learnt_gaps import describe_learnt
 from fieldtwin.gateway.runtime.gateway import stale_limits
 from fieldtwin.gateway.runtime.status import describe
+from fieldtwin.plc.status import PlcStatus
 from fieldtwin.results.trace import Event, Kind
 from fieldtwin.run.benches.invariant_watch import InvariantWatch
 from fieldtwin.run.benches.virtual_bench import VirtualBench
@@ -102,7 +103,7 @@ class VirtualRun(DrivenRun):
         """The invariants that this run checks; a scenario checks the invariants itself."""
         self._stated = InvariantWatch(self.system)
         self.gateway_status: dict[str, Any] | None = None
-        self.plc_status: dict[str, Any] | None = None
+        self.plc_status: PlcStatus | None = None
         self.field_status: FieldStatus | None = None
         self.may_refuse: tuple[str, ...] = ()
         """Tags of which a scenario expects that their outputs are refused."""
@@ -291,7 +292,7 @@ class VirtualRun(DrivenRun):
             "learnt": describe_learnt(gateway.drivers.values()),
             "store_error": "",
         }
-        self.plc_status = {**plc.describe(), "gateway_alive": plc.gateway_alive, "counters": plc.counters()}
+        self.plc_status = plc.status()
         self.field_status = bench.run.field.status()
 
     def summary(self) -> dict[str, Any]:

@@ -1,7 +1,8 @@
 """The files of a PLC's programs, and which of them changed since the PLC read them.
 
-Structured Text is read again at each restart of the programs; a Python module only when the process starts. Modules
-that a module imports are not checked. This module must not know what a program does.
+Structured Text is read again at each restart of the programs; a Python module only when the process starts. The modules that
+were imported from the folder of a program's file, or from a folder in it, count as files of the program. This module must
+not know what a program does.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
+from sysconfig import get_paths
 from typing import Any
 
 from fieldtwin.plc.binding import BoundProgram
@@ -42,7 +44,22 @@ def sources(programs: Sequence[BoundProgram], before: Sequence[Source] = ()) -> 
         path = made.source_path or getattr(sys.modules.get(made.__module__), "__file__", None) or ""
         digest = imported.get(path) or _digest(path)
         found.append(Source(bound.name, path, digest, bool(made.source_path)))
+        if path and not made.source_path:
+            found += [Source(bound.name, p, imported.get(p) or _digest(p), False) for p in _beside(path)]
     return found
+
+
+def _beside(path: str) -> list[str]:
+    """Return the files of the imported modules in the folder of the module `path`, or in a folder in it, except libraries'."""
+    folder, libraries = Path(path).resolve().parent, tuple(Path(p).resolve() for p in {*get_paths().values()})
+    files = {getattr(module, "__file__", None) for module in list(sys.modules.values())} - {None, path}
+    return sorted(
+        file
+        for file in files
+        if isinstance(file, str)
+        and (at := Path(file).resolve()).is_relative_to(folder)
+        and not any(at.is_relative_to(library) and not folder.is_relative_to(library) for library in libraries)
+    )
 
 
 def changed(known: Sequence[Source]) -> list[Source]:

@@ -3,6 +3,7 @@ PLC."""
 
 from __future__ import annotations
 
+import importlib
 from pathlib import Path
 
 import click
@@ -116,6 +117,22 @@ def test_inputs_are_good_again_after_a_restart(tmp_path: Path) -> None:
     rig.runner.restart()
     rig.until(200)
     assert rig.runner.input("d.n").quality is Quality.GOOD
+
+
+def test_a_changed_module_that_a_program_imports_from_its_folder_is_known(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Defect: `reload` ignored it, and the PLC went on with the old module."""
+    helper = tmp_path / "gains_of_the_pump.py"
+    helper.write_text("GAIN = 1\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    importlib.import_module("gains_of_the_pump")
+    rig = Rig(tmp_path, FAST_AND_SLOW, ("Fast", "Slow"))
+    assert changed(rig.runner.sources) == []
+    helper.write_text("GAIN = 2\n")
+    assert [(s.program, Path(s.path).name) for s in changed(rig.runner.sources)] == [
+        ("fast", helper.name), ("slow", helper.name),
+    ]  # fmt: skip
 
 
 def test_a_program_file_that_changed_is_known(tmp_path: Path) -> None:

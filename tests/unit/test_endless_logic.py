@@ -9,7 +9,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -18,12 +17,11 @@ from st_bench import program, run, scan
 from fieldtwin.gateway.core.image.image import INPUTS
 from fieldtwin.plc.binding import image_for
 from fieldtwin.plc.config import PlcConfig, ProgramConfig
-from fieldtwin.plc.program import ProgramFailed, ProgramStuck, ScanStuck, ScanTooLong
+from fieldtwin.plc.program import ProgramFailed, ProgramStuck, ScanTooLong
 from fieldtwin.plc.prove import Proof, prove
 from fieldtwin.plc.runner import Runner
 from fieldtwin.plc.st.resource import MAX_STEPS
 from fieldtwin.plc.task import StopReason
-from fieldtwin.plc.watchdog import ScanWatchdog
 from fieldtwin.testing.worker.stepped_program import SteppedProgram
 
 ENDLESS = {
@@ -83,70 +81,6 @@ def test_a_test_that_steps_a_program_fails_with_file_and_line(tmp_path: Path) ->
 def test_the_prover_reports_it() -> None:
     proof = Proof(lambda: program(f"{HEAD}{ENDLESS['WHILE']} END_PROGRAM"), {}, {"any": lambda p: True})
     assert "loop iterations and calls in one scan" in prove(proof).broken
-
-
-PYTHON = """
-from fieldtwin.gateway.core.image.image import TagKind
-from fieldtwin.plc.program import Program, ScanInfo, var_output
-
-class Spins(Program):
-    n = var_output(TagKind.INT, initial=0)
-
-    def execute(self, scan: ScanInfo) -> None:
-        while True:
-            try:
-                self.n += 1
-            except Exception:
-                pass
-"""
-
-
-def test_endless_python_logic_under_virtual_time_ends_after_a_limit_of_real_time(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Defect: only a signal ended it."""
-    (tmp_path / "spins_for_ever.py").write_text(PYTHON)
-    monkeypatch.syspath_prepend(tmp_path)
-    config = ProgramConfig("p", "python: spins_for_ever:Spins")
-    layout = image_for([config.bind((str(tmp_path),))], {})
-    memory = memoryview(bytearray(layout.size))
-    layout.format(memory)
-    image = layout.attach(memory)
-    image.writer(INPUTS).publish([], 0)
-    now = [0]
-    plc = PlcConfig("", layout.describe(), "", (config,), python_path=(str(tmp_path),), max_restarts=0)
-    watchdog = ScanWatchdog(0.2)
-    try:
-        runner = Runner(plc, image, lambda: now[0], watchdog)
-        runner.start()
-        now[0] = runner.deadline_ns
-        runner.run_once()
-    finally:
-        watchdog.close()
-    assert runner.stop_reason is StopReason.STUCK
-    assert isinstance(runner.error, ProgramStuck)
-    assert str(tmp_path / "spins_for_ever.py") in str(runner.error)
-    assert 9 <= runner.error.line <= 13
-    assert "0.2 s of real time and no end" in str(runner.error)
-
-
-def _spin(watchdog: ScanWatchdog) -> None:
-    watchdog.arm()
-    while True:
-        pass
-
-
-def test_a_watchdog_raises_nothing_after_the_scan() -> None:
-    watchdog = ScanWatchdog(0.05)
-    try:
-        with pytest.raises(ScanStuck):
-            _spin(watchdog)
-        watchdog.disarm()
-        end = time.monotonic() + 0.3
-        while time.monotonic() < end:
-            pass
-    finally:
-        watchdog.close()
 
 
 SPINS = """

@@ -29,7 +29,6 @@ from fieldtwin.gateway.store.exchange_log import ExchangeLog
 from fieldtwin.plc.publishing import Change
 from fieldtwin.plc.runner import Runner
 from fieldtwin.plc.task import run_on_clock
-from fieldtwin.plc.watchdog import LIMIT_S, ScanWatchdog
 from fieldtwin.twin.plant.mapping import MappedConnector, mapped_endpoint
 from fieldtwin.twin.plant.physical import plc_config
 from fieldtwin.twin.prototype.field import FieldSide
@@ -118,10 +117,9 @@ class VirtualPrototype(Started):
             true_silences=True,
             listen=self.net.listen_for_clients,
         )
-        config = plc_config(self.system, self._run_dir)
-        watchdog = ScanWatchdog(max(LIMIT_S, config.stuck_ms / 1000))
-        self._stack.callback(watchdog.close)
-        self.plc = Runner(config, for_plc, clock.monotonic_ns, watchdog, on_change=self._on_change)
+        self.plc = Runner(
+            plc_config(self.system, self._run_dir), for_plc, clock.monotonic_ns, on_change=self._on_change
+        )
         self._stack.callback(self.plc.close)
         self.gateway.outputs.journal.on_new = self._refused
         if self._prepare is not None:

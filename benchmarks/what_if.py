@@ -48,7 +48,7 @@ def main() -> int:
             traced.append(faster(path, 600.0)[0])
     seconds = median(took) * HORIZON_S / horizon_s
     print(
-        f"6 h ahead, sampling each second: {seconds:.1f} s, {HORIZON_S / seconds:.0f} times as fast as time; "
+        f"6 h ahead, sampling each second: {seconds:.1f} s, {HORIZON_S / seconds:.0f} times real time; "
         f"a run in standby, traced and judged: {median(traced):.0f} times"
     )
     goals.most("what-if, 6 h of the observatory at 100 ms", seconds, GOAL_S, "s")

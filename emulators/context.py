@@ -233,7 +233,7 @@ class VirtualContext:
             return self._remove(series)
         if series.last is not None and series.when_used_up is WhenUsedUp.HOLD:
             return series.last
-        raise UsedUp(f"nothing is left of what was recorded for command {command.data.hex(' ')}")
+        raise UsedUp(f"the recording has no further entry for command {command.data.hex(' ')}")
 
     def _remove(self, series: _Series) -> Recorded:
         recorded = series.take()

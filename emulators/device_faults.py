@@ -92,7 +92,7 @@ def check_device(spec: FaultSpec, profile: DeviceProfile | None, *, values: bool
             hint="--values makes its registers from its profile",
         )
     if kind is Kind.VALUE and tag is not None and tag.is_text:
-        raise WrongAim("register", f"{tag.name} is no number", expected="a tag that is one")
+        raise WrongAim("register", f"{tag.name} is not a number", expected="a tag that is one")
     if profile is not None:
         check_fault(spec.make(), aim.register_, profile.tags.values())
     _place(aim, profile)

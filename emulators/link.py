@@ -54,7 +54,7 @@ class EmulatedConnection(TCPConnection):
 
     def __init__(self, protocol: PROTOCOL) -> None:
         if protocol is PROTOCOL.CAN:
-            raise Bug("CAN is a bus and no pipe", expected="a software CAN bus (SPEC ruling 13)")
+            raise Bug("CAN is a bus, not a pipe", expected="a software CAN bus (SPEC ruling 13)")
         super().__init__()
         self.protocol = protocol
         self.written_bytes = 0
@@ -334,7 +334,7 @@ class Link:
                     await target.write(data)
                 delivered = True
             except TimeoutError:
-                self._event(f"nobody takes the bytes on {target.endpoint}: {len(data)} lost")
+                self._event(f"no program reads the bytes on {target.endpoint}: {len(data)} lost")
             except Unreachable as e:
                 return e
             finally:

@@ -190,7 +190,7 @@ class SignalPlayer(Signals):
         if t_s <= last:
             return t_s
         if self.at_end is WhenUsedUp.ERROR:
-            raise UsedUp("the recording is played out", path=self.track.path, got=f"{t_s:.3f} s of {last:.3f} s")
+            raise UsedUp("the recording has ended", path=self.track.path, got=f"{t_s:.3f} s of {last:.3f} s")
         if self.at_end is WhenUsedUp.LOOP and last > first:
             return first + math.fmod(t_s - first, last - first)
         return last

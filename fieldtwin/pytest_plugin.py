@@ -38,13 +38,18 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         "--fieldtwin-command",
         default="",
         metavar="CMD",
-        help="what runs fieldtwin, such as /opt/fieldtwin/bin/fieldtwin; default: FIELDTWIN_COMMAND, else this Python",
+        help="command that runs fieldtwin, such as /opt/fieldtwin/bin/fieldtwin; default: FIELDTWIN_COMMAND, else this Python",
     )
-    group.addoption("--fieldtwin-target", default="", metavar="TARGET", help="where scenarios run; default: virtual")
-    group.addoption("--fieldtwin-seed", type=int, default=None, metavar="N", help="another seed for all that has one")
-    group.addoption("--fieldtwin-trust", action="store_true", help="run what is inside of a stranger's template, too")
     group.addoption(
-        "--fieldtwin-html", default="", metavar="FILE", help="one page with verdicts and the requirement matrix"
+        "--fieldtwin-target", default="", metavar="TARGET", help="target on which scenarios run; default: virtual"
+    )
+    group.addoption("--fieldtwin-seed", type=int, default=None, metavar="N", help="seed for all scenarios and faults")
+    group.addoption("--fieldtwin-trust", action="store_true", help="also run code from templates")
+    group.addoption(
+        "--fieldtwin-html",
+        default="",
+        metavar="FILE",
+        help="write an HTML page with verdicts and the requirement matrix to this file",
     )
     parser.addini("fieldtwin_scenarios", f"collect *{SUFFIX} as tests", type="bool", default=True)
     parser.addini("fieldtwin_profiles", "folders with devices/ and systems/", type="paths", default=[])
@@ -100,7 +105,7 @@ def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestR
         try:
             seen = [str(e) for wire in wires for e in wire.exchanges(strays=True)]
         except (FieldtwinRefused, FieldtwinUnavailable) as e:
-            seen = [f"not to be had: {e}"]
+            seen = [f"not available: {e}"]
         left_out = [f"({len(seen) - _SHOWN} before)"] if len(seen) > _SHOWN else []
         report.sections.append(("on the wire", "\n".join(left_out + seen[-_SHOWN:]) or "nothing"))
     if report.failed and report.when == "call":
@@ -196,7 +201,7 @@ def prototype(request: pytest.FixtureRequest) -> Iterator[Prototype]:
 
     said, runner = _said(request), _runner(request.config)
     if "system" not in said:
-        pytest.fail('which system? @pytest.mark.fieldtwin(system="observatory")', pytrace=False)
+        pytest.fail('the system is missing: @pytest.mark.fieldtwin(system="observatory")', pytrace=False)
     keys = ("system", "prototype", "recordings", "speed", "listen", "seed")
     args = {"seed": request.config.getoption("--fieldtwin-seed"), **{key: said[key] for key in keys if key in said}}
     answer = _or_fail(lambda: runner.call("system", **_places(request), **args))
@@ -230,7 +235,9 @@ def plc(request: pytest.FixtureRequest) -> Iterator[Plc | RunningPlc]:
         yield _or_fail(lambda: RunningPlc(runner, whole.id, places["profiles"]))
         return  # it ends with the field side
     if "plc" not in said:
-        pytest.fail('which program? @pytest.mark.fieldtwin(plc="pump.st"), or system="observatory"', pytrace=False)
+        pytest.fail(
+            'the program is missing: @pytest.mark.fieldtwin(plc="pump.st"), or system="observatory"', pytrace=False
+        )
     folders = (str(request.node.path.parent),)
     made: Plc = _or_fail(
         lambda: Plc(runner, said["plc"], folders, said.get("cycle_ms", 10.0), system=said.get("system", ""))

@@ -22,7 +22,7 @@ from fieldtwin.plc.program import Program, Role, Variable
 if TYPE_CHECKING:
     from fieldtwin.plc.st.program import StProgram
 
-_SOURCES = "python: module:Class, or FILE.st, or FILE.xml, each with :PROGRAM behind it where it has several"
+_SOURCES = "python: module:Class, or FILE.st, or FILE.xml, followed by :PROGRAM if it has several"
 _ST_SUFFIXES = (".st", ".xml")
 
 
@@ -80,7 +80,7 @@ def load_program(source: str, python_path: Sequence[str] = (), together: dict[An
     except FieldtwinError:
         raise
     except Exception as e:  # the constructor is the user's code: it can raise any error, which is translated here, once
-        raise FileInvalid(f"program {source!r} cannot be made: {type(e).__name__}: {e}") from e
+        raise FileInvalid(f"program {source!r} cannot be created: {type(e).__name__}: {e}") from e
 
 
 def _python_class(source: str, rest: str, python_path: Sequence[str]) -> type[Program]:

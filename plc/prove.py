@@ -136,7 +136,7 @@ def prove(proof: Proof, max_states: int = MAX_STATES, max_depth: int = 10_000) -
     while waiting:
         point = waiting.popleft()
         if point.number >= max_depth:
-            return Result(len(seen), transitions, depth, complete=False, reason=f"more than {max_depth} scans deep")
+            return Result(len(seen), transitions, depth, complete=False, reason=f"deeper than {max_depth} scans")
         depth = max(depth, point.number + 1)
         for given in choices:
             following = point.after(given)
@@ -192,7 +192,7 @@ def _tested(proof: Proof, choices: Sequence[Given], seen: set[Hashable], whole: 
             if broken := _broken(proof, point, given):
                 return Result(whole.states, whole.transitions, len(way), False, broken, tuple(way))
             if _key(proof, point) not in seen:
-                reason = "the key leaves out what decides: two states with one key go on differently"
+                reason = "the key omits a deciding variable: two states with the same key continue differently"
                 return Result(whole.states, whole.transitions, whole.depth, complete=False, reason=reason)
     return whole
 

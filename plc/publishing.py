@@ -135,7 +135,7 @@ class OutputImage:
                 self.consumed.append(spec.name.removesuffix(consumed_name("")))
                 continue
             if self.consumed:
-                raise FileInvalid(f"{spec.name} stands behind the consumed tags", expected="a layout of process_image")
+                raise FileInvalid(f"{spec.name} comes after the consumed tags", expected="a layout of process_image")
             bound, variable = made[spec.name]
             source = Output(bound, variable, spec, index)
             self.outputs.append(source)

@@ -137,7 +137,7 @@ def _freeze_heap() -> None:
 def _promote(priority: int) -> None:
     _need_linux()
     if priority <= 0:
-        raise OSError(errno.EPERM, "not asked for")
+        raise OSError(errno.EPERM, "not requested")
     os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
 
 

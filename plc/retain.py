@@ -102,7 +102,7 @@ class RetainFile:
             if magic != _MAGIC or size != cls._size(capacity):
                 raise FileInvalid("not a file of retained variables", path=str(path))
             if kept != layout:
-                raise FileInvalid("the retained variables are those of another program", path=str(path))
+                raise FileInvalid("the retained variables belong to a different program", path=str(path))
             return cls(path, mmap.mmap(descriptor, size), capacity)
         finally:
             os.close(descriptor)
@@ -154,12 +154,14 @@ class RetainFile:
         try:
             data = msgspec.msgpack.encode(values)
         except (TypeError, OverflowError, msgspec.MsgspecError) as e:
-            raise RetainFull(f"a retained variable holds what cannot be kept: {e}", where=str(self.path)) from e
+            raise RetainFull(
+                f"a retained variable holds a value that cannot be retained: {e}", where=str(self.path)
+            ) from e
         if data == self._last:
             return False
         if len(data) > self._capacity:
             raise RetainFull(
-                "the retained variables take more than their file has",
+                "the retained variables need more room than their file has",
                 expected=f"at most {self._capacity} bytes", got=str(len(data)), where=str(self.path),
             )  # fmt: skip
         counter = self._counter + 1

@@ -108,7 +108,8 @@ class Runner:
         for new, old in zip(programs, self.programs, strict=False):
             if _interface(new) != _interface(old):
                 raise FileInvalid(
-                    f"program {new.name} has other variables than the one that runs", hint="stop the system and run it"
+                    f"program {new.name} has different variables from the running one",
+                    hint="stop the system and run it",
                 )
         return programs
 
@@ -153,14 +154,14 @@ class Runner:
         tags = {tag.name for region in self._image.layout.regions for tag in region.tags}
         for n, spec in enumerate(specs):
             if spec.name in names[:n]:
-                raise FileInvalid(f"task {spec.name} is there twice")
+                raise FileInvalid(f"task {spec.name} is defined twice")
             if bool(spec.single) == (spec.interval_ms > 0):
                 raise FileInvalid(f"task {spec.name}", expected="an interval above 0, or a trigger (single)")
             if spec.single and spec.single not in tags:
                 raise FileInvalid(f"the trigger of task {spec.name} does not exist", got=spec.single)
         if all(s.single for s in specs):
             raise FileInvalid(
-                "only SINGLE tasks", expected="at least one with an interval, which looks at their triggers"
+                "only SINGLE tasks", expected="at least one task with an interval, which checks their triggers"
             )
         for p in self.config.programs:
             if p.task and p.task not in names:

@@ -183,10 +183,8 @@ def _compiled(cls: type[Program], transition: Transition) -> CodeType | None:
     try:
         code = compile(transition.when, f"<{where}>", "eval")
     except SyntaxError as e:
-        raise Bug(f"a guard that is no expression: {e.msg}", got=transition.when, where=where) from e
+        raise Bug(f"a guard that is not an expression: {e.msg}", got=transition.when, where=where) from e
     unknown = [n for n in code.co_names if n not in cls.variables and n not in _SAFE and n != "in_state_ms"]
     if unknown:
-        raise Bug(
-            "a guard that names no variable", got=", ".join(unknown), expected=", ".join(cls.variables), where=where
-        )
+        raise Bug("a guard without a variable", got=", ".join(unknown), expected=", ".join(cls.variables), where=where)
     return code

@@ -183,7 +183,7 @@ def _check_lists(sections: dict[str, Section], objects: dict[int, DictionaryObje
     unlisted = [index for index in objects if listed and index not in listed and f"{index:04x}" in sections]
     if unlisted:
         names = ", ".join(f"{index:04X}h" for index in unlisted[:_NAMED]) + (", ..." if len(unlisted) > _NAMED else "")
-        sections[f"{unlisted[0]:04x}"].note(f"{len(unlisted)} objects are described and in no list: {names}")
+        sections[f"{unlisted[0]:04x}"].note(f"{len(unlisted)} objects are described, but not listed: {names}")
     for index, found in objects.items():
         own = sections.get(f"{index:04x}")
         if own is None:
@@ -316,7 +316,7 @@ def _read_default(section: Section, data_type: int, value_text: str) -> tuple[by
         try:
             return *_value(data_type, text), key != "DefaultValue"
         except ValueError:
-            section.note(f"{key} of [{section.name}] is no value of data type {data_type:04X}h: {text[:40]}", key)
+            section.note(f"{key} of [{section.name}] is not a value of data type {data_type:04X}h: {text[:40]}", key)
     return codec.encode_text(data_type, ""), False, False
 
 
@@ -358,5 +358,5 @@ def _limit(section: Section, key: str, data_type: int) -> int | float | None:
             raise ValueError("no value is above or below it")
         return limit
     except ValueError:
-        section.note(f"{key} of [{section.name}] is no number of its type, left out: {text[:40]}", key)
+        section.note(f"{key} of [{section.name}] is not a number of its type, left out: {text[:40]}", key)
         return None

@@ -60,7 +60,7 @@ class Section:
             return parse_number(text)
         except ValueError:
             raise FileInvalid(
-                f"{key} of [{self.name}] is no number", path=self.path, line=line, expected="a number", got=text
+                f"{key} of [{self.name}] is not a number", path=self.path, line=line, expected="a number", got=text
             ) from None
 
     def count(self, key: str) -> int:
@@ -68,7 +68,7 @@ class Section:
         try:
             return self.number(key, 0)
         except FileInvalid:
-            self.note(f"{key} of [{self.name}] is no number, left out", key)
+            self.note(f"{key} of [{self.name}] is not a number, left out", key)
             return 0
 
     def note(self, text: str, key: str = "") -> None:
@@ -134,7 +134,7 @@ def parse_sections(text: str, path: str = "", notes: list[Note] | None = None) -
                 raise FileInvalid(f"{key} is given twice in [{current.name}]", path=path, line=number)
             notes.append(Note(number, f"{key} of [{current.name}] is given twice, the last one counts"))
         if bare != value.strip():
-            notes.append(Note(number, f"a comment behind the value of {key} in [{current.name}] is left out"))
+            notes.append(Note(number, f"a comment after the value of {key} in [{current.name}] is left out"))
         current.values[key] = (bare, number)
     return sections
 

@@ -119,11 +119,11 @@ def _without_model(dictionary: Dictionary) -> Remark:
     if entry is not None and codec.is_integer(entry.data_type):
         number = int(codec.decode(entry.data_type, entry.default)) & 0xFFFF
     why = (
-        f"1000h (device type) names the device profile {number}, of which there is no model"
+        f"1000h (device type) names the device profile {number}, which has no model"
         if number
         else "1000h (device type) has no value"
     )
     text = f"{why}: the objects hold what the file says and what clients write"
     if dictionary.entry(0x6040, 0) is not None and dictionary.entry(0x6041, 0) is not None:
-        text += "; 6040h and 6041h are those of a CiA 402 drive, and no state machine is behind them"
+        text += "; 6040h and 6041h are those of a CiA 402 drive, but no state machine implements them"
     return Remark(text, model=True)

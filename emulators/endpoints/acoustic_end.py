@@ -29,7 +29,7 @@ async def _read(reader: asyncio.StreamReader) -> tuple[bytes, bytes]:
     head = await reader.readexactly(3)
     length = int.from_bytes(head[1:])
     if length > _LONGEST:
-        raise Desync("no frame of the water", expected=f"at most {_LONGEST} bytes", got=str(length))
+        raise Desync("not a frame of the acoustic channel", expected=f"at most {_LONGEST} bytes", got=str(length))
     return head[:1], await reader.readexactly(length)
 
 
@@ -62,7 +62,7 @@ class AcousticServer:
         try:
             self._server = await asyncio.start_unix_server(self._serve, path)
         except OSError as e:
-            raise EndpointBusy(f"cannot serve the water: {e.strerror}", where=str(path)) from e
+            raise EndpointBusy(f"cannot serve the acoustic channel: {e.strerror}", where=str(path)) from e
 
     async def run(self) -> None:
         """Forward received packets to the modems, until cancelled."""
@@ -142,13 +142,13 @@ class AcousticEnd:
         try:
             reader, writer = await asyncio.open_unix_connection(path)
         except OSError as e:
-            raise Unreachable("there is no water", where=str(path)) from e
+            raise Unreachable("there is no acoustic channel", where=str(path)) from e
         try:
             writer.write(_frame(b"M", name.encode()))
             await _read(reader)
         except (OSError, asyncio.IncompleteReadError, Desync) as e:
             await _close(writer)
-            raise Unreachable(f"{name} is not in the water", where=str(path)) from e
+            raise Unreachable(f"{name} is not on the acoustic channel", where=str(path)) from e
         return cls(reader, writer)
 
     def submit(self, payload: bytes, now_ns: int) -> bool:

@@ -82,7 +82,7 @@ class SoftBusServer:
         monitored: bool = True,
         data_bitrate: int = 0,
     ) -> SoftBusServer:
-        """Listen on a ``can:fieldtwin/HOST:PORT`` endpoint; port 0 takes a free one (see `bound`).
+        """Listen on a ``can:fieldtwin/HOST:PORT`` endpoint; port 0 selects a free port (see `bound`).
 
         `paced`: frames take their exact time at `bitrate` bit/s; otherwise they are delivered immediately.
         `queue_frames` limits each node's transmit queue, `max_outbound_frames` the frames that wait for a slow client.
@@ -93,7 +93,7 @@ class SoftBusServer:
         kind of endpoint or an impossible bit rate.
         """
         if endpoint.interface != "fieldtwin":
-            raise UsageError(f"{endpoint} is no software CAN bus", expected="can:fieldtwin/HOST:PORT")
+            raise UsageError(f"{endpoint} is not a software CAN bus", expected="can:fieldtwin/HOST:PORT")
         host, port = endpoint.address
         runner = BusRunner(
             bitrate,

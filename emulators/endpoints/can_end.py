@@ -61,7 +61,7 @@ async def _join_soft_bus(endpoint: Endpoint, bitrate: int) -> SoftBusEnd:
         async with asyncio.timeout(OPEN_TIMEOUT_S):
             reader, writer = await asyncio.open_connection(host, port)
     except OSError as e:  # includes TimeoutError
-        raise Unreachable(f"no software CAN bus: {os_reason(e)}", where=str(endpoint)) from e
+        raise Unreachable(f"cannot reach the software CAN bus: {os_reason(e)}", where=str(endpoint)) from e
     try:
         loop = asyncio.get_running_loop()
         asked_ns = int(loop.time() * NS_PER_S)
@@ -69,11 +69,11 @@ async def _join_soft_bus(endpoint: Endpoint, bitrate: int) -> SoftBusEnd:
             writer.write(Hello(bitrate, options=WANTS_CONFIRMATIONS | WANTS_ERRORS).pack())
             answer = unpack_hello(await reader.readexactly(RECORD_SIZE))
         if answer is None:
-            raise Unreachable("what answers there is no software CAN bus", where=str(endpoint))
+            raise Unreachable("the program that answers there is not a software CAN bus", where=str(endpoint))
         _judge(answer, bitrate, endpoint)
     except (OSError, EOFError) as e:
         await _hang_up(writer)
-        raise Unreachable("what listens there is no software CAN bus", where=str(endpoint)) from e
+        raise Unreachable("the program that listens there is not a software CAN bus", where=str(endpoint)) from e
     except BaseException:
         await _hang_up(writer)
         raise
@@ -87,7 +87,7 @@ def _judge(answer: Hello, bitrate: int, endpoint: Endpoint) -> None:
     """Raise the error for an answer of the bus that is not a welcome."""
     if answer.status == Status.WRONG_BITRATE:
         raise UsageError(
-            "the software CAN bus has another bit rate",
+            "the software CAN bus runs at a different bit rate",
             expected=f"{bitrate} bit/s",
             got=f"{answer.bitrate} bit/s",
             where=str(endpoint),
@@ -96,7 +96,9 @@ def _judge(answer: Hello, bitrate: int, endpoint: Endpoint) -> None:
         raise EndpointBusy("the software CAN bus is full", where=str(endpoint))
     if answer.status != Status.WELCOME:
         raise Unreachable(
-            "the software CAN bus does not know our version", got=f"version {answer.version}", where=str(endpoint)
+            "the software CAN bus does not support this protocol version",
+            got=f"version {answer.version}",
+            where=str(endpoint),
         )
 
 
@@ -197,7 +199,7 @@ def _open_kernel_end(endpoint: Endpoint) -> KernelCanEnd:
     except OSError as e:
         raise _no_interface(endpoint) from e
     if kind != ARPHRD_CAN:
-        raise Unreachable(f"{endpoint.path} is no CAN interface", where=str(endpoint))
+        raise Unreachable(f"{endpoint.path} is not a CAN interface", where=str(endpoint))
     if not up:
         raise Unreachable(f"{endpoint.path} is down", where=str(endpoint), hint=f"ip link set {endpoint.path} up")
     try:

@@ -137,7 +137,7 @@ class _Wire(asyncio.BufferedProtocol):
 
     def eof_received(self) -> bool:
         self.eof = True
-        self._end.feed_lost(ConnectionLost("the far side finished sending", where=str(self._end.endpoint)))
+        self._end.feed_lost(ConnectionLost("the peer finished sending", where=str(self._end.endpoint)))
         return True  # stay open to send the rest
 
     def connection_lost(self, exc: Exception | None) -> None:
@@ -255,7 +255,7 @@ class TtyEnd(ByteConnection):
             raise EndpointBusy("the serial device is held by another program", where=where) from e
         except (OSError, termios.error) as e:
             os.close(fd)
-            raise Unreachable(f"this is no serial device: {e}", where=where) from e
+            raise Unreachable(f"this is not a serial device: {e}", where=where) from e
         except FieldtwinError:
             os.close(fd)
             raise

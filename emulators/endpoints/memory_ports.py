@@ -97,7 +97,9 @@ class MemoryNet:
         if bus is None or str(endpoint) in self._refused:
             raise Unreachable("no such bus", where=str(endpoint))
         if bitrate and bitrate != bus._runner.bitrate:
-            raise UsageError("the bus runs at another bit rate", expected=str(bus._runner.bitrate), got=str(bitrate))
+            raise UsageError(
+                "the bus runs at a different bit rate", expected=str(bus._runner.bitrate), got=str(bitrate)
+            )
         return bus._runner.attach(endpoint, "gateway")
 
     async def listen_for_clients(
@@ -183,7 +185,7 @@ class _Listener:
         if len(self._clients) >= self.max_clients:
             self.evicted += 1
             oldest = self._clients.pop(0)
-            oldest.wire.cut(ConnectionLost("the connection gave way to another", where=str(oldest.endpoint)))
+            oldest.wire.cut(ConnectionLost("the connection was replaced by a newer one", where=str(oldest.endpoint)))
         self._clients.append(wire.far)
         self._nursery.start(self._serve(wire.far), f"client of {self.bound}")
 

@@ -77,7 +77,7 @@ class PtyEnd(ByteConnection):
         try:
             master, spare = os.openpty()
         except OSError as e:
-            raise Unreachable(f"no pty to be had: {e.strerror}", where=str(endpoint)) from e
+            raise Unreachable(f"cannot create a pty: {e.strerror}", where=str(endpoint)) from e
         try:
             os.set_blocking(master, False)
             _make_raw(spare, pace)
@@ -260,7 +260,7 @@ def _raise_idle_flags(descriptor: int) -> None:
 def _replace_link(link: Path, device: str, endpoint: Endpoint) -> None:
     """Create the link atomically: a program that opens it meanwhile gets either the old port or the new one."""
     if os.path.lexists(link) and not link.is_symlink():
-        raise EndpointBusy("a file stands where the link to the virtual serial port goes", where=f"{endpoint}: {link}")
+        raise EndpointBusy("a file already exists at the path of the virtual serial port", where=f"{endpoint}: {link}")
     beside = link.with_name(f".{link.name}.{os.getpid()}")
     try:
         beside.unlink(missing_ok=True)

@@ -37,7 +37,7 @@ class SlcanPort:
 
     @classmethod
     async def open(cls, runner: BusRunner, endpoint: Endpoint) -> SlcanPort:
-        """Listen on a ``tcp://HOST:PORT`` endpoint; port 0 takes a free one (see `bound`).
+        """Listen on a ``tcp://HOST:PORT`` endpoint; port 0 selects a free port (see `bound`).
 
         Raises `EndpointBusy` if the port is in use, `Unreachable` if it cannot be opened.
         """

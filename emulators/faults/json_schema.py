@@ -9,22 +9,22 @@ from fieldtwin.emulators.faults.registry import FAULTS
 from fieldtwin.emulators.faults.schema import MOST, aims_of
 
 _ABOUT = {
-    "bus": "on all that is on a bus",
-    "device": "on a device",
-    "unit": "the unit id, on CAN the node id; default: the device's",
-    "function": "Modbus: the function code, without the bit of an exception",
+    "bus": "all devices of a bus",
+    "device": "a device",
+    "unit": "the unit ID, on CAN the node ID; default: the device's",
+    "function": "Modbus: the function code, without the exception bit",
     "address": "Modbus: a PDU address, or holding:0x10",
-    "registers": "Modbus: how many registers or bits the request reads or writes: 40, 65..125 or 65..",
+    "registers": "Modbus: the number of registers or bits that the request reads or writes: 40, 65..125 or 65..",
     "register": "a tag of the device",
     "cob_id": "CAN: the identifier",
     "index": "CANopen: the object that an SDO frame names",
     "direction": "request (to the device), reply, or both",
     "nth": "the n-th frame that matches, from 1",
     "every": "each n-th frame that matches",
-    "from": "since when: 5s, 250ms, 2min, 24h of the run",
-    "until": "until when; default: for good",
-    "optional": "true: a scenario may pass although the fault never struck",
-    "probability": "of each frame that matches",
+    "from": "start time within the run: 5s, 250ms, 2min, 24h",
+    "until": "end time within the run; default: no end",
+    "optional": "true: a scenario may pass although the fault never took effect",
+    "probability": "probability for each frame that matches",
 }
 
 

@@ -29,11 +29,11 @@ def check_can_link(spec: FaultSpec) -> None:
     _check_names(spec, "unit, cob_id, index")
     if issubclass(spec.kind, BusFault):
         raise WrongAim(
-            "name", f"fault {spec.kind.name} is one of a bus that is modelled, and a link has none",
+            "name", f"fault {spec.kind.name} needs a modelled bus, and a link has none",
             hint="`fieldtwin run` and `fieldtwin with` have one",
         )  # fmt: skip
     if issubclass(spec.kind, CanFault) and spec.kind.appears is not CanFault.appears and spec.aim.unit is None:
-        raise WrongAim("name", f"fault {spec.kind.name} is sent by a node", expected="unit: the node's id")
+        raise WrongAim("name", f"fault {spec.kind.name} is sent by a node", expected="unit: the node ID")
 
 
 def _check_kind(spec: FaultSpec, kind: Kind, expected: str) -> None:
@@ -45,7 +45,7 @@ def _check_names(spec: FaultSpec, expected: str) -> None:
     aim = spec.aim
     for key, name in (("device", aim.device), ("bus", aim.bus), ("register", aim.register_)):
         if name:
-            raise WrongAim(key, f"fault {spec.id}: a link knows no names", expected=expected)
+            raise WrongAim(key, f"fault {spec.id}: a link has no device or bus names", expected=expected)
 
 
 def wire_faults(

@@ -81,7 +81,7 @@ def parse_fault(
         raise wrong("", "a fault", expected="{name: ..., device: ...}", got=repr(said)[:60])
     name = said.get("name")
     if not isinstance(name, str):
-        raise wrong("", "a fault without a name", expected="name: one that `fieldtwin faults` lists")
+        raise wrong("", "a fault without a name", expected="name: one of those that `fieldtwin faults` lists")
     try:
         kind = fault_class(name)
     except UsageError as e:
@@ -119,7 +119,7 @@ def parse_fault(
     from_s = time("from", aim.from_)
     until_s = None if aim.until is None else time("until", aim.until)
     if until_s is not None and until_s <= from_s:
-        raise wrong("until", "a fault that ends before it begins", expected="until after from")
+        raise wrong("until", "the fault ends before it begins", expected="until after from")
     return FaultSpec(str(said.get("id") or f"{name}-{number}"), kind, aim, parameters, from_s, until_s)
 
 
@@ -147,7 +147,7 @@ def load_faults(path: Path, check: Check | None = None) -> tuple[dict[str, Any],
         if check is not None:
             checked(check, spec, file, ("faults", n))
         if spec.id in found:
-            raise file.error(("faults", n, "id"), f"the id {spec.id!r} stands twice")
+            raise file.error(("faults", n, "id"), f"the id {spec.id!r} is defined twice")
         found[spec.id] = {**one, "id": spec.id}
     return tuple(found.values())
 

@@ -172,7 +172,7 @@ class MapBank(RegisterBank):
         addresses = range(span.start, span.start + span.count)
         twice = self._declared[span.table].intersection(addresses)
         if twice:
-            raise UsageError("two spans hold the same cell", where=f"{span.table}:{min(twice)}")
+            raise UsageError("two spans contain the same cell", where=f"{span.table}:{min(twice)}")
         self._cells[span.table].update(dict.fromkeys(addresses, 0))
         self._declared[span.table].update(addresses)
         if span.access != "wo":
@@ -235,7 +235,7 @@ class MapBank(RegisterBank):
         try:
             return self._cells[table][address]  # undeclared cells that `undeclared` fills read as 0
         except KeyError:
-            raise IllegalAddress("no cell that can be read", where=f"{table}:{address}") from None
+            raise IllegalAddress("not a readable cell", where=f"{table}:{address}") from None
 
     def poke(self, table: Table, address: int, *values: int) -> None:
         """Set cells from the device's side, read-only ones included. Raises `IllegalAddress` or `IllegalValue`."""

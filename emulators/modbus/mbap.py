@@ -51,7 +51,7 @@ class MbapSlave:
         any_unit: bool = False,
     ) -> None:
         if any_unit and len(units) != 1:
-            raise UsageError("only a single unit can answer under any id", got=f"{len(units)} units")
+            raise UsageError("only a single unit can answer to every unit ID", got=f"{len(units)} units")
         for unit_id in units:
             if not 0 <= unit_id <= 255:
                 raise UsageError("unit id", expected="0 to 255", got=str(unit_id))

@@ -192,4 +192,4 @@ def _require_words(data: bytes, count: int) -> None:
 
 def _require_range(address: int, count: int) -> None:
     if address + count > ADDRESSES:
-        raise IllegalAddress("beyond the end of the table", got=f"{count} from {address}")
+        raise IllegalAddress("after the end of the table", got=f"{count} from {address}")

@@ -46,7 +46,7 @@ class PlayedObjects:
             self._objects.append((tag.name, tag.object, tag.scale, tag.offset, is_float, encoder))
         if not self._objects:
             raise FileInvalid(
-                "the recording plays nothing of this device",
+                "the recording has no signal of this device",
                 path=player.path,
                 expected="signals under names of its tags",
                 got=", ".join(player.names),

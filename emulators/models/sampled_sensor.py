@@ -34,7 +34,7 @@ class SampledSensor(RegisterBank):
 
     def __init__(self, profile: DeviceProfile, player: Signals, identity: Mapping[str, str]) -> None:
         if profile.sampled is None:
-            raise FileInvalid("the profile says nothing about sampling", path=profile.path, expected="`sampled:`")
+            raise FileInvalid("the profile has no `sampled`", path=profile.path, expected="`sampled:`")
         self.journal = HeldJournal()
         self.distortions = Distortions()
         """Value faults of its signals, which apply to the next samples."""

@@ -24,7 +24,7 @@ class SimulatedRegisters(StatedRegisters):
         for name in signals.names:
             if name not in profile.tags or profile.tags[name].is_text:
                 expected = ", ".join(tag.name for tag in profile.tags.values() if not tag.is_text)
-                raise FileInvalid(f"{profile.name} has no number {name!r}", path=signals.path, expected=expected)
+                raise FileInvalid(f"{profile.name} has no numeric tag {name!r}", path=signals.path, expected=expected)
         super().__init__(profile, values, now_ns)
         self._signals = signals
         self._played = [profile.tags[name] for name in signals.names]

@@ -48,7 +48,7 @@ def node_of(log: CanLog, node_id: int) -> int:
     if len(asked) == 1:
         return asked[0]
     raise UsageError(
-        f"the log holds nothing of node {node_id}",
+        f"the log has no frames of node {node_id}",
         where=str(log.path),
         expected="its SDO replies or heartbeats",
         got=", ".join(f"node {node}" for node in asked),
@@ -63,7 +63,7 @@ def recorded_objects(log: CanLog, dictionary: Dictionary, node_id: int) -> Recor
     then = node_of(log, node_id)
     objects = RecordedObjects(log.frames(), dictionary, then, log.at_end, log.speed)
     if not objects.initial:
-        raise UsageError(f"the log holds nothing of node {then} that its data sheet knows", where=str(log.path))
+        raise UsageError(f"the log has no object of node {then} that is in its data sheet", where=str(log.path))
     if then != node_id:  # identifiers derived from the node ID follow the present one
         own = {entry.key for entry in dictionary.entries() if entry.node_relative}
         objects.initial = {key: raw for key, raw in objects.initial.items() if key not in own}
@@ -111,7 +111,7 @@ class RecordedObjects:
         self._began_ns = now_ns if self._began_ns is None else self._began_ns
         at_s = (now_ns - self._began_ns) / NS_PER_S * self._speed
         if at_s > self.duration_s and self._when_used_up is WhenUsedUp.ERROR:
-            raise UsedUp(f"the log of node {self._node_id} is over after {self.duration_s:.3f} s")
+            raise UsedUp(f"the log of node {self._node_id} ends after {self.duration_s:.3f} s")
         if self._when_used_up is WhenUsedUp.LOOP and self.duration_s:
             at_s %= self.duration_s
         return {key: self._values[key][max(bisect_right(times, at_s) - 1, 0)] for key, times in self._times.items()}

@@ -121,7 +121,7 @@ class Formula:
         self._known = known
         self._random = random
         if len(text) > LONGEST:
-            raise UsageError("too long a formula", expected=f"at most {LONGEST} characters", got=f"{len(text)}")
+            raise UsageError("the formula is too long", expected=f"at most {LONGEST} characters", got=f"{len(text)}")
         try:
             tree = ast.parse(text.strip(), mode="eval").body
         except (SyntaxError, ValueError, RecursionError, MemoryError) as e:
@@ -170,7 +170,7 @@ class Formula:
             return _constant(CONSTANTS[name])
         if name not in self._known and name not in (TIME, STEP):
             raise UsageError(
-                f"nothing is called {name!r}",
+                f"there is no value or function {name!r}",
                 expected=", ".join([TIME, STEP, *self._known]),
                 hint=did_you_mean(name, [TIME, STEP, *self._known, *CONSTANTS]),
             )

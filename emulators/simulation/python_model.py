@@ -82,7 +82,7 @@ class PythonModel:
 def _load(path: Path) -> ModuleType:
     spec = importlib.util.spec_from_file_location(f"fieldtwin_simulation_{path.stem}", path)
     if spec is None or spec.loader is None or not path.is_file():
-        raise FileInvalid("no Python file", path=str(path), expected="FILE.py:CLASS")
+        raise FileInvalid("not a Python file", path=str(path), expected="FILE.py:CLASS")
     module = importlib.util.module_from_spec(spec)
     try:
         spec.loader.exec_module(module)

@@ -89,11 +89,11 @@ def by_formulas(
     known = (*formulas, *inputs)
     for name in start:
         if name not in formulas:
-            raise UsageError(f"nothing computes {name!r}", expected=", ".join(formulas))
+            raise UsageError(f"no formula or step computes {name!r}", expected=", ".join(formulas))
     made: dict[str, Formula] = {}
     for name, text in formulas.items():
         if name in (TIME, STEP) or name in inputs:
-            raise UsageError(f"{name!r} is no name for a value", expected="one that is not taken")
+            raise UsageError(f"{name!r} is not a valid name for a value", expected="one that is not taken")
         made[name] = Formula(text, known, Random(f"{seed}:{name}"))
 
     def step(t_s: float, dt_s: float, values: Mapping[str, float]) -> Mapping[str, float]:

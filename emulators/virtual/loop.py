@@ -253,7 +253,7 @@ class VirtualLoop(asyncio.AbstractEventLoop):
                 self.call_exception_handler({"message": f"in {handle}", "exception": e, "handle": handle})
             run += 1
             if run == STUCK_AFTER:
-                raise Deadlock("time stands still: callbacks call each other at one instant", got=str(handle))
+                raise Deadlock("virtual time stands still: callbacks schedule each other without end", got=str(handle))
         self.callbacks += run
         if not self._stopping:
             self._advance()

@@ -232,5 +232,5 @@ class AcousticMedium:
 
     def _modem(self, name: str) -> _Modem:
         if name not in self._modems:
-            raise UsageError(f"no modem {name!r} in the water", expected=", ".join(self._modems))
+            raise UsageError(f"no modem {name!r} on the acoustic channel", expected=", ".join(self._modems))
         return self._modems[name]

@@ -112,7 +112,7 @@ class CanBus:
             raise UsageError("a node cannot send an error frame", got=str(frame))
         sender = self._node(node)
         if sender.listen_only:
-            raise UsageError("a node that only listens cannot send", got=str(frame))
+            raise UsageError("a listen-only node cannot send", got=str(frame))
         if len(sender.queue) >= self.queue_frames:
             self._run(now_ns)  # frames that have ended by now free their places
             if len(sender.queue) >= self.queue_frames:

@@ -24,38 +24,43 @@ _CHOICE = (
         "--fault-every",
         type=Duration(),
         default=None,
-        help="With random faults: time between two of them on average; default: 2min.",
+        help="With random faults: mean time between two faults; default: 2min.",
     ),
     click.option(
         "--fault-kinds",
         default="",
         callback=_each,
         metavar="NAME,...",
-        help="With random faults: only these (fieldtwin faults); those of values only where they are named here.",
+        help="With random faults: only these (see fieldtwin faults); value faults occur only if they are named here.",
     ),
     click.option(
         "--fault-aims",
         default="",
         callback=_each,
         metavar="AIM,...",
-        help="With random faults: only at these, DEVICE, BUS or DEVICE.TAG; default: every device.",
+        help="With random faults: only on these targets (DEVICE, BUS or DEVICE.TAG); default: every device.",
     ),
 )
 _CAMPAIGN = (
-    click.option("--seeds", default="", metavar="1..200", help="In virtual time: a run for each of these seeds."),
-    click.option("--jobs", type=click.IntRange(1, 256), default=1, help="So many runs of --seeds at once."),
+    click.option(
+        "--seeds",
+        default="",
+        metavar="1..200",
+        help="In virtual time: one run for each of these seeds, such as 1..200.",
+    ),
+    click.option("--jobs", type=click.IntRange(1, 256), default=1, help="Number of --seeds runs at a time."),
     click.option(
         "--faults",
         type=click.Choice(["random"]),
         default=None,
-        help="With --seeds: faults that each seed chooses. Then always, never, within and invariants are judged.",
+        help="With --seeds: random faults, chosen by each seed. Only always, never, within and invariants are then checked.",
     ),
     click.option(
         "--for",
         "duration_s",
         type=Duration(),
         default=0.0,
-        help="With random faults: how long a run lasts; default: as long as the steps may take, at least 10min.",
+        help="With random faults: length of a run; default: the maximum time of the steps, at least 10min.",
     ),
 )
 
@@ -97,9 +102,9 @@ class CampaignRequest(NamedTuple):
         """Raise `UsageError` for options that have no effect without --seeds, or without random faults."""
         self.choice.of(self.faults)
         if not self.seeds and (self.faults or self.jobs != 1 or self.duration_s):
-            raise UsageError("--faults, --for and --jobs of scenarios go with --seeds", expected="--seeds 1..200")
+            raise UsageError("--faults, --for and --jobs of scenarios need --seeds", expected="--seeds 1..200")
         if self.duration_s and not self.faults:
-            raise UsageError("--for goes with --faults random: without it the steps say how long a run lasts")
+            raise UsageError("--for needs --faults random: without it the steps determine the length of a run")
 
 
 def fault_choice(function: Callable[..., Any]) -> Callable[..., Any]:

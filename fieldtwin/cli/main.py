@@ -22,76 +22,94 @@ from fieldtwin.cli.broken_pipe import VERDICTS, talk_unheard, to_nowhere, verdic
 COMMANDS = {
     "run": ("fieldtwin.cli.run.run_command", "Run a system: the plant, or its prototype."),
     "reload": ("fieldtwin.cli.run.reload_command", "Let a running instance read its files again, between two polls."),
-    "emulate": ("fieldtwin.cli.emulate.emulate_command", "Emulate the field side of a system, or one device."),
+    "emulate": ("fieldtwin.cli.emulate.emulate_command", "Emulate the field devices of a system, or one device."),
     "plc": (
         "fieldtwin.cli.run.plc_command",
         "Look into a running PLC: tags, forces, steps, reasons; draw and prove programs.",
     ),
     "shore": (
         "fieldtwin.cli.run.topside_command",
-        "The far end of a system's transmitter: send commands, show responses.",
+        "The topside controller of a system's modem: send commands, show responses.",
     ),
     "shadow": (
         "fieldtwin.cli.twin.shadow_command",
-        "A digital shadow: watch a plant from elsewhere, and compare it with its model.",
+        "A digital shadow: observe a plant remotely, and compare it with its model.",
     ),
-    "twin": ("fieldtwin.cli.twin.twin_command", "A digital twin: a shadow with a way back, that plans and commands."),
+    "twin": ("fieldtwin.cli.twin.twin_command", "A digital twin: a shadow that also plans and commands."),
     "link": (
         "fieldtwin.cli.emulate.link_command",
         "The emulated connection on its own: a serial port carried over TCP.",
     ),
     "bridge": (
         "fieldtwin.cli.emulate.bridge_command",
-        "Modbus TCP clients to units on a serial line, or the other way round.",
+        "Connect Modbus TCP clients to serial units, or serial clients to TCP devices.",
     ),
     "can-bus": ("fieldtwin.cli.emulate.can_bus_command", "A software CAN bus on a TCP port."),
-    "check": ("fieldtwin.cli.test.check_command", "Judge a Modbus or CANopen device, or master: verdicts, waivers."),
+    "check": (
+        "fieldtwin.cli.test.check_command",
+        "Run conformance tests of a Modbus or CANopen device, client or master.",
+    ),
     "line": (
         "fieldtwin.cli.device.line_command",
-        "Look at a wire before anything is sent, and rank what may be wrong.",
+        "Examine a serial line or bus without sending; rank possible faults.",
     ),
-    "scan": ("fieldtwin.cli.device.scan_command", "Find the units or nodes on a wire: listen first, then ask, paced."),
+    "scan": (
+        "fieldtwin.cli.device.scan_command",
+        "Find the units or nodes on a bus: listen first, then ask at a limited rate.",
+    ),
     "identify": (
         "fieldtwin.cli.device.identify_command",
-        "Ask a device what it is, and say which profile fits, and how surely.",
+        "Read a device's identification, and find the profile that fits.",
     ),
     "read": ("fieldtwin.cli.device.read_command", "Read values of one device, by name or address."),
-    "write": ("fieldtwin.cli.device.write_command", "Write values of one device: asked for, read back, put back."),
-    "watch": ("fieldtwin.cli.device.watch_command", "Live values of one device, with sparklines; a picture of them."),
-    "dump": ("fieldtwin.cli.device.dump_command", "Read all that a device holds: values, holes, limits, latency."),
-    "report": ("fieldtwin.cli.system.report_command", "A site acceptance document from dumps, comparisons and checks."),
+    "write": (
+        "fieldtwin.cli.device.write_command",
+        "Write values of one device, with confirmation, read-back and restore.",
+    ),
+    "watch": ("fieldtwin.cli.device.watch_command", "Show live values of one device, with sparklines or as a plot."),
+    "dump": ("fieldtwin.cli.device.dump_command", "Read all values of a device, with its gaps, limits and latency."),
+    "report": (
+        "fieldtwin.cli.system.report_command",
+        "Make a site acceptance document from dumps, comparisons and checks.",
+    ),
     "record": ("fieldtwin.cli.recordings.record_command", "Record a device, a line between two ports, or a CAN bus."),
-    "diff": ("fieldtwin.cli.device.diff_command", "Two dumps, or a dump and a profile: what differs, by name."),
+    "diff": ("fieldtwin.cli.device.diff_command", "Compare two dumps, or a dump and a profile, by name."),
     "infer": (
         "fieldtwin.cli.device.infer_command",
-        "Guess a profile from dumps taken over time, and say how sure it is.",
+        "Infer a draft profile, with confidence, from dumps taken over time.",
     ),
-    "compare": ("fieldtwin.cli.recordings.compare_command", "Hold a device, or a recording, against a recording."),
-    "import": ("fieldtwin.cli.recordings.import_command", "Turn foreign files into recordings."),
-    "export": ("fieldtwin.cli.recordings.export_command", "Turn recordings into CSV, Parquet, candump logs or pcap."),
+    "compare": ("fieldtwin.cli.recordings.compare_command", "Compare a device, or a recording, with a recording."),
+    "import": ("fieldtwin.cli.recordings.import_command", "Convert files of other programs to recordings."),
+    "export": ("fieldtwin.cli.recordings.export_command", "Convert recordings to CSV, Parquet, candump logs or pcap."),
     "what-if": (
         "fieldtwin.cli.twin.what_if_command",
-        "Fork a prototype from what is known, and see what comes of a plan.",
+        "Simulate the effect of a plan from the present state.",
     ),
-    "test": ("fieldtwin.cli.test.test_command", "Run scenarios against a prototype, and judge it."),
+    "test": ("fieldtwin.cli.test.test_command", "Run test scenarios against a prototype."),
     "test-host": ("fieldtwin.cli.test.worker_command", "Emulated devices for tests, over stdin and stdout."),
-    "with": ("fieldtwin.cli.run.with_command", "Run any command against the emulated field; end with its exit status."),
-    "faults": ("fieldtwin.cli.emulate.faults_command", "List the faults that can be put on wires and into devices."),
+    "with": (
+        "fieldtwin.cli.run.with_command",
+        "Run any command against the simulated field devices; end with its exit status.",
+    ),
+    "faults": ("fieldtwin.cli.emulate.faults_command", "List the faults that can be injected into buses and devices."),
     "template": (
         "fieldtwin.cli.system.template_command",
-        "A system and all that it takes, as one file: pack, check, compare, unpack.",
+        "Pack a system into one file; check, compare and unpack such files.",
     ),
-    "draw": ("fieldtwin.cli.system.draw_command", "Draw a system's wires, and who hangs on each: text, or SVG."),
-    "trace": ("fieldtwin.cli.recordings.trace_command", "What happened in a run: frames in words, JSON, or waveforms."),
+    "draw": ("fieldtwin.cli.system.draw_command", "Draw a system's buses and their devices as text or SVG."),
+    "trace": (
+        "fieldtwin.cli.recordings.trace_command",
+        "Show the events of a run: decoded frames, JSON, or waveforms.",
+    ),
     "schema": ("fieldtwin.cli.system.schema_command", "Print the JSON schema of a kind of file."),
-    "doctor": ("fieldtwin.cli.system.doctor_command", "Check what this computer can do, and say what to change."),
+    "doctor": ("fieldtwin.cli.system.doctor_command", "Check what this computer supports, and what to change."),
 }
 SECTIONS = {
     "Run a system, or parts of it": (
         *("run", "reload", "emulate", "with", "plc"),
         *("shore", "link", "bridge", "can-bus", "draw"),
     ),
-    "Meet a device": (
+    "Examine a device": (
         *("line", "scan", "identify", "read", "write", "watch", "dump", "diff", "infer"),
         *("record", "import", "export", "compare", "check", "report"),
     ),
@@ -157,12 +175,13 @@ class LazyGroup(click.Group):
 )
 @click.version_option(__version__, "--version", prog_name="fieldtwin")
 def cli() -> None:
-    """Run a plant's own control software without the plant: gateway, soft PLC and emulators on real wires.
+    """Run a plant's own control software without the plant: gateway, soft PLC and emulators on real serial lines, sockets and
+    CAN buses.
 
-    Data goes to stdout, talk to stderr. Exit codes: 0 ok, 1 a check failed, 2 usage, 3 a file is invalid,
-    4 unreachable, 5 the device refused, 70 our bug, 130 interrupted.
+    Results go to stdout, diagnostics to stderr. Exit codes: 0 ok, 1 a check failed, 2 wrong usage, 3 a file is invalid, 4
+    unreachable, 5 the device refused, 70 internal error, 130 interrupted.
 
-    fieldtwin is no safety function.
+    fieldtwin is not a safety function.
     """
 
 
@@ -197,7 +216,7 @@ def main() -> None:
     except OSError as e:
         if os.environ.get("FIELDTWIN_TRACEBACK") or e.errno not in HOST_REFUSES:
             _bug(e)
-        click.echo(f"fieldtwin: {e.filename or 'a file, or what we print to'}: {e.strerror}", err=True)
+        click.echo(f"fieldtwin: {e.filename or 'a file or the output'}: {e.strerror}", err=True)
         _drop_what_is_unsaid()
         sys.exit(FileInvalid.exit_code)
     except Exception as e:  # the outermost handler: any other exception is a bug of fieldtwin
@@ -213,7 +232,7 @@ def _bug(error: Exception) -> NoReturn:
     if os.environ.get("FIELDTWIN_TRACEBACK"):
         raise error
     click.echo(
-        f"fieldtwin: a bug of ours: {type(error).__name__}: {error} (run again with FIELDTWIN_TRACEBACK=1 and report it)",
+        f"fieldtwin: internal error: {type(error).__name__}: {error} (run again with FIELDTWIN_TRACEBACK=1 and report it)",
         err=True,
     )
     sys.exit(BUG)

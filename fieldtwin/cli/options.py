@@ -47,7 +47,7 @@ class Duration(_OfFloat):
             return value
         match = _DURATION.match(str(value))
         if not match:
-            self.fail(f"{value!r} is no duration such as 20s, 500ms or 2m", param, ctx)
+            self.fail(f"{value!r} is not a duration such as 20s, 500ms or 2m", param, ctx)
         number, unit = float(match[1]), match[2]
         if unit is None and number:
             self.fail(f"{value!r} has no unit: write {match[1]}ms, {match[1]}s, {match[1]}m or {match[1]}h", param, ctx)
@@ -77,7 +77,9 @@ class Secret(_OfText):
         if not text.startswith("@"):
             named = param.name if param is not None else None
             if ctx is not None and named and ctx.get_parameter_source(named) is ParameterSource.COMMANDLINE:
-                self.fail("everybody here can read the command line: @FILE, or the environment", param, ctx)
+                self.fail(
+                    "every user of this computer can read the command line: use @FILE, or the environment", param, ctx
+                )
             return text
         try:
             lines = Path(text[1:]).read_text(encoding="utf-8").splitlines()

@@ -13,7 +13,7 @@ from fieldtwin.run.template import Ask, Stranger
 SHOWN = 5
 
 trust_option = click.option(
-    "--trust", is_flag=True, help="Do not ask about a template's code in Python and what its prototype opens."
+    "--trust", is_flag=True, help="Do not ask before running a template's Python code and opening its endpoints."
 )
 
 
@@ -32,13 +32,16 @@ def ask_about(template: Stranger) -> bool:
     """Print what a template contains and ask whether it may run. Without a terminal the answer is no."""
     if template.code:
         talk.print(
-            f"{escape(str(template.path))} brings control logic in Python: {shown(template.code)}.\n"
-            "It is a program: run, it can do on this computer whatever you can.",
+            f"{escape(str(template.path))} contains control logic in Python: {shown(template.code)}.\n"
+            "When run, this program can do everything on this computer that you can do.",
             soft_wrap=True,
         )
     if template.reach:
         lines = shown(template.reach, "\n  ")
-        talk.print(f"{escape(str(template.path))} does not keep to itself as a prototype:\n  {lines}", soft_wrap=True)
+        talk.print(
+            f"{escape(str(template.path))} affects more than its run directory as a prototype:\n  {lines}",
+            soft_wrap=True,
+        )
     if not sys.stdin.isatty():
         return False
     return click.confirm("Run it?", default=False, err=True)

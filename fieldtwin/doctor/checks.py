@@ -86,7 +86,7 @@ def _pty() -> Check:
             os.close(master)
             os.close(slave)
     except OSError as e:
-        return Check("virtual serial", Verdict.BAD, f"no pty: {e.strerror}", "mount devpts on /dev/pts")
+        return Check("virtual serial", Verdict.BAD, f"no pseudo-terminal: {e.strerror}", "mount devpts on /dev/pts")
     if not whole:
         return Check("virtual serial", Verdict.BAD, "a raw pty changes bytes", "report this")
     return Check("virtual serial", Verdict.OK, "ptys work")
@@ -154,5 +154,5 @@ def _disk() -> Check:
     free = shutil.disk_usage(existing).free
     found = f"{free // (1024 * 1024)} MiB free at {existing}"
     if free < MIN_FREE_BYTES:
-        return Check("disk", Verdict.BAD, found, "logs and stores need room")
+        return Check("disk", Verdict.BAD, found, "logs and stores need space")
     return Check("disk", Verdict.OK, found)

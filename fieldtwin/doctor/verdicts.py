@@ -44,11 +44,13 @@ def judged_clock(state: ClockState | None) -> Check:
     Scans and polls use the monotonic clock; a wrong time of day spoils logs and recordings and makes TLS fail.
     """
     if state is None:
-        return Check("clock", Verdict.NOTE, "this system does not say whether it is synchronised", "use NTP or PTP")
+        return Check("clock", Verdict.NOTE, "this system does not report whether it is synchronised", "use NTP or PTP")
     if state.year < 2024:
-        return Check("clock", Verdict.BAD, f"the year is {state.year}", "set the clock; a battery for it, or NTP")
+        return Check(
+            "clock", Verdict.BAD, f"the year is {state.year}", "set the clock, and use a backup battery or NTP"
+        )
     if not state.synchronised:
-        advice = "start chrony or systemd-timesyncd: time stamps of logs, and certificates, go by it"
+        advice = "start chrony or systemd-timesyncd: time stamps of logs and certificates depend on it"
         return Check("clock", Verdict.NOTE, "the kernel's clock is not synchronised", advice)
     return Check("clock", Verdict.OK, f"synchronised, at most {state.error_s * 1000:.0f} ms off")
 
@@ -75,8 +77,8 @@ def judged_watches(instances: int | None) -> Check:
         return Check("inotify", Verdict.OK, "not on this system")
     if instances < MIN_INOTIFY:
         advice = "sysctl fs.inotify.max_user_instances=128"
-        return Check("inotify", Verdict.NOTE, f"{instances} instances a user", advice)
-    return Check("inotify", Verdict.OK, f"{instances} instances a user")
+        return Check("inotify", Verdict.NOTE, f"{instances} instances per user", advice)
+    return Check("inotify", Verdict.OK, f"{instances} instances per user")
 
 
 def judged_processor(cpus: int, quota: float | None) -> Check:
@@ -86,9 +88,9 @@ def judged_processor(cpus: int, quota: float | None) -> Check:
     """
     if quota is None:
         return Check("processors", Verdict.OK, f"{cpus}, no quota")
-    found = f"{cpus}, of which a cgroup gives {quota:g} at most"
+    found = f"{cpus}, of which a cgroup grants {quota:g} at most"
     if quota < MIN_CPUS:
-        advice = "scans are late whenever it is used up: give at least one (docker --cpus, systemd CPUQuota)"
+        advice = "scans are late whenever the quota is used up: grant at least one (docker --cpus, systemd CPUQuota)"
         return Check("processors", Verdict.NOTE, found, advice)
     return Check("processors", Verdict.OK, found)
 

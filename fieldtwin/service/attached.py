@@ -146,14 +146,14 @@ class Service:
         if done.restart:
             named = "; ".join(f"{c['where']}: {c['what']}" for c in done.restart[:MOST_NAMED])
             more = f"; {len(done.restart) - MOST_NAMED} more" if len(done.restart) > MOST_NAMED else ""
-            text = f"not reloaded, nothing was changed; these need a restart: {named}{more}"
+            text = f"not reloaded, nothing was changed; these changes need a restart: {named}{more}"
             return Event(Priority.ERROR, "not_reloaded", text, {"error": "needs a restart"})
         if done.applied and self._log is not None:
             return None
         what = (
             "reloaded: " + "; ".join(c["what"] for c in done.changes[:MOST_NAMED])
             if done.applied
-            else ("reloaded: nothing is otherwise in the files")
+            else ("reloaded: the files have not changed")
         )
         return Event(Priority.NOTICE, "reloaded", what, {"count": len(done.changes)})
 

@@ -121,7 +121,7 @@ def _thread(before: Status | None, now: Status | None) -> list[Event]:
         text, was = (now or {}).get(key, ""), (before or {}).get(key, "")
         if now is not None and text != was:
             priority = Priority.WARNING if text else Priority.NOTICE
-            found.append(Event(priority, f"thread_{key}", f"{what}: {text or 'all is well again'}", {"error": text}))
+            found.append(Event(priority, f"thread_{key}", f"{what}: {text or 'recovered'}", {"error": text}))
     return found
 
 

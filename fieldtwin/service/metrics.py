@@ -74,9 +74,9 @@ def families(seen: Snapshot) -> list[Family]:
     page.gauge("info", "Version, system, and whether it is a plant or its prototype.").add(
         1, version=__version__, system=seen.system, mode=seen.mode
     )
-    page.gauge("run_seconds", "How long this run has lasted.").add(seen.uptime_s)
-    page.gauge("status_age_seconds", "How old what is told here is.").add(seen.asked_ago_s)
-    up = page.gauge("up", "Whether a process of the run lives and, gateway and PLC, answers.")
+    page.gauge("run_seconds", "Duration of this run.").add(seen.uptime_s)
+    page.gauge("status_age_seconds", "Age of the statuses from which these metrics come.").add(seen.asked_ago_s)
+    up = page.gauge("up", "Whether a process of the run is alive and, for gateway and PLC, answers.")
     for name, lives in seen.children.items():
         answers = {"gateway": seen.gateway is not None, "plc": seen.plc is not None}.get(name, True)
         up.add(int(lives and answers), process=name)
@@ -91,15 +91,18 @@ def families(seen: Snapshot) -> list[Family]:
 
 
 def _buses(page: Page, gateway: Status) -> None:
-    connected = page.gauge("bus_connected", "Whether the bus's wire is open.")
-    opens = page.counter("bus_opens", "How often it was opened: more than once is lost and found again.")
+    connected = page.gauge("bus_connected", "Whether the bus's connection is open.")
+    opens = page.counter(
+        "bus_opens", "How often the connection was opened; more than once means that it was lost and recovered."
+    )
     events = page.counter(
-        "bus_events", "What a master counted: requests, replies, timeouts, CRC errors, frames, PDOs... by event."
+        "bus_events",
+        "Counters of the gateway on a bus: requests, replies, timeouts, CRC errors, frames, PDOs... by event.",
     )
     latency = page.histogram(
-        "bus_latency_seconds", "From a request sent to its answer (Modbus), and whole SDO transfers (CANopen)."
+        "bus_latency_seconds", "Response times: from request to reply (Modbus), and whole SDO transfers (CANopen)."
     )
-    late = page.counter("bus_not_produced", "SYNC, TIME and repeated RPDOs that found no room in their time.")
+    late = page.counter("bus_not_produced", "SYNC, TIME and repeated RPDOs that could not be sent in their period.")
     for name, bus in _some(gateway["buses"]):
         connected.add(int(bus["connected"]), bus=name)
         opens.add(bus["opens"], bus=name)
@@ -113,15 +116,15 @@ def _buses(page: Page, gateway: Status) -> None:
 
 
 def _devices(page: Page, gateway: Status) -> None:
-    online = page.gauge("device_online", "Whether a device answers and is the right one.")
-    wrong = page.gauge("device_wrong", "Whether what answers is another device than the system file says.")
+    online = page.gauge("device_online", "Whether a device answers and has the expected identity.")
+    wrong = page.gauge("device_wrong", "Whether the device that answers differs from the one in the system file.")
     polls = page.counter("device_polls", "Polls of a device.")
     errors = page.counter("device_errors", "Polls that failed, and PDOs that were malformed.")
     boots = page.counter(
-        "device_boots", "Boot-ups heard of a CANopen node: more than expected is a device that restarts."
+        "device_boots", "Boot-ups received from a CANopen node; more than expected means that the device restarts."
     )
     emcys = page.counter("device_emcys", "Emergency messages of a CANopen node.")
-    pdos = page.counter("device_pdos", "Process data frames, by direction as the gateway sees it.")
+    pdos = page.counter("device_pdos", "Process data frames, by direction from the gateway's view.")
     devices = gateway["devices"]
     for name, device in islice(devices.items(), MOST_DEVICES):
         labels = {"device": name, "bus": device["bus"]}
@@ -136,14 +139,14 @@ def _devices(page: Page, gateway: Status) -> None:
             pdos.add(device["rpdos_sent"], **labels, direction="out")
     page.gauge("devices", "Devices of the system.").add(len(devices))
     page.gauge("devices_online", "Devices that answer.").add(sum(bool(d["online"]) for d in devices.values()))
-    page.gauge("devices_left_out", "Devices without series of their own here: too many.").add(
+    page.gauge("devices_left_out", "Devices above the limit, which have no series.").add(
         max(0, len(devices) - MOST_DEVICES)
     )
 
 
 def _tags(page: Page, gateway: Status) -> None:
     qualities = Counter(tag["quality"] for tag in gateway["tags"].values())
-    counted = page.gauge("tags", "Tags by their quality now.")
+    counted = page.gauge("tags", "Tags by their present quality.")
     for quality in Quality:
         counted.add(qualities[str(quality)], quality=str(quality))
     ages = [tag["age_s"] for tag in gateway["tags"].values() if tag.get("age_s") is not None]
@@ -151,8 +154,8 @@ def _tags(page: Page, gateway: Status) -> None:
     page.counter("published", "Values published.").add(gateway["published"])
     page.counter("logged", "Entries of the exchange log.").add(gateway["logged"])
     page.counter("log_dropped", "Entries that the exchange log lost.").add(gateway["log_dropped"])
-    page.counter("reloads", "Times that a changed configuration was taken over.").add(gateway["config"]["reloads"])
-    page.gauge("store_ok", "Whether the disk took the log when that was tried last.").add(
+    page.counter("reloads", "Times that a changed configuration was applied.").add(gateway["config"]["reloads"])
+    page.gauge("store_ok", "Whether the last write of the log to disk succeeded.").add(
         int(not gateway.get("store_error"))
     )
 
@@ -160,21 +163,21 @@ def _tags(page: Page, gateway: Status) -> None:
 def _writes(page: Page, gateway: Status) -> None:
     writes = gateway["writes"]
     page.gauge("writes_allowed", "Whether this run may write.").add(int(writes["allowed"]))
-    page.gauge("outputs_safe", "Whether the outputs are at their safe values because the PLC is gone.").add(
+    page.gauge("outputs_safe", "Whether the outputs are at their safe values because the PLC was lost.").add(
         int(writes["safe"])
     )
-    counted = page.counter("writes", "Writes of outputs, by how they ended; repeated ones are done again as asked.")
+    counted = page.counter("writes", "Writes of outputs, by result; `repeated` ones are periodic repetitions.")
     for result in ("done", "failed", "refused", "repeated"):
         counted.add(writes[result], result=result)
     held = [o for o in gateway["outputs"] if o["wanted"] is not None and o["wanted"] != o["held"]]
-    page.gauge("outputs_pending", "Outputs whose device does not hold yet what is wanted.").add(len(held))
-    page.gauge("plc_alive", "Whether the gateway sees the PLC alive.").add(int(gateway["plc"]["alive"]))
+    page.gauge("outputs_pending", "Outputs whose device does not hold the commanded value yet.").add(len(held))
+    page.gauge("plc_alive", "Whether the gateway receives the PLC's heartbeat.").add(int(gateway["plc"]["alive"]))
     page.counter("plc_losses", "How often the gateway lost the PLC.").add(gateway["plc"]["losses"])
 
 
 def _mailboxes(page: Page, gateway: Status) -> None:
-    queued = page.gauge("mailbox_queued", "Messages of a transmitter that wait.")
-    counted = page.counter("mailbox_messages", "Messages of a transmitter, by what became of them.")
+    queued = page.gauge("mailbox_queued", "Queued messages of a transmitter.")
+    counted = page.counter("mailbox_messages", "Messages of a transmitter, by result.")
     for name, box in _some(gateway["mailboxes"]):
         queued.add(box["queued"], device=name)
         for what in ("received", "sent", "taken", "dropped", "waits", "commands_refused"):
@@ -183,7 +186,7 @@ def _mailboxes(page: Page, gateway: Status) -> None:
 
 def _masters(page: Page, gateway: Status) -> None:
     """Add the clients' requests: servers and bridges."""
-    counted = page.counter("server_events", "What a server or a bridge counted, by event.")
+    counted = page.counter("server_events", "Counters of a server or bridge, by event.")
     for kind in ("serve", "bridge"):
         for name, server in _some(gateway[kind]):
             for event, count in server.items():
@@ -193,7 +196,7 @@ def _masters(page: Page, gateway: Status) -> None:
 
 def _watchers(page: Page, gateway: Status) -> None:
     """Count devices by their problem, so that an alert needs no text matching."""
-    page.gauge("devices_wrong", "Devices that are others than the system file says.").add(
+    page.gauge("devices_wrong", "Devices that differ from those in the system file.").add(
         sum(bool(d["identity_error"]) for d in gateway["devices"].values())
     )
 
@@ -201,7 +204,7 @@ def _watchers(page: Page, gateway: Status) -> None:
 def _plc(page: Page, plc: PlcStatus) -> None:
     per_task: list[tuple[str, str, Callable[[ScanStatus], Any]]] = [
         ("scans", "Scans of a task.", lambda t: t.scans),
-        ("missed_periods", "Periods in which a task's scan did not begin.", lambda t: t.missed_periods),
+        ("missed_periods", "Periods in which a task's scan did not start.", lambda t: t.missed_periods),
         ("overruns", "Scans that took longer than their period.", lambda t: t.overruns),
     ]
     tasks: dict[str, ScanStatus] = dict(_some(plc.tasks or {"main": plc}))
@@ -212,12 +215,12 @@ def _plc(page: Page, plc: PlcStatus) -> None:
     spreads: list[tuple[str, str, Callable[[ScanStatus], Spread]]] = [
         (
             "plc_lateness_seconds",
-            "How late scans began, since the start, by quantile; 1 is the worst.",
+            "Start delay of scans since the start, by quantile; 1 is the maximum.",
             lambda t: t.lateness_us,
         ),
         (
             "plc_scan_seconds",
-            "How long scans took, since the start, by quantile; 1 is the longest.",
+            "Duration of scans since the start, by quantile; 1 is the maximum.",
             lambda t: t.duration_us,
         ),
     ]
@@ -234,7 +237,7 @@ def _plc(page: Page, plc: PlcStatus) -> None:
     )
     page.counter("plc_restarts", "Restarts of the PLC's program after a failure.").add(plc.restarts)
     page.gauge("plc_forces", "Variables that are forced.").add(len(plc.forces))
-    counted = page.counter("plc_events", "What the PLC counted of its image and its messages, by event.")
+    counted = page.counter("plc_events", "Counters of the PLC's process image and messages, by event.")
     for event, count in plc.counters.items():
         counted.add(count, event=event)
 

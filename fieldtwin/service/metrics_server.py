@@ -25,7 +25,7 @@ def parse_place(text: str) -> tuple[str, int]:
     """Parse ``HOST:PORT``, ``:PORT`` or ``PORT``; the default host is 127.0.0.1. Port 0 is any free port."""
     found = _PLACE.match(text)
     if found is None or int(found["port"]) > 65535:
-        raise UsageError("where metrics are served", expected="HOST:PORT such as 127.0.0.1:9464", got=text)
+        raise UsageError("the address of the metrics", expected="HOST:PORT such as 127.0.0.1:9464", got=text)
     return (found["host"] or "127.0.0.1").strip("[]"), int(found["port"])
 
 
@@ -45,7 +45,7 @@ class MetricsServer:
             self._server = await asyncio.start_server(self._serve, host, port, limit=MOST_HEAD)
         except OSError as e:
             kind = EndpointBusy if e.errno == errno.EADDRINUSE else Unreachable
-            raise kind("cannot serve metrics here", where=f"{host}:{port}", hint=e.strerror or str(e)) from e
+            raise kind("cannot serve metrics at this address", where=f"{host}:{port}", hint=e.strerror or str(e)) from e
         at = self._server.sockets[0].getsockname()
         return f"http://{f'[{at[0]}]' if ':' in at[0] else at[0]}:{at[1]}/metrics"
 
@@ -88,7 +88,7 @@ class MetricsServer:
         if method not in (b"GET", b"HEAD"):
             return self._refusal("405 Method Not Allowed", "GET /metrics", "Allow: GET, HEAD\r\n")
         if path != b"/metrics":
-            return self._refusal("404 Not Found", "/metrics is all there is")
+            return self._refusal("404 Not Found", "the only page is /metrics")
         self.served += 1
         return _response("200 OK", self._page(), CONTENT_TYPE, with_body=method == b"GET")
 

@@ -74,7 +74,7 @@ class Results:
     def pytest_terminal_summary(self, terminalreporter: Any) -> None:
         where = self._config.getoption("--fieldtwin-html")
         if self._problem:
-            terminalreporter.write_line(f"fieldtwin: no report: {self._problem}", red=True)
+            terminalreporter.write_line(f"fieldtwin: no report was written: {self._problem}", red=True)
         else:
             terminalreporter.write_sep("-", f"report: {where}")
 

@@ -104,7 +104,7 @@ class Runner:
         except OSError as e:
             self._said.close()
             raise FieldtwinUnavailable(
-                f"cannot start {self.command[0]!r}: {e.strerror or e}; --fieldtwin-command or {COMMAND_VARIABLE} says what to run"
+                f"cannot start {self.command[0]!r}: {e.strerror or e}; --fieldtwin-command or {COMMAND_VARIABLE} sets the command"
             ) from e
         threading.Thread(target=_pump, args=(process, self._answers), daemon=True, name="fieldtwin").start()
         self._process = process
@@ -120,10 +120,10 @@ class Runner:
             code = None
         self._said.seek(0)
         last = "".join(deque(self._said, maxlen=5)).strip()
-        ended = "does not answer any more" if code is None else f"ended with status {code}"
+        ended = "no longer answers" if code is None else f"ended with status {code}"
         hint = ""
         if "No module named" in last:  # this environment has the plugin alone
-            last, hint = last.splitlines()[-1], f"; --fieldtwin-command or {COMMAND_VARIABLE} says what to run"
+            last, hint = last.splitlines()[-1], f"; --fieldtwin-command or {COMMAND_VARIABLE} sets the command"
         return FieldtwinUnavailable(f"{shlex.join(self.command)} test-host {ended}: {last or 'it said nothing'}{hint}")
 
     def close(self) -> None:

@@ -61,7 +61,7 @@ class RunningPlc:
             if time.monotonic() >= until:
                 wanted = " and ".join([f"{value!r}"] * (value is not ...) + [f"of quality {quality!r}"] * bool(quality))
                 raise AssertionError(
-                    f"{name} was to be {wanted} within {within_s:g} s; it is {row['value']!r}, {row['quality']}"
+                    f"{name} should become {wanted} within {within_s:g} s; it is {row['value']!r}, {row['quality']}"
                 )
             time.sleep(POLL_S)
 

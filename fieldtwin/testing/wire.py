@@ -241,7 +241,7 @@ class _Wanted:
     def of(cls, times: int | None, at_least: int | None, at_most: int | None, like: dict[str, Any]) -> _Wanted:
         __tracebackhide__ = True
         if times is not None and (at_least is not None or at_most is not None):
-            raise TypeError("times is an exact number: give times, or at_least and at_most")
+            raise TypeError("times is exact: give either times, or at_least and at_most")
         if at_least is not None and at_most is not None and at_least > at_most:
             raise TypeError(f"at least {at_least} and at most {at_most} can never be met")
         if times is None and at_least is None and at_most is None:

@@ -84,9 +84,9 @@ class AdapterConnection(CanConnection):
                 await self._loop.run_in_executor(self._sender, self._bus.send, message, SEND_TIMEOUT_S)
             except can.CanTimeoutError as e:
                 raise WireError(
-                    f"the adapter took no frame for {SEND_TIMEOUT_S:g} s",
+                    f"the adapter did not accept a frame for {SEND_TIMEOUT_S:g} s",
                     where=str(self.endpoint),
-                    hint="does another node acknowledge? is the bit rate right, the cable in?",
+                    hint="check that another node acknowledges, the bit rate, and the cable",
                 ) from e
             except (OSError, can.CanError, ValueError) as e:
                 self.feed_lost(_gone(self.endpoint, e))
@@ -156,13 +156,13 @@ def _bitrate(endpoint: Endpoint, asked: int) -> int:
         raise UsageError(f"{endpoint}: bitrate", expected="bit/s, such as 250000", got=repr(text))
     said = int(text)
     if said and asked and said != asked:
-        raise UsageError(f"{endpoint}: two bit rates", expected=f"{asked} bit/s", got=f"{said} bit/s")
+        raise UsageError(f"{endpoint}: two different bit rates", expected=f"{asked} bit/s", got=f"{said} bit/s")
     rate = said or asked
     if not rate and endpoint.interface not in RATELESS:
         raise UsageError(
             f"{endpoint}: an adapter needs the bit rate of its bus",
-            expected="?bitrate=250000 behind the channel",
-            hint="one that guesses wrong destroys everybody's frames",
+            expected="?bitrate=250000 after the channel",
+            hint="an adapter with a wrong bit rate destroys the frames of all nodes",
         )
     return rate
 
@@ -225,14 +225,16 @@ def _open(endpoint: Endpoint, words: dict[str, Any]) -> can.BusABC:
             raise _no_driver(endpoint, e) from e
         if "busy" in str(e).lower() or "in use" in str(e).lower():
             raise EndpointBusy("the adapter is held by another program", where=str(endpoint), hint=str(e)) from e
-        raise Unreachable(f"cannot open the adapter: {e}", where=str(endpoint), hint="is it plugged in?") from e
+        raise Unreachable(
+            f"cannot open the adapter: {e}", where=str(endpoint), hint="check that it is plugged in"
+        ) from e
 
 
 def _no_driver(endpoint: Endpoint, error: Exception) -> UsageError:
     return UsageError(
-        f"{endpoint}: the driver of {endpoint.interface} is not on this computer",
+        f"{endpoint}: the driver of {endpoint.interface} is not installed",
         got=str(error),
-        hint="its maker's library, and python-can's extra for it: pip install 'python-can[...]'",
+        hint="install the maker's library, and python-can's extra for it: pip install 'python-can[...]'",
     )
 
 

@@ -59,7 +59,7 @@ class SocketCanConnection(CanConnection):
         it runs at a bit rate other than `bitrate` (bit/s; a virtual interface has no bit rate and accepts any).
         """
         if endpoint.interface != "socketcan":
-            raise UsageError(f"{endpoint} is no kernel CAN interface", expected="can:socketcan/IFACE")
+            raise UsageError(f"{endpoint} is not a kernel CAN interface", expected="can:socketcan/IFACE")
         _check(endpoint, bitrate)
         try:
             bus = can.Bus(interface="socketcan", channel=endpoint.path, receive_own_messages=False, ignore_config=True)
@@ -82,7 +82,7 @@ class SocketCanConnection(CanConnection):
                     raise WireError(
                         f"the transmit queue stayed full for {SEND_TIMEOUT_S:g} s",
                         where=str(self.endpoint),
-                        hint="does another node acknowledge? is the bus off, the bit rate right, the cable in?",
+                        hint="check the cable, the bit rate, that another node acknowledges, and that the bus is not off",
                     )
                 await asyncio.sleep(backoff_s)
                 backoff_s = min(2 * backoff_s, LAST_BACKOFF_S)
@@ -157,12 +157,12 @@ def _check(endpoint: Endpoint, bitrate: int) -> None:
     except OSError as e:
         raise _unreachable(endpoint, e) from e
     if not link.is_can:
-        raise Unreachable(f"{endpoint.path} is no CAN interface", where=str(endpoint), hint="ip -brief link show")
+        raise Unreachable(f"{endpoint.path} is not a CAN interface", where=str(endpoint), hint="ip -brief link show")
     if not link.is_up:
         raise Unreachable(f"{endpoint.path} is down", where=str(endpoint), hint=_up(endpoint))
     if link.bitrate and bitrate and link.bitrate != bitrate:
         raise UsageError(
-            f"{endpoint.path} runs at another bit rate",
+            f"{endpoint.path} runs at a different bit rate",
             expected=f"{bitrate} bit/s",
             got=f"{link.bitrate} bit/s",
             where=str(endpoint),

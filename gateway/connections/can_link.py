@@ -65,7 +65,7 @@ def read_link(answer: bytes) -> CanLink:
     length, kind_of_message, *_ = _MESSAGE.unpack_from(answer)
     if kind_of_message != _RTM_NEWLINK:
         code = -struct.unpack_from("=i", answer, _MESSAGE.size)[0]
-        raise OSError(code, "the kernel tells nothing about the interface")
+        raise OSError(code, "the kernel gives no information about the interface")
     _, link_type, _, flags, _ = _LINK.unpack_from(answer, _MESSAGE.size)
     info = dict(_attributes(dict(_attributes(answer[_MESSAGE.size + _LINK.size : length])).get(_IFLA_LINKINFO, b"")))
     kind = info.get(_IFLA_INFO_KIND, b"").rstrip(b"\0").decode("ascii", "replace")

@@ -134,7 +134,11 @@ class TcpListener:
         Raises `EndpointBusy`, or `Unreachable` with a hint how to solve it.
         """
         if endpoint.scheme not in ("tcp", "tls"):
-            raise UsageError("cannot listen there", expected="tcp://HOST:PORT or tls://HOST:PORT", got=str(endpoint))
+            raise UsageError(
+                "cannot listen on this kind of endpoint",
+                expected="tcp://HOST:PORT or tls://HOST:PORT",
+                got=str(endpoint),
+            )
         loop = asyncio.get_running_loop()
         tls = await loop.run_in_executor(None, server_context, endpoint) if endpoint.scheme == "tls" else None
         sock: socket.socket | None = None

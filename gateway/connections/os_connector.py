@@ -52,7 +52,7 @@ class OsConnector(Connector):
                     expected=f"rtu:{endpoint.path} on the side that opens it",
                 )
             case scheme:
-                raise UsageError(f"{endpoint}: {scheme}: cannot be opened here", expected=BYTE_SCHEMES)
+                raise UsageError(f"{endpoint}: {scheme}: cannot be opened by this program", expected=BYTE_SCHEMES)
 
     async def open_can(self, endpoint: Endpoint, bitrate: int) -> CanConnection:
         """Open ``can:socketcan/CHANNEL``, ``can:fieldtwin/HOST:PORT``, or any other interface of python-can.
@@ -60,7 +60,7 @@ class OsConnector(Connector):
         Raises the errors of `Connector`.
         """
         if not endpoint.is_can:
-            raise UsageError(f"{endpoint} is no CAN bus", expected="can:INTERFACE/CHANNEL")
+            raise UsageError(f"{endpoint} is not a CAN bus", expected="can:INTERFACE/CHANNEL")
         match endpoint.interface:
             case "socketcan":
                 from fieldtwin.gateway.connections.can_end import SocketCanConnection

@@ -93,7 +93,7 @@ def _set_rs485(port: Port, endpoint: Endpoint) -> None:
             expected="a driver that switches the direction (ioctl TIOCSRS485)",
             got=getattr(e, "strerror", None) or str(e),
             where=str(endpoint),
-            hint="leave rs485=1 out where the adapter switches by itself",
+            hint="remove rs485=1 if the adapter switches the direction by itself",
         ) from e
 
 
@@ -106,13 +106,15 @@ def close_unwanted(opening: asyncio.Future[Port]) -> None:
 def _cannot_open(endpoint: Endpoint, number: int, text: str) -> Unreachable:
     where = str(endpoint)
     if number in _BUSY:
-        return EndpointBusy("the port is held by another program", where=where, hint=f"fuser {endpoint.path} names it")
+        return EndpointBusy(
+            "the port is held by another program", where=where, hint=f"find it with: fuser {endpoint.path}"
+        )
     if number in _ABSENT:
         return Unreachable("there is no such serial port", where=where, hint=_ports_hint())
     if number in (errno.EACCES, errno.EPERM):
         return Unreachable("no permission for the port", where=where, hint=_group_hint(endpoint.path))
     if number == errno.ENOTTY or "Could not configure port" in text:  # pyserial gives this one no number
-        return Unreachable("this is no serial port", where=where, hint=_ports_hint())
+        return Unreachable("this is not a serial port", where=where, hint=_ports_hint())
     return Unreachable(f"cannot open the port: {os.strerror(number) if number else text}", where=where)
 
 
@@ -128,7 +130,7 @@ def ports_here() -> list[str]:
 
 def _ports_hint() -> str:
     names = ports_here()
-    return f"ports here: {', '.join(names[:8])}" if names else "this computer has no serial port now"
+    return f"ports here: {', '.join(names[:8])}" if names else "this computer has no serial port"
 
 
 def _group_hint(path: str) -> str:

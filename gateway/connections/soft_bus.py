@@ -175,7 +175,9 @@ class _Wire(asyncio.Protocol):
             for start in range(0, whole, RECORD_SIZE):
                 self._connection.on_record(records[start : start + RECORD_SIZE])
         except Desync as e:
-            self._connection.on_lost(ConnectionLost(f"the bus broke its protocol: {e}", where=self._where()))
+            self._connection.on_lost(
+                ConnectionLost(f"the software CAN bus violated its protocol: {e}", where=self._where())
+            )
             self._abort()
 
     def connection_lost(self, exc: Exception | None) -> None:
@@ -239,7 +241,7 @@ class SoftBus(can.BusABC):
         single_handle: bool = True,  # python-can's programs pass it to every interface; every handle is single here
     ) -> None:
         if data_bitrate and not fd:
-            raise can.CanInitializationError("a data bit rate is for CAN FD: fd=True")
+            raise can.CanInitializationError("a data bit rate needs CAN FD: fd=True")
         self._fd = fd
         self._record_size = FD_RECORD_SIZE if fd else RECORD_SIZE
         clock = WallClock()
@@ -360,7 +362,7 @@ class SoftBus(can.BusABC):
             left_s = None if deadline_ns is None else max(0, deadline_ns - self._clock.monotonic_ns()) / NS_PER_S
             try:
                 if not select.select([], [self._socket], [], left_s)[1]:
-                    raise can.CanTimeoutError("the software CAN bus takes no more frames now")
+                    raise can.CanTimeoutError("the software CAN bus accepts no more frames at present")
                 self._unsent = self._unsent[self._socket.send(self._unsent) :]
             except can.CanTimeoutError:
                 raise  # CanTimeoutError is also an OSError, through TimeoutError
@@ -408,7 +410,9 @@ def _frame_of(msg: can.Message) -> CanFrame:
 
 
 def _nobody(error: OSError, where: str) -> Unreachable:
-    return Unreachable(f"no software CAN bus: {os_reason(error)}", where=where, hint="start one: fieldtwin can-bus")
+    return Unreachable(
+        f"cannot reach the software CAN bus: {os_reason(error)}", where=where, hint="start one: fieldtwin can-bus"
+    )
 
 
 def _loop_ns(loop: asyncio.AbstractEventLoop) -> int:

@@ -70,32 +70,34 @@ def read_answer(record: bytes, wanted_bitrate: int, where: str, *, fd: bool = Fa
     different version or is not a software CAN bus.
     """
     if len(record) != RECORD_SIZE:
-        raise Unreachable("what answers there is no software CAN bus", got=f"{len(record)} bytes", where=where)
+        raise Unreachable(
+            "the program that answers there is not a software CAN bus", got=f"{len(record)} bytes", where=where
+        )
     mark, version, status, _, bitrate, bus_ns, magic, window, data_kbitrate = _LAYOUT.unpack(record)
     if mark != _MARK or magic != _MAGIC:
-        raise Unreachable("what answers there is no software CAN bus", got=record.hex(), where=where)
+        raise Unreachable("the program that answers there is not a software CAN bus", got=record.hex(), where=where)
     if status == _WRONG_BITRATE and wanted_bitrate in (0, bitrate):
         raise UsageError(
-            "the software CAN bus has another data bit rate",
+            "the software CAN bus has a different data bit rate",
             expected=f"{data_bitrate} bit/s",
             got=f"{data_kbitrate * 1000} bit/s",
             where=where,
-            hint="start the bus with that one: fieldtwin can-bus --data-bitrate N",
+            hint="start the bus with this rate: fieldtwin can-bus --data-bitrate N",
         )
     if status == _WRONG_BITRATE:
         raise UsageError(
-            "the software CAN bus runs at another bit rate",
+            "the software CAN bus runs at a different bit rate",
             expected=f"{wanted_bitrate} bit/s",
             got=f"{bitrate} bit/s",
             where=where,
-            hint="set the bit rate of the bus in the system file, or start the bus with that one",
+            hint="set the bit rate of the bus in the system file, or start the bus with this rate",
         )
     if status == _FULL:
-        raise EndpointBusy("the software CAN bus has no room for another node", where=where)
+        raise EndpointBusy("the software CAN bus is full", where=where)
     wanted_version = _FD_VERSION if fd else _VERSION
     if status != _WELCOME or version != wanted_version:
         raise Unreachable(
-            "the software CAN bus speaks another version",
+            "the software CAN bus uses a different protocol version",
             expected=f"version {wanted_version}",
             got=f"version {version}, status {status}",
             where=where,

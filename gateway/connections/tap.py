@@ -74,7 +74,7 @@ class _Observers:
         self._taps = tuple(other for other in self._taps if other is not tap)
         self.failed += 1
         asyncio.get_running_loop().call_exception_handler(
-            {"message": f"a tap on {endpoint} failed and was taken off: {tap!r}", "exception": error}
+            {"message": f"a tap on {endpoint} failed and was removed: {tap!r}", "exception": error}
         )
 
 

@@ -81,7 +81,7 @@ class TcpConnection(ByteConnection):
     def _cannot_open(self, error: OSError) -> Unreachable:
         where = str(self.endpoint)
         if isinstance(error, ConnectionRefusedError):
-            hint = f"the host answers and has no program on port {self.endpoint.port}"
+            hint = f"the host answers, but no program listens on port {self.endpoint.port}"
             return Unreachable("connection refused", where=where, hint=hint)
         return Unreachable(f"cannot connect: {error.strerror or error}", where=where)
 
@@ -175,7 +175,7 @@ class _Wire(asyncio.BufferedProtocol):
 
 
 def _ended(endpoint: Endpoint) -> ConnectionLost:
-    return ConnectionLost("the far side closed the connection", where=str(endpoint))
+    return ConnectionLost("the peer closed the connection", where=str(endpoint))
 
 
 async def resolve(endpoint: Endpoint, kind: socket.SocketKind) -> list[str]:

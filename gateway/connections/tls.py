@@ -64,7 +64,7 @@ class TlsConnection(TcpConnection):
     def _cannot_open(self, error: OSError) -> Unreachable:
         where = str(self.endpoint)
         if isinstance(error, ssl.SSLCertVerificationError):
-            hint = "ca= names who is trusted, name= whom the certificate is for"
+            hint = "ca= is the trusted authority, name= the name in the server's certificate"
             return Unreachable(f"the server's certificate is refused: {error.verify_message}", where=where, hint=hint)
         if isinstance(error, ssl.SSLError):
             return Unreachable(f"no TLS with that server: {_reason(error)}", where=where)
@@ -84,7 +84,7 @@ def _context(endpoint: Endpoint) -> tuple[ssl.SSLContext, str]:
     where = str(endpoint)
     ca, certificate, key = (endpoint.param(name) for name in ("ca", "cert", "key"))
     if key and not certificate:
-        raise UsageError("a key is of no use without its certificate", expected="cert=FILE", where=where)
+        raise UsageError("a key needs its certificate", expected="cert=FILE", where=where)
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)  # verifies certificate and name
     context.minimum_version = ssl.TLSVersion.TLSv1_2  # MBTLS 6.2
     try:

@@ -21,12 +21,12 @@ def check_files(endpoint: Endpoint) -> None:
     missing = [name for name in ("cert", "ca") if not endpoint.param(name)]
     if missing:
         raise UsageError(
-            "a TLS server shows a certificate and asks for the clients'",
+            "a TLS server needs a certificate and the authority of its clients' certificates",
             expected="cert=FILE&key=FILE&ca=FILE",
             got=f"no {' and no '.join(missing)}",
         )
     if endpoint.param("name"):
-        raise UsageError("name= is for who connects", expected="cert=FILE&key=FILE&ca=FILE", got=str(endpoint))
+        raise UsageError("name= is only for clients", expected="cert=FILE&key=FILE&ca=FILE", got=str(endpoint))
 
 
 def server_context(endpoint: Endpoint) -> ssl.SSLContext:

@@ -52,7 +52,7 @@ class UdpConnection(ByteConnection):
         except TimeoutError as e:
             raise Unreachable(f"no answer from the name service within {timeout_s:g} s", where=where) from e
         except OSError as e:
-            raise Unreachable(f"cannot send there: {e.strerror or e}", where=where) from e
+            raise Unreachable(f"cannot send to this address: {e.strerror or e}", where=where) from e
         return connection
 
     async def write(self, data: bytes) -> None:
@@ -102,8 +102,8 @@ class _Wire(asyncio.DatagramProtocol):
     def error_received(self, exc: Exception) -> None:
         endpoint = self._connection.endpoint
         if isinstance(exc, ConnectionRefusedError):
-            hint = f"the host answers and has no program on UDP port {endpoint.port}"
-            self._connection.end(ConnectionLost("nobody listens there", where=str(endpoint), hint=hint))
+            hint = f"the host answers, but no program listens on UDP port {endpoint.port}"
+            self._connection.end(ConnectionLost("no program listens there", where=str(endpoint), hint=hint))
         else:
             self._connection.end(ConnectionLost(f"cannot send: {_why(exc)}", where=str(endpoint)))
 

@@ -80,12 +80,12 @@ class ControlServer:
         process.
         """
         if not self._token and host not in ("127.0.0.1", "::1", "localhost"):
-            raise UsageError("a control channel off loopback needs a token", where=f"{host}:{port}")
+            raise UsageError("a control channel that is not on loopback needs a token", where=f"{host}:{port}")
         try:
             server = await asyncio.start_server(self._serve_tcp, host, port, limit=MAX_LINE)
         except OSError as e:
             raise Unreachable(
-                f"cannot listen for control: {os_reason(e)}", where=f"{host}:{port}", hint="port 0 takes a free one"
+                f"cannot listen for control: {os_reason(e)}", where=f"{host}:{port}", hint="port 0 selects a free port"
             ) from e
         self._servers.append(server)
         return int(server.sockets[0].getsockname()[1])
@@ -141,10 +141,10 @@ class ControlServer:
             token = str(request.get("token", ""))
             trusted = trusted or hmac.compare_digest(token.encode(errors="replace"), self._token.encode())
             if not trusted:
-                raise UsageError("this control channel wants its token")
+                raise UsageError("this control channel requires its token")
             verb = self._verbs.get(str(request.get("verb")))
             if verb is None:
-                raise UsageError(f"unknown verb {request.get('verb')!r}", expected=", ".join(sorted(self._verbs)))
+                raise UsageError(f"unknown command {request.get('verb')!r}", expected=", ".join(sorted(self._verbs)))
             return _encode(request_id, {"ok": True, "result": await verb(request.get("args") or {})}), trusted
         except FieldtwinError as e:
             error = e
@@ -195,7 +195,9 @@ async def _refuse_if_alive(path: Path) -> None:
     except OSError:
         return  # no process listens: the socket was left over from a process that was killed
     writer.close()
-    raise EndpointBusy("another process serves control here", where=str(path), hint="is this instance running already?")
+    raise EndpointBusy(
+        "another process already serves this control channel", where=str(path), hint="is this instance running already?"
+    )
 
 
 def _describe(e: FieldtwinError) -> dict[str, Any]:
@@ -287,7 +289,7 @@ class ControlClient:
                 raise ConnectionLost("the other process closed its control channel", where=self._where)
             answer = json.loads(line)
             if not isinstance(answer, dict):
-                raise ConnectionLost("the other process does not speak the control protocol", where=self._where)
+                raise ConnectionLost("the other process does not use the control protocol", where=self._where)
             if answer.get("id") == request_id:  # an answer to a call that timed out earlier is skipped
                 return answer
 

@@ -51,7 +51,7 @@ class Device(ABC):
         kind = type(self).__name__
         if connection.type not in self.wire_types:
             expected = " or ".join(sorted(t.value for t in self.wire_types))
-            raise Bug(f"a {kind} on another kind of wire", expected=expected, got=connection.type.value)
+            raise Bug(f"a {kind} on a different kind of connection", expected=expected, got=connection.type.value)
         if not commands:
             raise Bug(f"a {kind} that accepts no command", expected="a command list that is not empty")
         self.connection = connection
@@ -69,7 +69,7 @@ class Device(ABC):
         """ExecuteCommand. Raises `UnknownCommand`, having done nothing, unless `command` is in the command list."""
         if command.name not in self.command_list:
             raise UnknownCommand(
-                f"no command {command.name!r}" if command.name else "a message that is no command",
+                f"no command {command.name!r}" if command.name else "a message that is not a command",
                 expected=", ".join(sorted(self.command_list)),
                 got=command.data.hex(" ") or "no bytes",
             )

@@ -111,7 +111,7 @@ class Endpoint:
             endpoint = cls(scheme, interface=interface, path=channel, params=params)
         else:
             if not rest:
-                raise UsageError(f"endpoint {url!r} names no port", expected=f"{scheme}:PATH")
+                raise UsageError(f"endpoint {url!r} has no port", expected=f"{scheme}:PATH")
             endpoint = cls(scheme, path=rest, params=params)
         _check_params(endpoint)
         return endpoint
@@ -164,7 +164,7 @@ class Endpoint:
             return None
         if self.scheme != "rtu":
             raise UsageError(
-                f"endpoint {self}: silence_us", expected="an rtu: endpoint; no other framing ends by silence"
+                f"endpoint {self}: silence_us", expected="an rtu: endpoint; only RTU frames end with a silence"
             )
         least_us = -int(-3.5e6 * self.serial.char_time_s // 1)
         if not _NUMBER.match(text) or not least_us <= int(text) <= MOST_SILENCE_US:
@@ -210,7 +210,7 @@ def _check_params(endpoint: Endpoint) -> None:
     names = [name for name, _ in endpoint.params]
     for name in names:
         if names.count(name) > 1:
-            raise UsageError(f"endpoint {endpoint}: {name!r} is said more than once")
+            raise UsageError(f"endpoint {endpoint}: {name!r} is given more than once")
         known = SERIAL_PARAMS if endpoint.is_serial else TLS_PARAMS if endpoint.scheme == "tls" else ()
         if known and name not in known:
             raise UsageError(f"endpoint {endpoint}: unknown setting", expected=" or ".join(known), got=repr(name))

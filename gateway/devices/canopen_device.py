@@ -173,7 +173,7 @@ class CanopenDriver(DeviceDriver):
         differences = await identity_differences(self.master, self.node, self.config.canopen.identity)
         if differences:
             self.identity_error = ", ".join(f"{name}: {difference}" for name, difference in differences.items())
-            raise WrongDevice("another node answers", got=self.identity_error, where=self.config.where)
+            raise WrongDevice("a different node answers", got=self.identity_error, where=self.config.where)
         wrong: dict[str, object] = {}
         for name, expected in self.config.expect.items():
             tag = self.profile.tags[name]
@@ -184,7 +184,7 @@ class CanopenDriver(DeviceDriver):
         if wrong:
             expected = ", ".join(f"{n} {self.config.expect[n]!r}" for n in wrong)
             raise WrongDevice(
-                "another node answers", expected=expected, got=self.identity_error, where=self.config.where
+                "a different node answers", expected=expected, got=self.identity_error, where=self.config.where
             )
 
     async def read_once(self) -> None:
@@ -203,7 +203,7 @@ class CanopenDriver(DeviceDriver):
         """What `configure` may write, in words; empty if the system file configures nothing that is written."""
         canopen, parts = self.config.canopen, []
         if canopen.configuration is not None:
-            parts.append(f"{canopen.dcf} unless it holds that")
+            parts.append(f"{canopen.dcf}(only if the node holds different values)")
         if self.config.heartbeat is not None and self.config.heartbeat.producer_ms is not None:
             parts.append("heartbeat")
         if self.config.tpdo1 is not None:
@@ -400,7 +400,7 @@ class CanopenDriver(DeviceDriver):
     async def send_rpdo(self, rpdo: Rpdo, values: Mapping[str, bytes]) -> None:
         """Send one frame with `values` by tag. Process data is not queued: only the newest value counts."""
         if self.identity_error:
-            raise NotAllowed("another node answers: nothing is written to it", got=self.identity_error).at(
+            raise NotAllowed("a different node answers: nothing is written to it", got=self.identity_error).at(
                 self.config.where
             )
         await self.master.send(rpdo.frame(values))
@@ -429,10 +429,10 @@ class CanopenDriver(DeviceDriver):
 
     async def _write(self, item: DATA) -> None:
         if not isinstance(item, COMMAND):
-            raise Bug("a node takes commands only", got=type(item).__name__, where=self.config.where)
+            raise Bug("a node accepts only commands", got=type(item).__name__, where=self.config.where)
         self.check(item)
         if self.identity_error:
-            raise NotAllowed("another node answers: nothing is written to it", got=self.identity_error).at(
+            raise NotAllowed("a different node answers: nothing is written to it", got=self.identity_error).at(
                 self.config.where
             )
         if item.name in NMT_COMMANDS:

@@ -63,7 +63,7 @@ class DeviceDriver(ABC):
         """Init: use this connection from now on; items that waited to be sent over an earlier one stay queued."""
         if connection.inbound.type not in self.wire_types:
             raise FileInvalid(
-                f"device {self.config.name!r} cannot stand on this bus",
+                f"device {self.config.name!r} does not fit this bus",
                 path=self.profile.path,
                 expected=" or ".join(sorted(t.value for t in self.wire_types)),
                 got=connection.inbound.type.value,

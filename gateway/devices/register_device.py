@@ -152,7 +152,7 @@ class RegisterDriver(DeviceDriver):
         if wrong:
             expected = ", ".join(f"{n} {self.config.expect[n]!r}" for n in wrong)
             raise WrongDevice(
-                "another device answers", expected=expected, got=self.identity_error, where=self.config.where
+                "a different device answers", expected=expected, got=self.identity_error, where=self.config.where
             )
 
     def cost(self, what: str) -> int:
@@ -312,7 +312,7 @@ class RegisterDriver(DeviceDriver):
         """Write a command's tag with one request and read it back, so that the published value is what the device
         holds."""
         if not isinstance(item, COMMAND):
-            raise Bug("a register device takes commands only", got=type(item).__name__, where=self.config.where)
+            raise Bug("a register device accepts only commands", got=type(item).__name__, where=self.config.where)
         self.check(item)
         tag = self._tag_of(item)
         await self._write_tag(tag, item.data)
@@ -324,7 +324,7 @@ class RegisterDriver(DeviceDriver):
             held = await self._read_tag(tag)
             if int.from_bytes(held.raw) != int.from_bytes(item.data):  # a coil is read back as one byte
                 raise VerifyFailed(
-                    f"{item.name}: acknowledged, and not held",
+                    f"{item.name}: the device acknowledged the write, but holds a different value",
                     expected=item.data.hex(),
                     got=held.raw.hex(),
                     where=f"{self.config.where} {tag.registers}",

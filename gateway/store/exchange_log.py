@@ -47,7 +47,7 @@ class ExchangeLog:
             raise Unreachable(f"cannot open the exchange log: {e}", where=str(path)) from e
         except sqlite3.DatabaseError as e:
             raise FileInvalid(
-                f"not a store of ours: {e}", path=str(path), hint="move it away; a new one is made"
+                f"not a store of fieldtwin: {e}", path=str(path), hint="move the file away; a new one is created"
             ) from e
 
     def _begin(self, system: str, prototype: bool) -> None:

@@ -16,7 +16,7 @@ def check_place(place: str) -> None:
     """Raise `UsageError` if a URL contains a password. The message does not repeat the password."""
     if place.startswith(URLS) and has_password(place):
         raise UsageError(
-            "a password in a URL can be read by everybody", got=without_password(place),
+            "every user of this computer can read a password in a URL", got=without_password(place),
             hint="PGPASSWORD in the environment, or ~/.pgpass (PGPASSFILE)",
         )  # fmt: skip
 

@@ -60,7 +60,7 @@ class PostgresKnowledge:
                     self._db = await self._connect()
                 return await work(self._db)
             except asyncpg.DiskFullError as e:
-                raise StoreFull("no room for more knowledge", where=self._where) from e
+                raise StoreFull("the knowledge store is full", where=self._where) from e
             except (
                 asyncpg.PostgresError,
                 asyncpg.InterfaceError,
@@ -100,7 +100,7 @@ class PostgresKnowledge:
         if version > LATEST:
             raise FileInvalid(
                 "the store was written by a newer fieldtwin", path=self._where, expected=f"schema {LATEST} or older",
-                got=f"schema {version}", hint="it is left as it is",
+                got=f"schema {version}", hint="the store was not changed",
             )  # fmt: skip
         for number in range(version + 1, LATEST + 1):
             await db.execute(files("fieldtwin.gateway.store").joinpath(SCRIPTS[number]).read_text(encoding="utf-8"))

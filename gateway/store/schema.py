@@ -31,7 +31,7 @@ def refuse_newer(db: sqlite3.Connection, path: Path) -> int:
             path=str(path),
             expected=f"schema {LATEST} or older",
             got=str(version),
-            hint="it is left as it is",
+            hint="the store was not changed",
         )
     return int(version)
 

@@ -68,7 +68,7 @@ class SqliteKnowledge:
         try:
             self._db = sqlite3.connect(self.path, timeout=BUSY_S, isolation_level=None, check_same_thread=False)
         except sqlite3.OperationalError as e:
-            raise Unreachable(f"cannot open the knowledge: {e}", where=str(self.path)) from e
+            raise Unreachable(f"cannot open the knowledge store: {e}", where=str(self.path)) from e
         try:
             refuse_newer(self._db, self.path)
             self._db.execute("PRAGMA journal_mode=WAL")
@@ -113,11 +113,15 @@ class SqliteKnowledge:
             return e
         if e.sqlite_errorcode == sqlite3.SQLITE_FULL:
             return StoreFull(
-                "no room for more knowledge", where=str(self.path), hint="make room; what is kept is whole"
+                "the knowledge store is full",
+                where=str(self.path),
+                hint="free some space; the stored events are intact",
             )
         if isinstance(e, sqlite3.OperationalError):
-            return Unreachable(f"the knowledge cannot be used: {e}", where=str(self.path))
-        return FileInvalid(f"not a store of ours: {e}", path=str(self.path), hint="move it away; a new one is made")
+            return Unreachable(f"the knowledge store cannot be used: {e}", where=str(self.path))
+        return FileInvalid(
+            f"not a store of fieldtwin: {e}", path=str(self.path), hint="move the file away; a new one is created"
+        )
 
     # -- origins ----------------------------------------------------------------------------------------------------------
 
@@ -261,7 +265,7 @@ class SqliteKnowledge:
         """Return a name that another process added."""
         row = self._db.execute("SELECT text FROM event_name WHERE id = ?", (number,)).fetchone()
         if row is None:
-            raise FileInvalid(f"damaged: there are events of name {number}, and no such name", path=str(self.path))
+            raise FileInvalid(f"damaged: events refer to name {number}, which does not exist", path=str(self.path))
         self._texts[number] = str(row[0])
         return str(row[0])
 

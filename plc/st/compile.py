@@ -169,7 +169,7 @@ class _Unit:
     def _no_address(self, v: t.VarDecl) -> None:
         if v.location:
             self.env.fail(
-                v.pos, f"{v.name} AT {v.location}: addresses mean nothing here",
+                v.pos, f"{v.name} AT {v.location}: addresses are not supported",
                 hint="declare it as VAR_INPUT or VAR_OUTPUT and bind it to a tag in the system file",
             )  # fmt: skip
 
@@ -243,7 +243,7 @@ class _Unit:
         key = pou.name.lower()
         symbols = self._symbols(pou, "")
         if key in symbols:
-            self.env.fail(pou.pos, f"{pou.name} is its own result, and declared once more")
+            self.env.fail(pou.pos, f"{pou.name} is the name of the function's result, and is declared again")
         symbols.setdefault(key, Symbol(pou.name, signature.returns, f"v_{key}"))
         arguments = ", ".join(f"v_{p.name.lower()}" for p in signature.inputs + signature.in_outs)
         body = Statements(self.env, symbols, self.out, pou.name.lower())

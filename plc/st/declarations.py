@@ -133,7 +133,7 @@ class Declarations:
         if role != "VAR_OUTPUT":
             self.env.fail(
                 spec.pos,
-                "MESSAGES stand here",
+                "MESSAGES are not allowed here",
                 expected="MESSAGES as VAR_INPUT, MESSAGES[bytes, depth] as VAR_OUTPUT of a PROGRAM",
             )
         max_bytes = MESSAGE_BYTES if spec.max_bytes is None else self._constant(spec.max_bytes, "the longest message")
@@ -272,7 +272,7 @@ class Declarations:
 
     def _initial_array(self, kind: ty.Type, init: t.InitArray) -> str:
         if not isinstance(kind, ty.Array):
-            self.env.fail(init.pos, "an array's value for what is none", got=str(kind))
+            self.env.fail(init.pos, "an array value for a type that is not an array", got=str(kind))
         items, count = [], 0
         total = ty.elements(ty.Array(kind.ranges, ty.INT))
         for often, item in init.items:
@@ -289,7 +289,7 @@ class Declarations:
     def _initial_struct(self, kind: ty.Type, init: t.InitStruct) -> str:
         members = kind.fields if isinstance(kind, ty.Struct) else kind.inputs if isinstance(kind, ty.Block) else None
         if members is None:
-            self.env.fail(init.pos, "a structure's value for what is none", got=str(kind))
+            self.env.fail(init.pos, "a structure value for a type that is not a structure", got=str(kind))
         given = []
         for name, item in init.members:
             if name.lower() not in members:

@@ -113,7 +113,7 @@ class Expressions:
         if isinstance(expr, t.Literal):
             return self._literal(expr)
         if self._deep >= MAX_DEEP:
-            self.env.fail(expr.pos, "an expression nested too deep", expected=f"at most {MAX_DEEP} levels")
+            self.env.fail(expr.pos, "the expression is nested too deeply", expected=f"at most {MAX_DEEP} levels")
         self._deep += 1
         before, self.wanted = self.wanted, wanted
         try:
@@ -165,7 +165,7 @@ class Expressions:
         if isinstance(result, int) and not -(2**63) <= result < 2**64:
             self.env.fail(expr.pos, "a whole number that no type holds")
         if isinstance(result, float) and not isfinite(result):
-            self.env.fail(expr.pos, "a number beyond the range of LREAL")
+            self.env.fail(expr.pos, "a number outside the range of LREAL")
         kind: ty.Type = ty.AnyInt(result) if isinstance(result, int) else ty.AnyReal(result)
         return Value(repr(result), kind, result)
 
@@ -236,7 +236,7 @@ class Expressions:
             return timed
         kind = ty.common(left.type, right.type)
         if kind is None or not ty.is_kind(kind, "int", "real"):
-            self._mismatch(expr, left, right, "numbers of types that meet")
+            self._mismatch(expr, left, right, "numbers of compatible types")
         if isinstance(kind, ty.AnyInt | ty.AnyReal):
             return self._folded(expr, left, right)
         assert isinstance(kind, ty.Elementary)
@@ -273,7 +273,7 @@ class Expressions:
             return self.known(expr, a & b if expr.op in ("AND", "&") else a | b if expr.op == "OR" else a ^ b)
         kind = ty.common(left.type, right.type)
         if kind is None or not ty.is_kind(kind, "bool", "bits"):
-            self._mismatch(expr, left, right, "BOOL, or bit strings of types that meet")
+            self._mismatch(expr, left, right, "BOOL, or bit strings of compatible types")
         x, y = self.coerced(left, kind, expr.pos), self.coerced(right, kind, expr.pos)
         if expr.op in ("AND_THEN", "OR_ELSE") and not ty.is_kind(kind, "bool"):
             self._mismatch(expr, left, right, "BOOL")
@@ -282,7 +282,7 @@ class Expressions:
     def _comparison(self, expr: t.Binary, left: Value, right: Value) -> Value:
         kind = ty.common(left.type, right.type)
         if kind is None or not isinstance(kind, ty.Elementary | ty.AnyInt | ty.AnyReal | ty.String | ty.Enum):
-            self._mismatch(expr, left, right, "two values of types that meet")
+            self._mismatch(expr, left, right, "two values of compatible types")
         if isinstance(kind, ty.AnyInt | ty.AnyReal | ty.String):
             a, b = left.code, right.code
         else:
@@ -321,7 +321,7 @@ class Expressions:
         if symbol is None:
             return self._enum_value(ref)
         if self.only_constants and symbol.constant is None:
-            self.env.fail(ref.pos, f"{ref.name} is no constant", expected="a constant expression")
+            self.env.fail(ref.pos, f"{ref.name} is not a constant", expected="a constant expression")
         owner, _, own = symbol.code.rpartition(".")
         reference = symbol.reference or (f"_v.Member({owner}, {own!r})" if owner else "")
         value = Value(symbol.code, symbol.type, symbol.constant, True, symbol.writable, reference)
@@ -366,7 +366,7 @@ class Expressions:
     def _index(self, value: Value, selector: t.Index) -> Value:
         kind = value.type
         if not isinstance(kind, ty.Array):
-            self.env.fail(selector.pos, "an index into what is no array", got=str(kind))
+            self.env.fail(selector.pos, "an index into a value that is not an array", got=str(kind))
         if len(selector.indices) != len(kind.ranges):
             self.env.fail(
                 selector.pos, "indices", expected=f"{len(kind.ranges)} for {kind}", got=str(len(selector.indices))
@@ -388,7 +388,9 @@ class Expressions:
     def _bit(self, value: Value, selector: t.Bit) -> Value:
         kind = ty.plain(value.type)
         if not (isinstance(kind, ty.Elementary) and kind.kind in ("int", "bits")):
-            self.env.fail(selector.pos, "a bit of what has none", expected="an integer or a bit string", got=str(kind))
+            self.env.fail(
+                selector.pos, "a bit of a value without bits", expected="an integer or a bit string", got=str(kind)
+            )
         if selector.number >= kind.bits:
             self.env.fail(selector.pos, f"{kind} has bits 0 to {kind.bits - 1}", got=str(selector.number))
         return Value(f"bool({value.code} >> {selector.number} & 1)", ty.BOOL)
@@ -412,7 +414,7 @@ class Expressions:
                 + [s.name for s in self.symbols.values()]
             )
             self.env.unknown(call.pos, "a function", call.ref.name, known)
-        raise self.env.error(call.pos, "a function block is called in a statement of its own", got=call.ref.name)
+        raise self.env.error(call.pos, "a function block is called in a separate statement", got=call.ref.name)
 
     def _user_function(self, call: t.Call, signature: Signature) -> Value:
         self.env.calls.setdefault(self.pou, {}).setdefault(signature.name.lower(), call.pos)

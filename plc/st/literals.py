@@ -39,7 +39,7 @@ def constant(literal: Literal) -> Constant:
     except Malformed:
         raise
     except ValueError as e:  # more digits than Python converts
-        raise Malformed("more digits than anything holds") from e
+        raise Malformed("more digits than any type holds") from e
     if isinstance(found.value, float) and not isfinite(found.value):
         raise Malformed("a number beyond the range of its type")
     if isinstance(found.value, int) and not -(2**63) <= found.value < 2**64:
@@ -92,7 +92,7 @@ def _typed(text: str) -> Constant:
 def _of_type(name: str, value: int) -> Constant:
     target = ty.ELEMENTARY.get(name.upper())
     if target is None or target.kind not in ("int", "bits", "bool"):
-        raise Malformed(f"{name} is no integer or bit string type")
+        raise Malformed(f"{name} is not an integer or bit string type")
     if not target.low <= value <= target.high:
         raise Malformed(f"{target} holds {target.low} to {target.high}")
     return Constant(bool(value) if target.kind == "bool" else value, target)
@@ -131,7 +131,7 @@ def _string(text: str, wide: bool) -> Constant:
                 try:
                     char, i = chr(int(text[i : i + digits], 16)), i + digits
                 except ValueError as e:
-                    raise Malformed(f"${text[i]} is no escape: $$ $' $L $N $P $R $T or {digits} hex digits") from e
+                    raise Malformed(f"${text[i]} is not an escape: $$ $' $L $N $P $R $T or {digits} hex digits") from e
         if not wide and ord(char) > 255:
             raise Malformed('a STRING holds characters of one byte; write a WSTRING ("...")')
         out.append(char)

@@ -348,7 +348,7 @@ def _integer(token: Token) -> int:
     try:
         return int(digits, int(base))
     except ValueError as e:
-        raise _Bad(token, "not a whole number that anything holds") from e
+        raise _Bad(token, "not a whole number that any type holds") from e
 
 
 __all__ = ["parse"]

@@ -66,7 +66,7 @@ def _parsed(text: str, path: str) -> _Element:
         nonlocal count
         count += 1
         if count > MAX_ELEMENTS:
-            raise FileInvalid("too large an export", path=path, expected=f"at most {MAX_ELEMENTS} elements")
+            raise FileInvalid("the export is too large", path=path, expected=f"at most {MAX_ELEMENTS} elements")
         element = _Element(name.rpartition("}")[2], attributes, parser.CurrentLineNumber)
         stack[-1].children.append(element)
         stack.append(element)
@@ -78,7 +78,7 @@ def _parsed(text: str, path: str) -> _Element:
         stack[-1].text.append((parser.CurrentLineNumber, data))
 
     def doctype(*_: object) -> None:
-        raise FileInvalid("a document type has no place here", path=path, line=parser.CurrentLineNumber)
+        raise FileInvalid("a document type declaration is not allowed", path=path, line=parser.CurrentLineNumber)
 
     parser.StartElementHandler = start
     parser.EndElementHandler = end
@@ -165,7 +165,7 @@ class _Converter:
             )
         for unsupported in ("Method", "Property", "action", "transition"):
             for found in pou.every(unsupported):
-                raise self._fail(found, f"{self._name(pou)} has what is not supported: {unsupported.lower()}")
+                raise self._fail(found, f"{self._name(pou)} has an unsupported part: {unsupported.lower()}")
         interface = pou.find("interface")
         returns = interface.find("returnType") if interface else None
         if kind == "FUNCTION" and (returns is None or not returns.children):

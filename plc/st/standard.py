@@ -81,7 +81,7 @@ def _meeting(x: Compiling, exprs: list[t.Expr]) -> tuple[list[str], ty.Type]:
     for value, expr in zip(found[1:], exprs[1:], strict=True):
         meeting = ty.common(kind, value.type)
         if meeting is None:
-            x.env.fail(expr.pos, "arguments of types that do not meet", got=f"{kind} and {value.type}")
+            x.env.fail(expr.pos, "arguments of incompatible types", got=f"{kind} and {value.type}")
         kind = meeting
     if (
         isinstance(kind, ty.AnyInt)

@@ -201,7 +201,7 @@ class Statements(Expressions):
             if before is not None and label[0] <= before[1]:
                 low, high, pos = max(before, label, key=lambda each: (each[2].line, each[2].column))
                 got = str(low) if low == high else f"{low}..{high}"
-                self.env.fail(pos, "a label that another branch has too", got=got)
+                self.env.fail(pos, "a label that another branch also has", got=got)
             before = label
 
     # -- iteration ----------------------------------------------------------------------------------------------------

@@ -342,7 +342,7 @@ def number_of(text: str, low: int, high: int) -> int:
         base = int(based.group(1)) if based else 10
         value = int((based.group(2) if based else digits).replace("_", ""), base)
     except ValueError:
-        raise LogicError("a string that is no whole number", got=repr(text[:MAX_SHOWN])) from None
+        raise LogicError("a string that is not a whole number", got=repr(text[:MAX_SHOWN])) from None
     if low <= value <= high:
         return value
     raise LogicError("a value that does not fit its type", expected=f"{low} to {high}", got=str(value))
@@ -350,5 +350,5 @@ def number_of(text: str, low: int, high: int) -> int:
 
 def real_of(text: str) -> float:
     if not _REAL.fullmatch(text.strip()):
-        raise LogicError("a string that is no number", got=repr(text[:MAX_SHOWN]))
+        raise LogicError("a string that is not a number", got=repr(text[:MAX_SHOWN]))
     return float(text)

@@ -40,7 +40,7 @@ RESULTS = [
     DeviceResult(CASES[0], passed("silence")),
     DeviceResult(CASES[1], failed("answers & <b>wrongly</b>"), spoken=(Spoken(1_500_000, Direction.SENT, "01 03"),)),
     DeviceResult(CASES[2], inconclusive("cannot be told")),
-    DeviceResult(CASES[3], skipped("not on this wire")),
+    DeviceResult(CASES[3], skipped("not on this kind of bus")),
     DeviceResult(CASES[4], skipped("it has no function 18")),
     DeviceResult(CASES[5], failed("known"), waived="the meter is replaced in May"),
 ]
@@ -102,7 +102,7 @@ def test_the_document_contains_everything_in_the_files(check: Path, dump: Path, 
         assert said in seen, said
     assert "<script" not in page
     assert "http" not in page.replace("https://", "")
-    assert "not on this wire" not in seen
+    assert "not on this kind of bus" not in seen
 
 
 def test_comparisons_and_differences_as_the_commands_write_them(tmp_path: Path) -> None:
@@ -196,7 +196,7 @@ def test_a_dump_that_left_out_addresses_between_others_is_called_sampled(tmp_pat
     path.write_text("".join(json.dumps(line) + "\n" for line in lines))
     piece = dump_piece(path)
     assert piece.verdict == "sampled"
-    assert ("not asked", "4 of 10 addresses; those beside them were") in piece.facts
+    assert ("not asked", "4 of 10 addresses; their neighbours were") in piece.facts
 
 
 @pytest.mark.parametrize(
@@ -241,7 +241,7 @@ def test_the_report_of_a_check_shows_bytes_and_escapes_text_of_devices() -> None
         f"--unit 17 --only {CASES[1].id}",
     ):
         assert said in seen, said
-    assert f"For other wires: {CASES[3].id}." in seen
+    assert f"For other kinds of bus: {CASES[3].id}." in seen
 
 
 def test_junit_has_each_case_with_its_bytes() -> None:

@@ -62,7 +62,7 @@ def _good() -> list[Event]:
     ("more", "says"),
     [
         ([Shown(_at(0.5), Word.POISON, "3333")], "published 3333, the value of the bad frame, 0.50 s"),
-        ([Shown(_at(0.5), Word.OTHER, "0")], "published 0, which no honest answer held"),
+        ([Shown(_at(0.5), Word.OTHER, "0")], "published 0, which no correct answer contained"),
         ([Garbled(_at(3), 1, b"\xff\xff")], "2 bytes that are no request: ff ff"),
         ([Ended(_at(0.7), 3)], "the master ended, exit code 3, 0.70 s"),
         ([Asked(_at(1 + i / 10), 1, READ) for i in range(40)], "41 requests in 5.0 s"),
@@ -96,7 +96,7 @@ def test_a_client_that_never_publishes_again_fails_only_if_a_probe_observes_it()
 def test_a_correct_odd_frame_is_accepted_before_the_plain_one_arrives() -> None:
     taken = Shown(_at(0.3), Word.SECOND, "2222")
     assert judges.accepts(_seen(*_good()[:2], taken, *_good()[2:])).verdict is Verdict.PASSED
-    assert "were not taken" in judges.accepts(_seen(*_good())).reason
+    assert "were not accepted" in judges.accepts(_seen(*_good())).reason
 
 
 @pytest.mark.parametrize(

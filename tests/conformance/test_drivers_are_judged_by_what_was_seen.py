@@ -138,7 +138,7 @@ def test_a_value_that_is_printed_for_an_exception_is_seen_by_the_output_probe(tm
     assert code == 1, said
     for case in ("MB-021", "MB-024"):
         assert found[case][0] == "failed", found
-        assert f"published {value}, which no honest answer held" in found[case][1]
+        assert f"published {value}, which no correct answer contained" in found[case][1]
 
 
 def test_a_number_in_a_line_of_another_form_is_inconclusive_with_the_way_out(tmp_path: Path) -> None:
@@ -161,7 +161,7 @@ def test_canopens_client_publishes_0_for_an_empty_value(tmp_path: Path) -> None:
     args = ("canopen-master", "--listen", "can:fieldtwin/127.0.0.1:0", "--timeout", "150ms", "--only", "30")
     code, found, said = run_check(tmp_path, *args, program=CANOPEN)
     assert (code, found["CO-030"][0]) == (1, "failed"), (found, said)
-    assert "published 0, which no honest answer held" in found["CO-030"][1]
+    assert "published 0, which no correct answer contained" in found["CO-030"][1]
 
 
 def test_only_the_places_of_values_in_lines_of_known_forms_are_values() -> None:
@@ -213,4 +213,4 @@ def _gives_up_at_the_first_adu(pause_s: float) -> Callable[..., object]:
 def test_a_correct_answer_at_the_end_of_a_case_is_not_taken_for_an_odd_one(pause_s: float) -> None:
     """The device answered correctly with the value of the case until its last delayed frame was sent."""
     result = judge(_gives_up_at_the_first_adu(pause_s), "tcp://plc:502", "MB-056c")["MB-056c"]  # type: ignore[arg-type]
-    assert (result.verdict, "were not taken" in result.reason) == (Verdict.FAILED, True), result.reason
+    assert (result.verdict, "were not accepted" in result.reason) == (Verdict.FAILED, True), result.reason

@@ -136,7 +136,7 @@ def test_the_printed_results_name_clauses_and_omit_cases_for_other_wires(
         "robustness    MB-021  read     exception frame of 5 bytes: waits",
         "1 failed, 1 robustness",
     ]
-    assert "1 more cases are for other wires" in printed.err
+    assert "1 more test cases are for other kinds of bus" in printed.err
     print_results(results, all_wires=True)
     assert "MB-070a" in capsys.readouterr().out
 

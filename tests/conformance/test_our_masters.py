@@ -26,7 +26,7 @@ from fieldtwin.gateway.protocols.modbus.client import ModbusClient
 from fieldtwin.results.model import Verdict
 
 NOT_ITS_BUSINESS = {
-    "MB-021": "polls no sooner than its timeout",
+    "MB-021": "poll period is not shorter than its timeout",
     "MB-025": "merges no reads",
 }
 """A client does not decide what to read and when: splitting reads is the task of a driver."""
@@ -122,7 +122,7 @@ def test_without_a_probe_cases_about_values_are_skipped_with_the_reason() -> Non
     assert "--probe" in results["MB-002"].reason
     assert results["MB-020"].verdict is Verdict.SKIPPED
     assert results["MB-022"].verdict is Verdict.PASSED
-    assert "what it published was not seen" in results["MB-022"].reason
+    assert "its published values were not observed" in results["MB-022"].reason
     assert results["MB-013"].verdict is Verdict.PASSED, "that it quarantines shows on the wire"
 
 

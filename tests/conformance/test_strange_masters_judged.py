@@ -136,20 +136,20 @@ def test_a_program_that_never_asks_is_reported_with_its_last_output(tmp_path: Pa
     )
     assert (code, found) == (4, {})
     assert "no licence" in said
-    assert "the program ended before it asked for anything, exit code 1" in said
+    assert "the program ended before its first request, exit code 1" in said
 
 
 @pytest.mark.parametrize(
     ("args", "says"),
     [
         (["modbus-master"], "no endpoint to listen on"),
-        (["modbus-master", "--listen", "can:fieldtwin/x:1"], "where the master is listened for"),
+        (["modbus-master", "--listen", "can:fieldtwin/x:1"], "the endpoint for the client or master"),
         (["modbus-master", "--listen", "tcp://127.0.0.1:0", "--only", "MB-0133"], "no case 'MB-0133'"),
         (["modbus-master", "--listen", "tcp://127.0.0.1:0", "--values", "1,2"], "three different numbers"),
         (["modbus-master", "--listen", "tcp://127.0.0.1:0", "--probe", "output"], "nothing prints"),
         (["modbus-master", "--listen", "tcp://127.0.0.1:0", "--probe", "tcp://x"], "a probe"),
         (["modbus-master", "--listen", "tcp://127.0.0.1:0", "--hold", "holding:x=1"], "--hold"),
-        (["canopen-master", "--listen", "tcp://127.0.0.1:0"], "where the master is listened for"),
+        (["canopen-master", "--listen", "tcp://127.0.0.1:0"], "the endpoint for the client or master"),
         (["canopen-master", "--listen", "can:fieldtwin/127.0.0.1:0", "--hold", "6041=1"], "--hold"),
     ],
 )

@@ -116,7 +116,7 @@ ROWS = [
 
 DRIVER_SAYS = {
     "timeout": "no reply within|does not answer|heartbeat lost",
-    "wire_error": "check sum|answers another request|another function|wrong size",
+    "wire_error": "check sum|a different request|another function|wrong size",
     "unreachable": "ended the connection|no reply within",
     "refused": "refused with exception 04h",
     "busy": "refused with exception 06h",
@@ -166,10 +166,10 @@ async def _by_hand(bench: VirtualBench) -> None:
             await bench.inject(said)
     with pytest.raises(UsageError, match=r"no tag of probe 'temprature'.*did you mean 'temperature'"):
         await bench.set_value("probe", "temprature", 1.0)
-    with pytest.raises(UsageError, match="no fault 'nobody' is in"):
+    with pytest.raises(UsageError, match="no fault 'nobody' is active"):
         await bench.clear("nobody")
     await bench.inject({"id": "mine", "name": "silence", "device": "probe"})
-    with pytest.raises(UsageError, match="the fault 'mine' is in already"):
+    with pytest.raises(UsageError, match="the fault 'mine' is already active"):
         await bench.inject({"id": "mine", "name": "silence", "device": "probe"})
     await bench.clear("mine")
     await bench.sleep_until_s(began_s + 2.6)
@@ -178,18 +178,18 @@ async def _by_hand(bench: VirtualBench) -> None:
 
 
 REFUSED: list[tuple[dict[str, Any], str]] = [
-    ({"name": "drop"}, "fault drop aims at nothing; expected device: NAME, or bus: NAME"),
+    ({"name": "drop"}, "fault drop has no target; expected device: NAME, or bus: NAME"),
     ({"name": "drop", "device": "prob"}, "no device 'prob'.*did you mean 'probe'"),
     ({"name": "drop", "bus": "lam"}, "no bus 'lam'.*did you mean 'lan'"),
     ({"name": "drop", "device": "tilt"}, "fault drop is for serial lines and sockets"),
     ({"name": "bus-off", "bus": "lan"}, "fault bus-off is for CAN buses"),
-    ({"name": "stuck"}, "fault stuck aims at nothing"),
+    ({"name": "stuck"}, "fault stuck has no target"),
     ({"name": "stuck", "device": "tilt", "nth": 3}, "unknown key 'nth' in fault stuck"),
     ({"name": "bus-off", "device": "tilt", "function": 3}, "unknown key 'function' in fault bus-off"),
     ({"name": "drop", "device": "probe", "cob_id": 3}, "unknown key 'cob_id' in fault drop"),
-    ({"name": "lost-frame", "bus": "can0", "register": "slope_long"}, "a register is one of a device"),
+    ({"name": "lost-frame", "bus": "can0", "register": "slope_long"}, "a register needs a device"),
     ({"name": "stuck", "device": "probe", "register": "presure"}, "no tag of probe 'presure'.*did you mean 'pressure'"),
-    ({"name": "drop", "bus": "lan", "register": "pressure"}, "a register is one of a device"),
+    ({"name": "drop", "bus": "lan", "register": "pressure"}, "a register needs a device"),
     ({"name": "drop", "bus": "lan", "address": "x"}, "an address; expected a number, or holding:0x10"),
     ({"name": "drop", "bus": "lan", "by": 1}, "unknown key 'by' in fault drop"),
 ]

@@ -114,7 +114,7 @@ EXPLICIT = [
     ("register: valve, value: 9", r"tank.valve cannot hold 9; expected 0 to 7 \(uint16, bits 4 to 6\)"),
     ("register: count, value: -1", r"tank.count cannot hold -1; expected 0 to 9999 \(bcd16\)"),
     ("register: weight, value: 1.0e+39", r"tank.weight cannot hold 1e\+39; expected .* \(float32\)"),
-    ("value: 4000", r"tank.level cannot hold 4000.*without it the fault strikes every tag"),
+    ("value: 4000", r"tank.level cannot hold 4000.*without it the fault affects every tag"),
 ]
 
 

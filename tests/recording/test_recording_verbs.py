@@ -88,10 +88,11 @@ def test_a_device_is_recorded_emulated_and_compared(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "error"),
     [
-        (("-o", "x.jsonl"), "what is to be recorded"), (("tcp://127.0.0.1:1", "-o", "x.jsonl"), "what is to be asked"),
-        (("--tap", "rtu:a", "can:socketcan/can0", "-o", "x.jsonl"), "a line is tapped between bytes"),
+        (("-o", "x.jsonl"), "the source of the recording is missing"),
+        (("tcp://127.0.0.1:1", "-o", "x.jsonl"), "the requests are not defined"),
+        (("--tap", "rtu:a", "can:socketcan/can0", "-o", "x.jsonl"), "only a byte stream can be tapped"),
         (("can:socketcan/can0", "--like", "w.jsonl", "-o", "x.log"), "--like is for Modbus"),
-        (("tcp://127.0.0.1:1", "--like", "w.jsonl", "-o", "x.jsonl"), "asks nothing that may be asked again"),
+        (("tcp://127.0.0.1:1", "--like", "w.jsonl", "-o", "x.jsonl"), "has no requests that may be repeated"),
     ],
 )  # fmt: skip
 def test_unrecordable_items_are_reported(
@@ -112,7 +113,7 @@ def _write(path: Path, *requests: str) -> Path:
 
 def test_a_plant_is_not_written_to_by_the_way(tmp_path: Path) -> None:
     path, nobody = _write(tmp_path / "w.jsonl", "0600010005"), "tcp://127.0.0.1:1"
-    with pytest.raises(NotAllowed, match="were not allowed"):
+    with pytest.raises(NotAllowed, match="were not confirmed"):
         called(compare, path, nobody, "--writes")
     with pytest.raises(Unreachable):
         called(compare, path, nobody, "--writes", "--yes")

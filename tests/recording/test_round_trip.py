@@ -227,7 +227,7 @@ def test_a_profile_is_polled_in_few_reads_and_refused_reads_are_split(tmp_path: 
     assert (counters.rounds, counters.exchanges, counters.refused) == (3, 7, 1)
     asked = [e.request.hex() for e in exchanges_of(tmp_path / "r.jsonl")]
     assert asked == ["0300000005", *["0300000001", "0300040001"] * 3]
-    with pytest.raises(UsageError, match="no group"):
+    with pytest.raises(UsageError, match="no poll group"):
         ProfileRound(load_profile(profile_path), 1, ["other"])
 
 

@@ -192,7 +192,7 @@ def test_under_random_faults_steps_only_drive(folder: Path) -> None:
     result = run_seed(Campaign(folder / "dry.scenario.yaml", (), SILENCES, 300.0), 1)
     step = next(check for check in result.checks if check.number == "3")
     assert (result.verdict, step.verdict) == (Verdict.PASSED, Verdict.SKIPPED)
-    assert "not judged under random faults" in step.got
+    assert "not checked under random faults" in step.got
     assert judge("dry.scenario.yaml", "--seeds", "1..2")[0] == 1  # without faults they are checked
 
 
@@ -233,7 +233,7 @@ def test_rate_kinds_and_aims_are_observed(folder: Path) -> None:
         (RandomFaults(kinds=("silense",)), "did you mean 'silence'"),
         (RandomFaults(aims=("sensr",)), "did you mean 'sensor'"),
         (RandomFaults(aims=("sensor.levl",)), "did you mean 'sensor.level'"),
-        (RandomFaults(kinds=("bus-off",)), "no such fault fits"),
+        (RandomFaults(kinds=("bus-off",)), "none of these faults fits"),
         (RandomFaults(kinds=("set",)), "cannot be chosen by chance"),
         (RandomFaults(mean_s=0.0), "the time between two random faults"),
     ],
@@ -265,7 +265,7 @@ def test_options_without_effect_are_refused(folder: Path, words: tuple[str, ...]
     ("invariants", "told"),
     [
         ('always: ["sensor.levl > 3"]', "did you mean 'sensor.level'"),
-        ('always: ["3 > 2"]', "this looks at nothing"),
+        ('always: ["3 > 2"]', "the expression refers to no value"),
         ('within: [{after: "well.runs", then: "sensor.level > 1", within: "2"}]', ""),
         ('sometimes: ["well.runs"]', "unknown key"),
     ],

@@ -1,7 +1,7 @@
 """A device whose prototype states no identity is read with an empty identity, which counts as the value it held.
 
 Defect: a virtual run of a device with a `serial` register, and without `identity` in the prototype file, was not ok:
-"ctd.serial was published as '' (...): the device held no such thing".
+"ctd.serial was published as '' (...): the device never had this value".
 """
 
 from __future__ import annotations

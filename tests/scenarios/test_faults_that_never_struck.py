@@ -117,4 +117,4 @@ def test_a_campaign_reports_how_often_faults_took_effect_and_needs_one(seeds: st
     told = CliRunner().invoke(run_command, [*words, "--jobs", "1"], standalone_mode=False)
     assert told.output.rstrip().endswith(ended)
     assert told.return_value == (0 if ended == "ok" else 1)
-    assert ("none was put in" in told.output) == (ended == "inconclusive")
+    assert ("none was injected" in told.output) == (ended == "inconclusive")

@@ -112,9 +112,9 @@ def test_a_campaign_outside_of_virtual_time_is_refused(
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (("--prototype", "--faults", "random"), "random faults go with --virtual"),
-        (("--prototype", "--seeds", "1..2"), "go with --virtual"),
-        (("--plant", "--faults", "random"), "a plant"),
+        (("--prototype", "--faults", "random"), "random faults need --virtual"),
+        (("--prototype", "--seeds", "1..2"), "need --virtual"),
+        (("--plant", "--faults", "random"), "plant"),
     ],
 )
 @pytest.mark.parametrize("system", ["observatory", "ocean_network"])

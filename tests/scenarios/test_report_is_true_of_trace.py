@@ -192,7 +192,7 @@ def check_step(past: Past, result: ScenarioResult, check: CheckResult) -> None:
 
 def check_headline(result: ScenarioResult) -> None:
     named = result.reason.partition(": ")[0].removeprefix("step ")
-    if result.verdict is Verdict.PASSED or not named or "expects nothing" in result.reason:
+    if result.verdict is Verdict.PASSED or not named or "has no expectation" in result.reason:
         return
     if named == "set":
         named = f"set {result.reason.split()[1]}"

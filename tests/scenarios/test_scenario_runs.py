@@ -125,7 +125,7 @@ def test_an_unsupported_step_of_a_target_is_skipped_and_does_not_pass(tmp_path: 
     ("steps", "told", "line"),
     [
         ("  - snd: {period_s: 1}\n", "did you mean 'send'", 4),
-        ("  - send: {period_s: 1}\n    pause: 1s\n", "one thing", 4),
+        ("  - send: {period_s: 1}\n    pause: 1s\n", "exactly one key", 4),
         ("  - fault: {name: silense, device: ctd}\n", "did you mean 'silence'", 4),
         ("  - fault: {name: silence, device: ctb}\n", "did you mean 'ctd'", 4),
         ("  - fault: {name: bus-off, device: ctd}\n", "for CAN buses", 4),
@@ -135,9 +135,9 @@ def test_an_unsupported_step_of_a_target_is_skipped_and_does_not_pass(tmp_path: 
         ("  - expect: {wire: ctd, register: pressur, times: 1}\n", "did you mean 'pressure'", 4),
         ("  - pause: 1s\n  - wait: {until: 'relay.stat == 1'}\n", "did you mean 'relay.state'", 5),
         ("  - pause: soon\n", "a time", 4),
-        ("  - expect: {quality: good}\n", "about one thing", 4),
-        ("  - expect: {tag: ctd.pressure, times: 1}\n", "'times' says nothing about this", 4),
-        ("  - expect: {wire: ctd, quality: good}\n", "'quality' says nothing about this", 4),
+        ("  - expect: {quality: good}\n", "exactly one of tag, wire and that", 4),
+        ("  - expect: {tag: ctd.pressure, times: 1}\n", "'times' has no meaning for this expectation", 4),
+        ("  - expect: {wire: ctd, quality: good}\n", "'quality' has no meaning for this expectation", 4),
         ("  - expect: {wire: ctd, requests_per_s: {max: 1}}\n", "during: 10s", 4),
         ("  - expect: {tag: ctd.pressure, quality: goood}\n", "did you mean 'good'", 4),
         ("  - expect: {tag: relay.state, like: recording}\n", "DEVICE.TAG", 4),
@@ -146,18 +146,18 @@ def test_an_unsupported_step_of_a_target_is_skipped_and_does_not_pass(tmp_path: 
         ("  - expect: {tag: relay.state, value: ACTVE}\n", "did you mean 'ACTIVE'", 4),
         ("  - set: {tag: ctd.pressure, value: high}\n", "ctd.pressure is a number; got 'high'", 4),
         ("  []\n", "steps is empty", 3),
-        ("  - {clear: dead, wait: 3s}\n", "one thing; expected send or set", 4),
+        ("  - {clear: dead, wait: 3s}\n", "exactly one key; expected send or set", 4),
         ("  - expect: {tag: ctd.pressure, value: 1, tolerance: -1}\n", "tolerance", 4),
-        ("  - expect: {wire: ctd, requests_per_s: {max: 2}, during: 0s}\n", "for no time", 4),
-        ("  - expect: {wire: ctd, requests_per_s: {}, during: 5s}\n", "hold whatever comes", 4),
-        ("  - expect: {wire: ctd, times: {min: 0}}\n", "hold whatever comes", 4),
+        ("  - expect: {wire: ctd, requests_per_s: {max: 2}, during: 0s}\n", "time above 0", 4),
+        ("  - expect: {wire: ctd, requests_per_s: {}, during: 5s}\n", "always met", 4),
+        ("  - expect: {wire: ctd, times: {min: 0}}\n", "always met", 4),
         ("  - expect: {wire: ctd, times: {max: -1}}\n", "never negative", 4),
-        ("  - expect: {wire: ctd, times: {min: 3, max: 1}}\n", "nothing is within these bounds", 4),
-        ("  - expect: {tag: ctd.pressure, updates_per_s: [11, 9], during: 5s}\n", "from one number to another", 4),
-        ("  - expect: {tag: ctd.pressure, updates_per_s: [9], during: 5s}\n", "from one number to another", 4),
-        ("  - expect: {wire: ctd, value: 7, times: 0}\n", "of which register", 4),
-        ("  - expect: {that: '1 < 2'}\n", "looks at nothing", 4),
-        ("  - wait: {until: '1'}\n", "looks at nothing", 4),
+        ("  - expect: {wire: ctd, times: {min: 3, max: 1}}\n", "these bounds can never be met", 4),
+        ("  - expect: {tag: ctd.pressure, updates_per_s: [11, 9], during: 5s}\n", "a rate needs bounds", 4),
+        ("  - expect: {tag: ctd.pressure, updates_per_s: [9], during: 5s}\n", "a rate needs bounds", 4),
+        ("  - expect: {wire: ctd, value: 7, times: 0}\n", "register of the value is missing", 4),
+        ("  - expect: {that: '1 < 2'}\n", "refers to no value", 4),
+        ("  - wait: {until: '1'}\n", "refers to no value", 4),
     ],
 )
 def test_a_mistake_is_named_at_its_position(tmp_path: Path, steps: str, told: str, line: int) -> None:
@@ -187,7 +187,7 @@ def test_a_missing_file_is_named_at_its_reference(tmp_path: Path, line: str, tol
 def test_a_scenario_without_expectations_does_not_pass(tmp_path: Path) -> None:
     result = run(tmp_path, "  - send: {period_s: 1}\n  - pause: 1s\n")
     assert result.verdict is Verdict.INCONCLUSIVE
-    assert "expects nothing" in result.reason
+    assert "has no expectation" in result.reason
 
 
 BITS = "  - fault: {id: bits, name: corrupt-bits, device: modem, function: 3, from: 1s, until: 3s}\n"
@@ -201,7 +201,7 @@ def test_a_scenario_can_be_checked_like_a_run(tmp_path: Path, steps: str, verdic
     check = result.checks[-1]
     assert (check.number, check.verdict, check.where) == ("judge", verdict, f"{tmp_path / 'x.scenario.yaml'}:3")
     if verdict is Verdict.FAILED:
-        assert "were never held by their device" in result.reason
+        assert "never occurred in their device" in result.reason
         assert "modem." in check.got
 
 

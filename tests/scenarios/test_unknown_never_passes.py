@@ -100,9 +100,9 @@ DEAD = "  - fault: {id: dead, name: silence, device: ctd}\n  - send: {period_s: 
         ("", "  - expect: {tag: ctd.pressure, quality: bad}\n", Verdict.FAILED, "never published"),
         ("", DEAD + "  - expect: {tag: ctd.pressure, quality: bad}\n", Verdict.FAILED, "no value yet"),
         ("", DEAD + "  - expect: {that: \"quality(ctd.pressure) == 'bad'\"}\n", Verdict.FAILED, "no value"),
-        ("always: ['not (ctd.pressure > 1)']\n", PAUSE, Verdict.INCONCLUSIVE, "nothing was ever known"),
-        ("never: ['ctd.pressure > 1']\n", PAUSE, Verdict.INCONCLUSIVE, "nothing was ever known"),
-        ("never: ['ctd.pressure > 1']\n", DEAD, Verdict.INCONCLUSIVE, "nothing was ever known"),
+        ("always: ['not (ctd.pressure > 1)']\n", PAUSE, Verdict.INCONCLUSIVE, "there was never a value"),
+        ("never: ['ctd.pressure > 1']\n", PAUSE, Verdict.INCONCLUSIVE, "there was never a value"),
+        ("never: ['ctd.pressure > 1']\n", DEAD, Verdict.INCONCLUSIVE, "there was never a value"),
         (
             "within: [{after: \"relay.state == 'STANDBY'\", then: 'ctd.pressure != 1', within: 1s}]\n",
             PAUSE,
@@ -113,13 +113,13 @@ DEAD = "  - fault: {id: dead, name: silence, device: ctd}\n  - send: {period_s: 
             "within: [{after: 'not (ctd.pressure > 1)', then: \"relay.state == 'STANDBY'\", within: 1s}]\n",
             PAUSE,
             Verdict.INCONCLUSIVE,
-            "nothing was there to judge",
+            "nothing to check",
         ),
         (
             "rate: [{tag: inclinometer.slope_long, updates_per_s: {max: 99}, over: 1s, while: 'not (ctd.pressure > 1)'}]\n",
             PAUSE,
             Verdict.INCONCLUSIVE,
-            "nothing was there to judge",
+            "nothing to check",
         ),
         (
             "rate: [{tag: ctd.pressure, updates_per_s: {max: 99}, over: 1s}]\n",
@@ -131,7 +131,7 @@ DEAD = "  - fault: {id: dead, name: silence, device: ctd}\n  - send: {period_s: 
             "cycle: [{late: 1s, while: 'not (ctd.pressure > 1)'}]\n",
             PAUSE,
             Verdict.INCONCLUSIVE,
-            "nothing was there to judge",
+            "nothing to check",
         ),
         (
             "never: [{wire: inclinometer, function: 5, unless: 'not (ctd.pressure > 1)'}]\n",
@@ -173,7 +173,7 @@ def test_a_rule_that_becomes_unknown_is_inconclusive_and_states_since_when(tmp_p
     )
     result = run(tmp_path, steps, "always: ['not (ctd.pressure / ctd.temperature > 1000)']\n")
     assert result.verdict is Verdict.INCONCLUSIVE, result.reason
-    assert "; unknown at " in result.checks[-1].got
+    assert "; no value in " in result.checks[-1].got
     assert result.reason.startswith("always 1: ")
 
 

@@ -363,5 +363,5 @@ def test_prose_10_twinning_rate_and_lag_are_measured_and_printed(capsys: pytest.
     told = capsys.readouterr().err
     assert "10.0 reports a second" in told
     assert "median 40 ms" in told
-    assert "11, 11 of them as the model" in told
+    assert "11, 11 of them agree with the model" in told
     assert json.dumps(shadow.describe()), "and as JSON"

@@ -136,9 +136,9 @@ def test_Device_is_what_a_running_line_asks(tmp_path: Path) -> None:
 @pytest.mark.parametrize("kind", [TCPConnection, CANConnection])
 def test_Sensor_hangs_on_RS232_only(kind: type[Connection[bytes]]) -> None:
     assert Thermometer(wire(RS232Connection)[0], ["read"]).connection.type is PROTOCOL.RS232
-    with pytest.raises(Bug, match="another kind of wire"):
+    with pytest.raises(Bug, match="different kind of connection"):
         Thermometer(wire(kind)[0], ["read"])
-    with pytest.raises(Bug, match="another kind of wire"):
+    with pytest.raises(Bug, match="different kind of connection"):
         SensorEmulator(wire(kind)[0], CTD, (), lambda pdu, now_ns: None)
 
 
@@ -152,9 +152,9 @@ def test_Sensor_result_of_a_command_is_a_RESPONSE() -> None:
 @pytest.mark.parametrize("kind", [RS232Connection, CANConnection])
 def test_Transmitter_hangs_on_TCP_only(kind: type[Connection[bytes]]) -> None:
     assert Modem(wire(TCPConnection)[0], ["read"]).connection.type is PROTOCOL.TCP
-    with pytest.raises(Bug, match="another kind of wire"):
+    with pytest.raises(Bug, match="different kind of connection"):
         Modem(wire(kind)[0], ["read"])
-    with pytest.raises(Bug, match="another kind of wire"):
+    with pytest.raises(Bug, match="different kind of connection"):
         TransmitterEmulator(wire(kind)[0], MODEM, (), lambda pdu, now_ns: None)
 
 

@@ -71,7 +71,8 @@ def test_DigitalTemplate_every_part_has_its_hash_and_a_wrong_one_is_named(tmp_pa
         whole = path.read_bytes()
         path.write_bytes(bytes([whole[0] ^ 1]) + whole[1:])
         with pytest.raises(
-            FileInvalid, match=f"{re.escape(file.path)}: not what was packed; expected SHA-256 {file.sha256}"
+            FileInvalid,
+            match=f"{re.escape(file.path)}: the file has changed since it was packed; expected SHA-256 {file.sha256}",
         ):
             FolderPackage(tmp_path / "T").verify()
         path.write_bytes(whole)

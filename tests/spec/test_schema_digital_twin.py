@@ -226,7 +226,7 @@ def test_Plan_says_what_is_asked_and_of_which_commands_nothing_is() -> None:
     assert prototype.asked == [(1, own), (10, EMPTY)]
     nobody = Rig(rules=rules)
     assert nobody.give(value(150.0), value(50.0)) == [10], "a question that nobody can ask is not left out"
-    assert "nobody here can" in str(nobody.twin.execute.collect()[0].value)
+    assert "this process cannot run one" in str(nobody.twin.execute.collect()[0].value)
 
 
 def test_Plan_what_is_found_while_a_prototype_is_asked_waits_and_of_one_subject_the_newest_counts() -> None:

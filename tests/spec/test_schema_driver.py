@@ -128,7 +128,7 @@ def test_SensorDriver_is_the_driver_on_RS232_and_accepts_no_other_connection() -
     assert type(driver) is SensorDriver
     assert SensorDriver.wire_types == {PROTOCOL.RS232}
     driver.attach(end(RS232Connection))
-    with pytest.raises(FileInvalid, match="cannot stand on this bus"):
+    with pytest.raises(FileInvalid, match="does not fit this bus"):
         driver.attach(end(TCPConnection))
 
 
@@ -152,7 +152,7 @@ def test_TransmitterDriver_is_the_driver_on_TCP_and_accepts_no_other_connection(
     assert type(driver) is TransmitterDriver
     assert TransmitterDriver.wire_types == {PROTOCOL.TCP}
     driver.attach(end(TCPConnection))
-    with pytest.raises(FileInvalid, match="cannot stand on this bus"):
+    with pytest.raises(FileInvalid, match="does not fit this bus"):
         driver.attach(end(RS232Connection))
 
 

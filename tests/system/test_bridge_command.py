@@ -130,10 +130,10 @@ def test_pymodbus_clients_through_the_bridge_are_read_only_by_default(tmp_path: 
 @pytest.mark.parametrize(
     ("args", "says", "code"),
     [
-        (("tcp://127.0.0.1:0", "can:socketcan/can0"), "Modbus is not spoken there", 2),
+        (("tcp://127.0.0.1:0", "can:socketcan/can0"), "this kind of endpoint does not carry Modbus", 2),
         (("tcp://127.0.0.1:0", "rtu:/dev/ttyNONE", "--role", "x"), "roles are in clients' certificates", 2),
         (("tls://127.0.0.1:0?cert=c.pem", "rtu:/dev/ttyNONE"), "no ca", 2),
-        (("udp://127.0.0.1:0", "rtu:/dev/ttyNONE"), "cannot listen there", 2),
+        (("udp://127.0.0.1:0", "rtu:/dev/ttyNONE"), "cannot listen on this kind of endpoint", 2),
         (("tcp://127.0.0.1:0", "rtu:/dev/ttyNONE", "--allow", "10.0.0.300"), "a network of clients", 2),
         (("tcp://192.0.2.1:1502", "rtu:/dev/ttyNONE"), "cannot listen", 4),
     ],

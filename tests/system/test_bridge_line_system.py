@@ -99,7 +99,7 @@ def test_a_master_on_a_line_reaches_tcp_units_of_a_prototype(tmp_path: Path) -> 
         gateway = program.control("p", "gateway")
         wait_for(lambda: gateway("get")["bridge"]["door"]["listening"], 15)
         masters = tmp_path / "run" / "p" / "bridge-door"
-        wait_for(lambda: f"masters of bridge door  →  {masters}" in program.err, 5)
+        wait_for(lambda: f"clients of bridge door  →  {masters}" in program.err, 5)
         check_a_master(masters)
         text = mbpoll(masters, 21, 34, "3")
         assert "Written 1 references" in text, text

@@ -71,7 +71,7 @@ def test_three_nodes_on_one_bus(tmp_path: Path) -> None:
 def test_the_first_process_creates_the_bus_and_one_without_a_bus_reports_it(tmp_path: Path) -> None:
     where = f"can:fieldtwin/127.0.0.1:{free_port()}"
     with fieldtwin(tmp_path, "emulate", "io-cia401", "--on", where, "--bitrate", "500000", name="io") as io:
-        wait_for(lambda: "a bus made here at 500000 bit/s" in io.err, 15, "the bus")
+        wait_for(lambda: "a new bus with 500000 bit/s" in io.err, 15, "the bus")
         with fieldtwin(tmp_path, "emulate", "drive-cia402", "--on", where, name="drive") as drive:
             wait_for(lambda: f"node 7 on {where}, with others" in drive.err, 15, "the second node")
             wrong = run_to_end(
@@ -93,4 +93,4 @@ def test_a_nearly_correct_name_and_a_recording_of_a_different_device(tmp_path: P
     assert "did you mean 'drive-cia402'?" in misspelt.err
     other = run_to_end(tmp_path, "emulate", "drive-cia402", *on, "--recording", "cast.jsonl", name="other")
     assert other.process.returncode == 3
-    assert "plays nothing of this device" in other.err
+    assert "has no signal of this device" in other.err

@@ -39,7 +39,7 @@ def test_one_field_simulator_serves_several_runs(tmp_path: Path) -> None:
             wait_for(lambda: not any(d["online"] for d in gateway("get")["devices"].values()), 10, "all lost")
             run.signal(signal.SIGINT)
             assert run.wait(5) == 1
-        assert any("the field side at localhost" in error for error in run.summary["errors"])
+        assert any("the field simulator at localhost" in error for error in run.summary["errors"])
     no_tracebacks(tmp_path)
 
 
@@ -65,7 +65,7 @@ def test_a_field_simulator_that_returns_is_found_again(tmp_path: Path) -> None:
             side.signal(signal.SIGKILL)
             side.wait(5)
             wait_for(lambda: not any(d["online"] for d in gateway("get")["devices"].values()), 10, "all lost")
-            wait_for(lambda: run.err.count("was lost: nobody knows") == 1, 10, "that it says so")
+            wait_for(lambda: run.err.count("was lost: the values") == 1, 10, "that it says so")
             assert all(tag["quality"] != "good" for tag in gateway("get")["tags"].values())
             with fieldtwin(tmp_path, *emulate, name="again"):
                 wait_for(lambda: "is back after" in run.err, 15, "that it says so")
@@ -73,6 +73,6 @@ def test_a_field_simulator_that_returns_is_found_again(tmp_path: Path) -> None:
                 run.signal(signal.SIGINT)
                 assert run.wait(5) == 0, run.out
         assert run.err.count("was lost") == run.err.count("is back after") == 1
-        assert "field side     lost once" in run.out
+        assert "simulator      lost once" in run.out
     no_tracebacks(tmp_path)
     no_tracebacks(tmp_path)

@@ -76,9 +76,9 @@ def test_with_a_users_controller_they_are_skipped_with_a_message(site: Path) -> 
     assert result["verdict"] == "passed", result
     (skipped,) = [one for one in result["checks"] if one["number"] == "invariants"]
     assert skipped["verdict"] == "skipped"
-    assert "not judged: the controller is another program" in skipped["got"]
+    assert "not checked: a third-party controller" in skipped["got"]
     shown = run_to_end(site, "test", *(word for word in words if word != "--json"), name="shown", within_s=150)
-    assert "invariants skipped: not judged: the controller is another program" in shown.out
+    assert "invariants skipped: not checked: a third-party controller" in shown.out
 
 
 def test_a_network_on_this_host_is_checked_by_the_invariants_of_its_members(tmp_path: Path) -> None:

@@ -88,7 +88,7 @@ def test_a_check_of_our_own_controller_needs_one(tmp_path: Path) -> None:
 
 def test_the_scan_lateness_of_a_foreign_controller_is_not_claimed(tmp_path: Path) -> None:
     bench = ControlBench(load_system("observatory"), Where(tmp_path), Trace(), target="compose", names=[])
-    with pytest.raises(UsageError, match="somebody else's controller"):
+    with pytest.raises(UsageError, match="third-party controller"):
         bench.late_ms()
 
 

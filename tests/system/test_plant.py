@@ -209,7 +209,7 @@ def test_another_device_than_expected_is_never_written(plant: Plant) -> None:
         run.signal(signal.SIGINT)
         assert run.wait(4) == 1
     assert plant.held() == ["0000"]
-    assert any("another device answers" in error for error in run.summary["errors"])
+    assert any("a different device answers" in error for error in run.summary["errors"])
 
 
 @pytest.mark.long

@@ -36,10 +36,10 @@ def test_a_running_plc_is_watched_forced_stepped_and_asked_why(tmp_path: Path, m
         wait_for(lambda: json.loads(plc("status", "--json"))["variables"]["relay.state"] == 1, 15, "ACTIVE")
         text = plc("status")
         assert "PLC: running" in text
-        assert "nothing is forced" in text
+        assert "no tag is forced" in text
         assert "relay.state" in plc("watch", "relay.*")
         assert "by program relay" in plc("why", "ctd.sample_period_s")
-        with pytest.raises(UsageError, match="nobody to ask"):
+        with pytest.raises(UsageError, match="no terminal for the confirmation"):
             plc("force", "ctd.sample_period_s", "9")
         plc("force", "ctd.sample_period_s", "9", "--yes")
         gateway = run.control("p", "gateway")
@@ -73,7 +73,7 @@ def test_the_observatorys_relay_is_drawn_and_proved(tmp_path: Path) -> None:
     assert {"STANDBY", "ACTIVE", "OFF", "command > 0"} <= texts
     plc("diagram", "observatory", "-o", str(tmp_path / "relay.svg"))
     assert (tmp_path / "relay.svg").read_text().startswith("<svg")
-    assert "relay: proved over" in plc("prove", "observatory")
+    assert "relay: proved for" in plc("prove", "observatory")
     assert json.loads(plc("prove", "observatory", "--json"))["proved"]
     assert "no proof" in plc("prove", "observatory", "--max-states", "5")
     with pytest.raises(UsageError, match="no program 'pump'"):
@@ -96,7 +96,7 @@ def test_a_counterexample_is_a_scenario(tmp_path: Path) -> None:
     )
     out = tmp_path / "found.scenario.yaml"
     shown = plc("prove", str(tmp_path / "site.yaml"), "-o", str(out))
-    assert "relay: broken after 2 scans: the state follows from the sign of the period" in shown
+    assert "relay: violated after 2 scans: the state follows from the sign of the period" in shown
     assert shown.endswith(out.read_text())  # not wrapped at a terminal's width, because it may be piped into a file
     scenario = parse(out.read_text(), str(out)).data
     assert (scenario["system"], scenario["needs"]) == ("site.yaml", ["send_command"])

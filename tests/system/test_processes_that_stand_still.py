@@ -60,7 +60,7 @@ def test_each_process_is_stopped_for_ten_seconds(tmp_path: Path) -> None:
     told = run.summary["errors"]
     for name in ("field", "gateway", "plc", "thread"):
         assert f"{name}: the process did not answer within 5 s" in told, told
-    own = [text for text in told if text.startswith("run: the run's own process stood still for ")]
+    own = [text for text in told if text.startswith("run: this process was not scheduled for ")]
     assert own, told
     others = [text for text in told if text not in own and not text.endswith("the process did not answer within 5 s")]
     assert others == [], "and nothing that is not so"

@@ -127,7 +127,7 @@ def test_a_scenario_about_our_gateway_is_skipped_with_the_reason(site: Path) -> 
     ("words", "told"),
     [
         (["--target", "virtual", "--with", "--", "true"], "cannot run in virtual time"),
-        (["--target", "compose", "--with", "--", "true"], "judges what runs already"),
+        (["--target", "compose", "--with", "--", "true"], "tests a running system"),
         (["--with"], "--with needs a command"),
         (["--with", "--", "no-such-program"], "no such program"),
     ],
@@ -160,7 +160,7 @@ def test_from_another_terminal_the_test_finds_the_only_field_simulator_of_the_sy
             several = run_to_end(site, "test", *words, name="several")
             assert several.process.returncode == 1
             assert (
-                f"several field sides of 'shed' run on this host; expected --instance with one of second, {home.name}"
+                f"several field simulators of 'shed' run on this host; expected --instance with one of second, {home.name}"
                 in (json.loads(several.out)[0]["reason"])
             )
             code, results, _ = judged(site, *words, "--instance", home.name, name="named")

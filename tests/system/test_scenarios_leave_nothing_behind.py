@@ -178,7 +178,7 @@ def test_a_value_set_by_the_user_is_restored_after_the_scenario(running: Running
     )
     (result,) = running.test("over")
     assert result["verdict"] in ("failed", "inconclusive"), result
-    assert "these were in already: the fault 'mine' (delay), tank.level set to 33" in result["reason"]
+    assert "these faults were already active: the fault 'mine' (delay), tank.level set to 33" in result["reason"]
     assert running.put_in() == (["mine"], {"tank.level": 33})
 
 

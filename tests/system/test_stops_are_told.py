@@ -52,7 +52,7 @@ def test_a_run_whose_plc_stopped_and_began_again_is_not_ok(tmp_path: Path) -> No
     (tmp_path / "once.py").write_text(PROGRAM)
     done = run_to_end(tmp_path, "run", str(tmp_path / "shed.yaml"), "--prototype", "--for", "4s")
     assert done.process.returncode == 1, done.out + done.err
-    assert "PLC: stopped by itself once, and began again after that; the last time: program once" in done.out
+    assert "PLC: stopped by itself once, and restarted after that; the last time: program once" in done.out
 
 
 def test_a_run_whose_gateway_died_does_not_claim_to_know_its_outputs(tmp_path: Path) -> None:

@@ -63,8 +63,8 @@ def test_a_twin_that_asks_first_sends_only_what_its_prototype_allows(tmp_path: P
         run.signal(2)
         run.wait(20)
     assert "command    period 2 s" in twin.err
-    assert "a prototype was asked: \"relay.state == 'ACTIVE'\" does not hold 20 s from now" in twin.err
-    assert "0 planned, 2 asked of a prototype, 1 sent, 1 refused" in twin.err
+    assert "simulated: \"relay.state == 'ACTIVE'\" does not hold 20 s from now" in twin.err
+    assert "0 planned, 2 simulated, 1 sent, 1 refused" in twin.err
     audit = [json.loads(line) for line in (root / "observatory" / "audit.jsonl").read_text().splitlines()]
     assert [a["payload"] for a in audit if a["action"] == "command"] == ["0002"]
     no_tracebacks(root)

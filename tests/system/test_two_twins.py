@@ -47,7 +47,7 @@ def test_two_twins_of_one_system_run_side_by_side_and_each_has_its_own_plant(tmp
         for plant, twin in zip(plants, twins, strict=True):
             wait_for(lambda p=plant: p("get")["commands_taken"] == 1 and p("get")["sent_through"] > 20, 40, twin.err)
         assert what_if(root, "observatory", "two") == (0, "ACTIVE", 7)
-        assert what_if(root, "ocean_west", "two") == (2, "the instance 'two' is one of another system", 0)
+        assert what_if(root, "ocean_west", "two") == (2, "the instance 'two' runs a different system", 0)
         assert what_if(root, "observatory", "three") == (4, "no instance 'three' is running here", 0)
         for twin in twins:
             twin.signal(2)

@@ -60,9 +60,9 @@ def test_many_seeds() -> None:
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (["--plant", "--virtual", "--for", "1s"], "wires in memory"),
+        (["--plant", "--virtual", "--for", "1s"], "buses in memory"),
         (["--prototype", "--virtual"], "needs an end"),
-        (["--prototype", "--seed", "1"], "go with --virtual"),
+        (["--prototype", "--seed", "1"], "need --virtual"),
         (["--prototype", "--virtual", "--for", "1s", "--seeds", "5..1"], "the lower first"),
         (["--prototype", "--virtual", "--for", "1s", "--seeds", "1..2", "--seed", "1"], "belong to one"),
     ],

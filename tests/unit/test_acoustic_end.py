@@ -72,7 +72,7 @@ def test_a_client_without_a_place_in_the_channel_is_disconnected(tmp_path: Path,
         writer.write(first)
         assert await reader.read() == b""
         writer.close()
-        with pytest.raises(Unreachable, match="z is not in the water"):
+        with pytest.raises(Unreachable, match="z is not on the acoustic channel"):
             await AcousticEnd.open(tmp_path / "w", "z")
         await server.aclose()
         with pytest.raises(Unreachable):

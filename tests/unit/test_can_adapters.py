@@ -82,11 +82,11 @@ def test_slcan_reaches_the_software_bus() -> None:
     [
         ("can:toaster/0", 250_000, "unknown kind of CAN interface 'toaster'"),
         ("can:pcan/PCAN_USBBUS1", 0, "needs the bit rate"),
-        ("can:pcan/PCAN_USBBUS1?bitrate=250000", 125_000, "two bit rates"),
+        ("can:pcan/PCAN_USBBUS1?bitrate=250000", 125_000, "two different bit rates"),
         ("can:pcan/PCAN_USBBUS1?bitrate=fast", 0, "bit/s, such as 250000"),
         ("can:vector/0?listen=1", 250_000, "no listen-only mode for vector"),
         ("can:kvaser/0?listen=yes", 250_000, "0 or 1"),
-        ("can:pcan/PCAN_USBBUS1", 250_000, "driver of pcan is not on this computer"),
+        ("can:pcan/PCAN_USBBUS1", 250_000, "driver of pcan is not installed"),
     ],
 )
 def test_an_impossible_command_line_is_refused_in_one_line(url: str, bitrate: int, says: str) -> None:

@@ -201,7 +201,7 @@ def test_another_identity_blocks_every_write_until_the_right_one_comes(tmp_path:
             r.peer.power_on()
             await asyncio.sleep(2)
             assert r.status.driver.identity_error == "serial: expected 44h, got 45h"
-            assert "another node answers" in r.status.error
+            assert "a different node answers" in r.status.error
             assert r.quality() == ("bad", "wrong device")
             assert peers.writes() == []
             assert r.audit() == []

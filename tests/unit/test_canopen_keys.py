@@ -94,7 +94,7 @@ def test_the_effect_of_the_keys_of_outputs_polls_and_pace(tmp_path: Path) -> Non
         ("rpdo1: {map: [controlword]}", "tags of this device's `writable`"),
         (RPDO1 + "{map: [statusword]}", "tags of this device's `writable`"),
         (RPDO1 + "{map: [mode, mode]}", "each once"),
-        (RPDO1 + "{map: [mode], transmission: sync}", "nobody says when its values count"),
+        (RPDO1 + "{map: [mode], transmission: sync}", "nothing triggers its values"),
         (RPDO1 + "{map: [controlword, target_velocity, mode], event_ms: 0}", "at least 1"),
         ("writable: [target_velocity, target_position, mode], rpdo1: {map: [target_velocity, target_position, mode]}",
          "64 bits; got 72"),
@@ -152,7 +152,7 @@ def test_a_malformed_dcf_is_reported_with_file_section_and_key(tmp_path: Path, d
 
 
 def test_a_dcf_that_sets_nothing_is_reported(tmp_path: Path) -> None:
-    with pytest.raises(FileInvalid, match="sets nothing"):
+    with pytest.raises(FileInvalid, match="sets no object"):
         load_system(
             write(tmp_path, "[DeviceInfo]\nVendorName=x\n\n" + var("2001", 6, "rw", "0"), NODE="dcf: node5.dcf")
         )

@@ -166,7 +166,7 @@ def test_a_dcf_sets_entries_of_compact_arrays() -> None:
     assert parse_dictionary(COMPACT.replace("4=99", "6=99")).mended == ("[3000Value] 6: left out, there are 5 entries",)
     with pytest.raises(FileInvalid, match=r"ParameterValue .*Valve1"):
         settings_of(parse_dictionary(COMPACT.replace("0x1234", "0x12345")))
-    assert "no compact array" in parse_dictionary(COMPACT.replace("CompactSubObj=5\n", "")).mended[0]
+    assert "not a compact array" in parse_dictionary(COMPACT.replace("CompactSubObj=5\n", "")).mended[0]
 
 
 def test_a_domain_is_set_to_the_file_that_a_dcf_names(tmp_path: Path) -> None:

@@ -309,8 +309,6 @@ def test_in_a_prototype_no_device_that_samples_is_emulated_by_its_profile_alone(
     path.write_text(text.replace("recording: incl.jsonl, at_end: loop", "model: profile"), encoding="utf-8")
     assert load_prototype(system, path).devices["inclinometer"].recording is None
     path.write_text(text.replace("recording: cast.jsonl, speed: 1, at_end: hold", "model: profile"), encoding="utf-8")
-    with pytest.raises(
-        FileInvalid, match="'ctd' does more than its registers say; expected `recording: FILE`"
-    ) as error:
+    with pytest.raises(FileInvalid, match="'ctd' needs more than its registers; expected `recording: FILE`") as error:
         load_prototype(system, path)
     assert error.value.line == next(n for n, line in enumerate(path.read_text().splitlines(), 1) if "ctd:" in line)

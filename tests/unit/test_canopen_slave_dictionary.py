@@ -139,7 +139,7 @@ def test_a_dcf_s_parameter_values_and_node_id() -> None:
         ("[1000]\nDataType=7\n[1000]\n", 3, "twice"),
         ("[1000]\nDataType=7\nDATATYPE=8\n", 3, "twice"),
         ("[1000]\nParameterName=x\n", 1, "no DataType"),
-        ("[1000]\nDataType=seven\n", 2, "no number"),
+        ("[1000]\nDataType=seven\n", 2, "not a number"),
         ("[1000]\nDataType=7\nAccessType=maybe\n", 3, "ro, wo"),
         ("[DeviceInfo]\nCompactPDO=3\nNrOfTXPDO=513\n[1000]\nDataType=7\n", 3, "NrOfTXPDO"),
     ],

@@ -82,7 +82,7 @@ def test_a_node_that_aborts_a_new_initiate_and_serves_the_next_one_passes(tmp_pa
     verdict, reason = found["CO-005"]
     assert verdict is Verdict.PASSED, found
     assert "abort 05040001" in reason
-    assert "then good service" in reason
+    assert "then normal service" in reason
 
 
 def test_a_node_that_aborts_a_new_initiate_and_serves_no_more_fails(tmp_path: Path) -> None:

@@ -32,8 +32,10 @@ VIRTUAL = ["observatory", "--prototype", "--virtual", "--for", "5s"]
 def test_a_run_with_faults_reports_that_it_did_not_check_devices(tmp_path: Path) -> None:
     (tmp_path / "faults.yaml").write_text(SILENT)
     done = CliRunner().invoke(run_system, [*VIRTUAL, "--faults", str(tmp_path / "faults.yaml")], standalone_mode=False)
-    assert "not judged     whether devices and outputs were good at the end, because faults were put in" in done.stdout
-    assert "not judged" not in CliRunner().invoke(run_system, VIRTUAL, standalone_mode=False).stdout
+    assert (
+        "not checked    whether devices and outputs were good at the end, because faults were injected" in done.stdout
+    )
+    assert "not checked" not in CliRunner().invoke(run_system, VIRTUAL, standalone_mode=False).stdout
 
 
 def test_the_audit_log_names_only_writes_of_the_start_up(tmp_path: Path) -> None:

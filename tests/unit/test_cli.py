@@ -79,8 +79,8 @@ def test_neither_flag_is_a_default_and_both_exclude_each_other(invoke: Invoke) -
 @pytest.mark.parametrize(
     ("args", "told"),
     [
-        (("run", "observatory", "--plant", "--speed", "2"), "a plant is not emulated"),
-        (("run", "observatory", "--plant", "--field", "localhost"), "a plant is not emulated"),
+        (("run", "observatory", "--plant", "--speed", "2"), "these options are for emulated devices"),
+        (("run", "observatory", "--plant", "--field", "localhost"), "these options are for emulated devices"),
         (("run", "observatory", "--prototype", "--allow-writes"), "--plant"),
         (("run", "observatory", "--prototype", "--for", "soon"), "duration"),
         (("run", "observatory", "--prototype", "--commands", "1,x"), "periods in seconds"),
@@ -171,7 +171,7 @@ def test_a_duplicate_key(invoke: Invoke, plant: Callable[..., str]) -> None:
     path = plant("  lan:   {url", "  line1: {url")
     code, _, err = invoke("run", path, "--plant")
     assert code == 3
-    assert "'line1' stands twice" in err
+    assert "'line1' is defined twice" in err
 
 
 @pytest.mark.parametrize(

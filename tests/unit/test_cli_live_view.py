@@ -96,7 +96,7 @@ def test_a_paused_plc_and_forces_are_in_sight(session: RunSession) -> None:
     session.plc_status = structs.replace(session.plc_status, state="paused", forces=forces)
     assert line(session).endswith("PLC PAUSED FORCED=" + ",".join(f"ctd.tag{n}" for n in range(8)) + " PLC LOST")
     top = " ".join(" ".join(shown(session, 80)[:20]).split())
-    assert "PAUSED: the PLC executes nothing, its outputs stay as they are" in top
+    assert "PAUSED: the PLC executes no program, its outputs keep their values" in top
     assert "FORCED: ctd.tag0 = 0, ctd.tag1 = 0.333333 by ada, " in top
     assert "and 2 more" in top
 

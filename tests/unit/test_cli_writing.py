@@ -35,7 +35,7 @@ def _run(*words: str, to: str | None = None) -> tuple[int, str]:
 def test_a_full_disk_is_not_our_bug() -> None:
     code, said = _run("schema", "system", to="/dev/full")
     assert code == 3
-    assert said == "fieldtwin: a file, or what we print to: No space left on device\n"
+    assert said == "fieldtwin: a file or the output: No space left on device\n"
 
 
 def test_a_trace_that_cannot_be_written(tmp_path: Path) -> None:

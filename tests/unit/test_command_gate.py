@@ -82,7 +82,7 @@ def test_each_number_is_taken_once_and_never_after_a_later_one(numbers: list[int
 @pytest.mark.parametrize(
     ("made", "event", "why"),
     [
-        (gate(remote=False), number(1), "the plant says local"),
+        (gate(remote=False), number(1), "the plant is switched to local"),
         (gate(), number(1, -1), "allowed are 0 to 3600 s"),
         (gate(), number(1, t_ms=NOW_MS - 601_000), "601 s old"),
         (gate(), Event(1, NOW_MS, Kind.COMMAND, "twin", "words"), "expected 2 bytes"),
@@ -113,7 +113,7 @@ def test_switch_and_limits_may_change_and_earlier_commands_count() -> None:
     made.restate(remote=True, bounds=Bounds(0, 60, 2))
     assert made.admit("t", number(4, 10)) is None
     assert [why.partition(": ")[2] for why in refusals(made)] == [
-        "the plant says local", "more than 2 commands in a minute",
+        "the plant is switched to local", "more than 2 commands in a minute",
     ]  # fmt: skip
     made.restate(remote=True, bounds=Bounds(0, 60, 4))
     assert made.admit("t", number(5, 61)) is None
@@ -164,7 +164,7 @@ def test_rules_are_read_and_the_first_that_fits_decides(tmp_path: Path) -> None:
         ("rules: [{when: ouside, period_s: 1}]", "ouside"),
         ("rules: [{when: outside, of: ctd.presure, period_s: 1}]", "observatory has no 'ctd.presure'"),
         ("rules: [{when: outside, period_s: 99999}]", "32767"),
-        ("rules: [{when: outside, of: ctd.pressure, period_s: 1}]", "no limits that it could be outside of"),
+        ("rules: [{when: outside, of: ctd.pressure, period_s: 1}]", "no limits for the condition"),
         ("{limits: {ctd.presure: [0, 1]}, rules: [{when: outside, period_s: 1}]}", "observatory has no 'ctd.presure'"),
         ("{limits: {ctd.pressure: [1, 0]}, rules: [{when: outside, period_s: 1}]}", "the smallest, then the largest"),
         ("rules: []", "rules"),
@@ -180,7 +180,7 @@ def test_errors_in_rules_are_reported_with_their_line(tmp_path: Path, text: str,
 
 def test_a_planner_in_python_is_made_or_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     system = load_system(str(OBSERVATORY))
-    with pytest.raises(FileInvalid, match="cannot be made: ModuleNotFoundError"):
+    with pytest.raises(FileInvalid, match="cannot be created: ModuleNotFoundError"):
         load_planner("python: no_such_module:Planner", system)
     with pytest.raises(FileInvalid, match="not a planner"):
         load_planner("python: collections:OrderedDict", system)
@@ -231,7 +231,7 @@ def test_a_manual_plan_waits_for_the_plants_state_and_is_refused_if_it_never_arr
             await twinning.run(asyncio.Event(), 0.2)
 
     run(main(heard=False))
-    assert (sent, said) == ([], ["period 5 s: the twin ended before it had heard of the plant"])
+    assert (sent, said) == ([], ["period 5 s: the twin ended before it received a status of the plant"])
     run(main(heard=True))
     assert sent == [encode_period(5)]
 

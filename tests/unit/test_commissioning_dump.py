@@ -209,7 +209,7 @@ def test_a_different_job_an_existing_file_and_a_missing_device_are_refused(tmp_p
         await dump(job(), out, words="", connector=wired(), clock=loop())
         with pytest.raises(FileInvalid, match="--resume"):
             await dump(job(), out, words="", connector=wired(), clock=loop())
-        with pytest.raises(FileInvalid, match="another job"):
+        with pytest.raises(FileInvalid, match="different device or range"):
             await dump(job(stride=1), out, words="", resume=True, connector=wired(), clock=loop())
         with pytest.raises(UsageError, match="broadcast"):
             await dump(Job(Target("rtu:/dev/ttyS99", 0)), tmp_path / "n.jsonl", words="")

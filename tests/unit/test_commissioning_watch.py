@@ -60,7 +60,7 @@ def test_samples_keep_their_pace_and_a_slow_round_is_not_made_up_for() -> None:
 
 
 def test_a_picture_is_made_or_refused_before_the_watching(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(UsageError, match="no picture of that kind"):
+    with pytest.raises(UsageError, match="unsupported image format"):
         check_plot(tmp_path / "x.txt")
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(UsageError, match="fieldtwin\\[plot\\]"):

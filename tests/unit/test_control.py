@@ -105,7 +105,7 @@ def test_a_command_is_served_and_its_errors_keep_their_kind(tmp_path: Path) -> N
             with pytest.raises(RemoteError, match="oops") as caught:
                 await client.call("broken")
             assert caught.value.kind == "Bug"
-            with pytest.raises(RemoteError, match="unknown verb 'fault'") as caught:
+            with pytest.raises(RemoteError, match="unknown command 'fault'") as caught:
                 await client.call("fault")
             assert "echo" in str(caught.value), "says which verbs there are"
             with pytest.raises(RemoteError) as caught:
@@ -198,7 +198,7 @@ def test_over_tcp_the_token_is_needed(tmp_path: Path) -> None:
         port = await server.listen_tcp("127.0.0.1", 0)
         for token in ("", "sesan", "sésame"):
             stranger = await ControlClient.connect_tcp("127.0.0.1", port, token)
-            with pytest.raises(RemoteError, match="wants its token") as caught:
+            with pytest.raises(RemoteError, match="requires its token") as caught:
                 await stranger.call("echo")
             assert caught.value.kind == "UsageError"
             await stranger.aclose()

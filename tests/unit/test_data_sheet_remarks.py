@@ -76,7 +76,7 @@ def test_a_missing_model_is_reported(device_type: str, said: str) -> None:
     sheet = var("1000", 7, "ro", device_type) + var("6040", 6, "rw", 0) + var("6041", 6, "ro", 0)
     (text,) = texts("[DeviceInfo]\nVendorName=x\n" + sheet, 17, has_model=False)
     assert said in text
-    assert "no state machine is behind them" in text
+    assert "no state machine implements them" in text
 
 
 def test_the_factory_settings_hold_without_parameter_values() -> None:
@@ -109,7 +109,7 @@ def emulated(tmp_path: Path, sheet: str, *options: str) -> tuple[list[str], int,
         subprocess.Popen([*command, "--on", "can:fieldtwin/127.0.0.1:0"], stderr=file, cwd=CHECKOUT) as process,
     ):
         try:
-            run(eventually(lambda: "made here" in said.read_text() or process.poll() is not None, within_s=60))
+            run(eventually(lambda: "a new bus with" in said.read_text() or process.poll() is not None, within_s=60))
             found = re.search(r"can:fieldtwin/[0-9.:]+[0-9]", said.read_text())
             assert found is not None, said.read_text()
             cob_id, status = run(ask(found[0]))
@@ -133,7 +133,7 @@ def test_emulate_reports_a_drive_without_a_model_and_how_to_choose_one(tmp_path:
     sheet = DRIVE.replace("DefaultValue=0x00020192\n", "")
     lines, _, status = emulated(tmp_path, sheet)
     assert status == 0
-    assert any("no state machine is behind them" in line and "--model 402" in line for line in lines), lines
+    assert any("no state machine implements them" in line and "--model 402" in line for line in lines), lines
     lines, _, status = emulated(tmp_path, sheet, "--model", "402")
     assert status & 0x6F == 0x40, "switch on disabled"
     assert not any("no state machine" in line for line in lines), lines

@@ -198,7 +198,7 @@ def test_a_write_that_is_acknowledged_and_not_held_is_an_error() -> None:
     async def main() -> None:
         async with ctd() as c:
             c.sensor._note_tags = lambda *a: c.sensor._cells.poke("holding", 1, 9)  # type: ignore[method-assign]
-            with pytest.raises(VerifyFailed, match="acknowledged, and not held"):
+            with pytest.raises(VerifyFailed, match="acknowledged the write, but holds a different value"):
                 await c.period(5)
             assert c.tags.current("ctd.sample_period_s", 0).value == 9  # the published values are those it holds
 

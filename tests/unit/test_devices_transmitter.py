@@ -253,7 +253,7 @@ def test_a_transmitter_needs_a_mailbox_and_a_socket() -> None:
         TransmitterDriver(DeviceConfig("x", ctd, "b", 1), tags)
     driver = TransmitterDriver(DeviceConfig("x", PROFILE, "b", 1), tags)
     near, _ = wire(LINE)
-    with pytest.raises(FileInvalid, match="cannot stand on this bus"):
+    with pytest.raises(FileInvalid, match="does not fit this bus"):
         driver.attach(near)
     assert BusConfig("b", LAN).retries == 1
 

@@ -97,7 +97,7 @@ def test_short_forms(url: str, expected: Endpoint) -> None:
         ("", "one of rtu:"),
         ("/dev/ttyS0", "one of rtu:"),
         ("http://h", "one of rtu:"),
-        ("rtu:", "names no port"),
+        ("rtu:", "has no port"),
         ("tcp:modem:502", "tcp://HOST:PORT"),
         ("tcp://", "tcp://HOST:PORT"),
         ("tcp://h:65536", "0 to 65535"),

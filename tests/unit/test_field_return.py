@@ -60,7 +60,12 @@ def free_port() -> int:
     [
         ("first", "tcp://127.0.0.1:5", False, ""),
         ("second", "tcp://127.0.0.1:5", True, ""),
-        ("second", "tcp://127.0.0.1:6", True, "listens elsewhere: far end of modem at tcp://127.0.0.1:6, not"),
+        (
+            "second",
+            "tcp://127.0.0.1:6",
+            True,
+            "with different endpoints: topside end of modem at tcp://127.0.0.1:6, not",
+        ),
     ],
 )
 def test_it_is_found_again(system: System, life: str, far: str, another: bool, moved: str) -> None:
@@ -76,7 +81,7 @@ def test_it_is_found_again(system: System, life: str, far: str, another: bool, m
         back.lost()
         back.lost()  # each failed request reports it
         assert back.client is None
-        assert "was lost: nobody knows what its devices held" in back.trouble
+        assert "was lost: the values of its devices are not known" in back.trouble
         await second.server.listen_tcp("127.0.0.1", port)
         await eventually(lambda: back.client is not None)
         assert returns == [another]
@@ -103,7 +108,7 @@ def test_one_with_another_system_file_is_not_taken(system: System) -> None:
         await first.server.aclose()
         back.lost()
         await other.server.listen_tcp("127.0.0.1", port)
-        await eventually(lambda: "another version" in back.trouble)
+        await eventually(lambda: "a different version" in back.trouble)
         assert back.client is None
         assert not returns
         other.status["devices"] = 5

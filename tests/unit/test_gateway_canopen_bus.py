@@ -242,7 +242,7 @@ def test_another_serial_number_blocks_every_write(tmp_path: Path) -> None:
             r.plug_node(serial=7)
             await eventually(lambda: r.quality("slope_long") == ("bad", "wrong device"))
             assert r.status.driver.identity_error == "serial is 7"
-            assert "another node answers" in r.status.error
+            assert "a different node answers" in r.status.error
             assert r.audit() == []
             assert all(f.data[0] >> 5 != 1 for f in r.sent_by_gateway() if f.can_id == SDO_TO_NODE)  # no download
             assert not [f for f in r.frames if f.can_id == 0]  # no NMT

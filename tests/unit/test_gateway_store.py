@@ -164,7 +164,7 @@ def test_a_store_of_a_newer_version_and_a_file_that_is_not_a_store_are_refused(t
     assert told.value.got == "99"
     none = tmp_path / "none.sqlite"
     none.write_bytes(b"this is a text file, and long enough to be looked into\n" * 40)
-    with pytest.raises(FileInvalid, match="not a store of ours"):
+    with pytest.raises(FileInvalid, match="not a store of fieldtwin"):
         ExchangeLog(none, system="obs", prototype=True)
     assert none.read_bytes().startswith(b"this is a text file")
     with pytest.raises((FileInvalid, Unreachable)):

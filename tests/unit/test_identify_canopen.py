@@ -55,7 +55,7 @@ def test_another_makers_drive_is_possible_and_another_kind_is_not() -> None:
         drive = await identify(numbers(0x00020192, 0x2E, 9))
         assert {c.profile for c in drive.candidates if c.sureness} == {"fieldtwin/drive-cia402"}
         assert drive.candidates[0].sureness is Sureness.POSSIBLE
-        assert "another maker" in " ".join(drive.candidates[0].against)
+        assert "a different maker" in " ".join(drive.candidates[0].against)
         strange = await identify(numbers(0, 0x2E, 9))
         assert all(c.sureness is Sureness.RULED_OUT for c in strange.candidates)
         assert strange.summary == "no known profile fits"
@@ -66,7 +66,7 @@ def test_another_makers_drive_is_possible_and_another_kind_is_not() -> None:
 def test_silence_is_reported_as_silence() -> None:
     async def main() -> None:
         found = await identify({}, node=6)
-        assert (found.answers, found.summary) == (False, "node 5 answers no SDO")
+        assert (found.answers, found.summary) == (False, "node 5 does not answer SDO requests")
 
     run_virtually(main())
 

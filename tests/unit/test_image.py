@@ -215,7 +215,7 @@ def test_another_layout_or_no_image_is_refused() -> None:
     with pytest.raises(FileInvalid, match="not a process image"):
         layout.attach(memory)
     layout.format(memory)
-    with pytest.raises(FileInvalid, match="another layout"):
+    with pytest.raises(FileInvalid, match="different layout"):
         other.attach(memory)
     with pytest.raises(FileInvalid, match="too small"):
         layout.attach(memory[:-1])

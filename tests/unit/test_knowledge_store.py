@@ -77,7 +77,7 @@ EVERY_KIND = [
     Event(0, 3, Kind.VALUE, "ctd.serial", "0042 ä"),
     Event(0, 4, Kind.VALUE, "ctd.pressure", None, int(Quality.BAD), int(Reason.TIMEOUT)),
     Event(0, 5, Kind.COMMAND, "shore", b"\0\1"),
-    Event(0, 6, Kind.REFUSAL, "execute", "the plant says local"),
+    Event(0, 6, Kind.REFUSAL, "execute", "the plant is switched to local"),
     Event(0, 7, Kind.STATE, "relay", -1),
     Event(0, 8, Kind.PAYLOAD, "relay", b""),
     Event(0, 9, Kind.VALUE, "ctd.pressure", math.inf),
@@ -344,7 +344,7 @@ def test_a_server_that_goes_away_is_unreachable_and_used_again_when_it_is_back(p
 def test_a_file_that_is_not_a_store_is_not_changed(tmp_path: Path) -> None:
     path = tmp_path / "letter.txt"
     path.write_text("dear plant, " * 100)
-    with pytest.raises(FileInvalid, match="not a store of ours"):
+    with pytest.raises(FileInvalid, match="not a store of fieldtwin"):
         run(SqliteKnowledge.open(path))
     with pytest.raises(FieldtwinError):
         run(SqliteKnowledge.open(tmp_path / "no" / "such" / "folder.db"))

@@ -31,7 +31,7 @@ class Moody(SqliteKnowledge):
         if self.slow is not None:
             await self.slow.wait()
         if self.full:
-            raise StoreFull("no room for more knowledge")
+            raise StoreFull("the knowledge store is full")
         return await super().append(origin, events)
 
     def room_bytes(self) -> int | None:
@@ -121,7 +121,7 @@ def test_low_space_is_reported_early_once_and_when_it_is_over(tmp_path: Path) ->
             store.room = room
             writer.observe(value(1))
             await writer.flush()
-        assert said == ["the disk of the knowledge is almost full: 99 MiB left", ""]
+        assert said == ["the disk of the knowledge store is almost full: 99 MiB left", ""]
         assert writer.written == 4, "early: while it can still be written"
         await store.aclose()
 
@@ -177,7 +177,7 @@ def test_a_refusing_store_is_reported_and_queued_events_stay(tmp_path: Path) -> 
         writer.observe(value(1))
         store.full = True
         assert not await writer.try_to_flush()
-        assert (said, writer.queued) == (["no room for more knowledge"], 1)
+        assert (said, writer.queued) == (["the knowledge store is full"], 1)
         store.full = False
         assert await writer.try_to_flush()
         assert (said[-1], writer.queued) == ("", 0)

@@ -139,7 +139,7 @@ def test_no_file_does_any_harm(data: bytes, tmp_path_factory: pytest.TempPathFac
 def test_a_disk_that_refuses_is_reported(site: Site, tmp_path: Path) -> None:
     site.run()
     full = LearntFile(tmp_path / "no such folder" / "learnt.json", [site.driver], {"line": BusConfig("line", LINE)})
-    with pytest.raises(Unreachable, match="cannot write what was learnt"):
+    with pytest.raises(Unreachable, match="cannot store the learnt gaps"):
         full.save()
 
 

@@ -43,7 +43,7 @@ def test_a_line_that_a_kill_cut_off_goes(tmp_path: Path) -> None:
 def test_a_file_that_is_not_a_line_is_named(tmp_path: Path) -> None:
     path = tmp_path / "ledger.jsonl"
     path.write_text('{"what": 1}\n')
-    with pytest.raises(FileInvalid, match="no line of a ledger") as e:
+    with pytest.raises(FileInvalid, match="not a line of a ledger") as e:
         Ledger(path)
     assert e.value.line == 1
 
@@ -53,7 +53,7 @@ def test_texts_are_not_mixed_up() -> None:
 
 
 def test_a_campaign_that_the_ledger_knows_as_failed_does_not_end_ok(tmp_path: Path) -> None:
-    """Defect: with --ledger a seed that had failed was not run again, and the campaign ended with ok."""
+    """Defect: with --ledger a seed that had failed was not repeated, and the campaign ended with ok."""
     from click.testing import CliRunner
 
     from fieldtwin.cli.run.run_command import command

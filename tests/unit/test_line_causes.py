@@ -42,7 +42,7 @@ def test_a_silent_line_is_not_a_fault_and_nothing_is_sent() -> None:
         assert line.sent == []
         assert not report.sent
         assert report.healthy
-        assert names(report)[0] == "nobody is asking"
+        assert names(report)[0] == "no client sends requests"
         assert dict(report.facts)["control lines"] == "CTS dsr"
 
     run_virtually(main())
@@ -97,7 +97,7 @@ def test_the_probe_sees_echo_and_answer_and_is_one_question() -> None:
         report = await look(nobody, probe_unit=9)
         assert report.probe is not None
         assert (report.probe.echo, report.probe.answer) == ("whole", "none")
-        assert "another unit id" in names(report)
+        assert "a different unit ID" in names(report)
         assert not report.healthy
 
     run_virtually(main())
@@ -106,7 +106,7 @@ def test_the_probe_sees_echo_and_answer_and_is_one_question() -> None:
 def test_no_probe_is_sent_into_foreign_traffic_without_permission() -> None:
     async def main() -> None:
         line = UartLine({1: meter()}, counts=True, chatter=(exchange(5, 1),))
-        with pytest.raises(NotAllowed, match="somebody talks"):
+        with pytest.raises(NotAllowed, match="carries traffic"):
             await look(line, probe_unit=1)
         assert line.sent == []
         report = await look(line, probe_unit=1, share_bus=True)
@@ -150,8 +150,8 @@ def heard_of(data: bytes) -> Heard:
         ),
         (SerialEvidence(N81, heard_of(bytes(range(0, 250, 3))), LineCounters(frame=40)), "the baud rate"),
         (SerialEvidence(N81, heard_of(b""), None, probe=Probe(1, "damaged", "none", 8)), "termination or noise"),
-        (SerialEvidence(N81, heard_of(b""), None, probe=Probe(1, "none", "none")), "another unit id"),
-        (SerialEvidence(N81, heard_of(exchange(5, 1)[0] * 20)), "only the master is heard"),
+        (SerialEvidence(N81, heard_of(b""), None, probe=Probe(1, "none", "none")), "a different unit ID"),
+        (SerialEvidence(N81, heard_of(exchange(5, 1)[0] * 20)), "only the client is received"),
         (SerialEvidence(N81, heard_of(b"".join((*exchange(5, 1), b"\x00") * 10))), "direction control"),
         (SerialEvidence(N81, heard_of(b"x"), LineCounters(overrun=3)), "the baud rate"),
     ],
@@ -173,7 +173,7 @@ def test_known_faults_come_first(evidence: SerialEvidence, first: str) -> None:
         (CanFacts("socketcan", tx_errors=128), BusHeard(), "alone on the bus"),
         (CanFacts("socketcan"), BusHeard(errors=9), "the bit rate"),
         (CanFacts("socketcan"), BusHeard(errors=9, frames=9), "termination or noise"),
-        (CanFacts("socketcan"), BusHeard(), "nobody is sending"),
+        (CanFacts("socketcan"), BusHeard(), "no node sends"),
     ],
 )
 def test_faults_of_a_bus(facts: CanFacts, heard: BusHeard, first: str) -> None:
@@ -184,8 +184,8 @@ def test_faults_of_a_bus(facts: CanFacts, heard: BusHeard, first: str) -> None:
 @pytest.mark.parametrize(
     ("problem", "heard", "hung_up", "first"),
     [
-        ("connection refused", b"", False, "nothing listens there"),
-        ("no answer", b"", False, "the host is off, or a firewall drops"),
+        ("connection refused", b"", False, "no program listens there"),
+        ("no answer", b"", False, "the host is off, or a firewall drops packets"),
         ("", b"", True, "no room for another client"),
         ("", b"SSH-2.0", False, "another protocol"),
         ("", b"", False, ""),
@@ -209,7 +209,7 @@ def test_a_host_that_hangs_up_is_found_out_without_sending() -> None:
         server.close()
         await server.wait_closed()
         report = await look_at_line(f"tcp://127.0.0.1:{port}", LineLook(listen_s=5))
-        assert report.causes[0].name == "nothing listens there"
+        assert report.causes[0].name == "no program listens there"
 
     asyncio.run(main())
 

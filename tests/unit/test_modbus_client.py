@@ -242,7 +242,7 @@ def test_an_identification_that_goes_round_in_circles_ends() -> None:
             await device.send_frame("01 2b 0e 01 01 ff 01 01 00 02 41 42")
 
         device.answer = answer
-        with pytest.raises(Desync, match="circles"):
+        with pytest.raises(Desync, match="repeats objects"):
             await client.read_identification(1)
         assert len(device.requests) == 2
 
@@ -258,7 +258,7 @@ def test_an_identification_that_goes_round_in_circles_ends() -> None:
         ("rtu+tcp://h:1", {"strict": True}, "baud rate"),
         ("rtu:/dev/x", {"accepts_zero_id": True}, "transaction ids"),
         ("rtu:/dev/x", {"turnaround_s": 0.0}, "out of range"),
-        ("can:socketcan/can0", {}, "not spoken"),
+        ("can:socketcan/can0", {}, "does not carry Modbus"),
     ],
 )
 def test_a_setting_that_a_wire_lacks_cannot_be_set(url: str, settings: dict[str, bool], says: str) -> None:

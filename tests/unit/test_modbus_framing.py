@@ -106,7 +106,7 @@ def test_mb_007_frames_closer_than_t35() -> None:
     assert registers(exchange(RtuFramer(char_time_ns=CHAR_NS), close)) == REGISTERS
     assert registers(exchange(RtuFramer(), [(10.0, foreign + REPLY)])) == REGISTERS
     strict = RtuFramer(strict=True, char_time_ns=CHAR_NS)
-    with pytest.raises(ReplyTimeout, match="too close"):
+    with pytest.raises(ReplyTimeout, match="too soon"):
         exchange(strict, close)
     assert outcome(strict, [(10.0, foreign + REPLY)]) is ReplyTimeout
     apart = [(10.0, foreign), (10.0 + 2.1 + 11 * 0.573, REPLY)]

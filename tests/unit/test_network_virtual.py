@@ -129,12 +129,12 @@ def test_the_minimal_faults_of_a_failing_seed_become_a_scenario_of_the_network(
     (tmp_path / "x.yaml").write_text(FAULTS + bits)
     result = on_the_command_line(tmp_path, "--for", "20s", "--faults", "x.yaml", "--seeds", "1")
     assert result.return_value == 1
-    assert "published values were never held by their device" in result.stdout
+    assert "published values never occurred in their device" in result.stdout
     scenario = load_scenario(tmp_path / "ocean_network-seed1.scenario.yaml")
     assert [step.fault["id"] for step in scenario.form.steps if step.fault] == ["bits"]
     again = run_virtual(scenario)
     assert again.verdict is Verdict.FAILED
-    assert "published values were never held by their device" in again.reason
+    assert "published values never occurred in their device" in again.reason
 
 
 def test_faults_of_a_system_and_of_the_acoustic_channel_affect_their_targets(tmp_path: Path) -> None:

@@ -65,7 +65,7 @@ def test_a_packed_file_of_a_gigabyte_ends_at_the_stated_size(tmp_path: Path, kin
         for _ in range(PIECES):
             file.write(piece)
     assert path.stat().st_size < PIECE * PIECES // 200
-    with pytest.raises(FileInvalid, match=r"the packed file holds too much.*at most \d+ bytes \(64 MiB, or 100 times"):
+    with pytest.raises(FileInvalid, match=r"the unpacked file is too large.*at most \d+ bytes \(64 MiB, or 100 times"):
         read(path)
 
 
@@ -77,7 +77,7 @@ def test_a_can_log_whose_containers_hold_gigabytes_ends_at_the_stated_size(tmp_p
     container += bytes(len(container) % 4)
     path = tmp_path / "bomb.blf"
     path.write_bytes(b"LOGG" + struct.pack("<I", 144) + bytes(136) + container * (PIECES * 32))
-    with pytest.raises(FileInvalid, match="the packed file holds too much"):
+    with pytest.raises(FileInvalid, match="the unpacked file is too large"):
         for _ in read_can_file(path, LeftOut()):
             pass
 

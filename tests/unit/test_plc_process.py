@@ -170,7 +170,7 @@ def test_commands_become_outputs_and_samples_responses_until_the_stop(tmp_path: 
             assert (status["state"], status["error"]) == ("running", "")
             assert status["inputs"]["modem.inbox"]["quality"] == "good"
             assert status["lateness_us"]["count"] >= status["scans"] > 0
-            assert status["realtime"]["refused"]["SCHED_FIFO 0"] == "not asked for"
+            assert status["realtime"]["refused"]["SCHED_FIFO 0"] == "not requested"
             with pytest.raises(RemoteError):
                 await client.call("fault")
             assert (await client.call("stop"))["state"] == "stopped"

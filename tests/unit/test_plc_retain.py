@@ -71,7 +71,7 @@ def test_a_different_program_starts_cold_and_the_old_file_is_kept(tmp_path: Path
     kept.close()
     other = Other()
     begun = Retained(bound(other), path)
-    assert begun.start == "cold start: the retained variables are those of another program"
+    assert begun.start == "cold start: the retained variables belong to a different program"
     assert (tmp_path / "retain.old").exists()
     begun.close()
 

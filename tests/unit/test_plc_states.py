@@ -91,9 +91,9 @@ def test_tables_that_make_no_sense_are_refused(table: object, told: str) -> None
 @pytest.mark.parametrize(
     ("transition", "told"),
     [
-        (Transition("A", "B", when="nothing > 1"), "names no variable"),
-        (Transition("A", "B", when="x >"), "no expression"),
-        (Transition("A", "B", when="open('f')"), "names no variable"),
+        (Transition("A", "B", when="nothing > 1"), "without a variable"),
+        (Transition("A", "B", when="x >"), "not an expression"),
+        (Transition("A", "B", when="open('f')"), "without a variable"),
         (Transition("A", "B", do="missing"), "no method missing"),
     ],
 )

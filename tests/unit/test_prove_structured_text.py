@@ -133,7 +133,7 @@ def test_a_key_that_omits_a_deciding_variable_proves_nothing() -> None:
     assert not result.proved
     assert replayed(program(text), result.way)[-1]["hit"] is True
     unseen = replace(proof, invariants={"nothing": lambda p: True}, key=lambda p: (p.hit, p.go))
-    assert prove(unseen).reason.startswith("the key leaves out what decides")
+    assert prove(unseen).reason.startswith("the key omits a deciding variable")
 
 
 class Delayed(Program):

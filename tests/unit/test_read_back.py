@@ -46,7 +46,7 @@ def node(folder: Path, more: str = "") -> Path:
 
 def test_a_writable_tag_that_is_never_read_back_is_named_with_the_remedy(tmp_path: Path) -> None:
     (warning,) = load_system(str(node(tmp_path))).warnings
-    assert "io.outputs_1 may be written and is never read back" in warning
+    assert "io.outputs_1 may be written but is never read back" in warning
     assert f"{tmp_path}/node.yaml:11:16" in warning
     assert "`values: {every_ms: 1000}` in `poll` of io, or the tag in its `tpdo1`" in warning
 
@@ -70,7 +70,7 @@ def test_the_warning_is_shown_when_the_file_is_loaded(tmp_path: Path) -> None:
         [sys.executable, "-m", "fieldtwin", *words], capture_output=True, text=True, timeout=60, check=True
     )
     assert "warning: " in run.stderr
-    assert "fan.mode may be written and is never read back" in run.stderr.replace("\n", " ")
+    assert "fan.mode may be written but is never read back" in run.stderr.replace("\n", " ")
     assert json.loads(run.stdout)["warnings"] == list(load_system(str(system)).warnings)
 
 

@@ -191,7 +191,7 @@ def test_an_invalid_range_is_refused(text: str) -> None:
 
 
 def test_a_gap_at_the_place_of_a_value_is_refused() -> None:
-    with pytest.raises(FileInvalid, match=r"holding:2\.\.5.*where the tag 't1' stands"):
+    with pytest.raises(FileInvalid, match=r"holding:2\.\.5.*overlaps the tag 't1'"):
         profile_of([(0, "uint16"), (4, "uint16")], gaps=["holding:1", "holding:2..5"])
 
 

@@ -224,7 +224,7 @@ def test_a_full_disk_leaves_whole_records(tmp_path: Path) -> None:
         with RecordingWriter(path, SIGNALS) as writer:
             resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size + 50, before[1]))
             writer.row(0.0, [1.0, 2.0])
-            with pytest.raises(FileInvalid, match="cannot write on"):
+            with pytest.raises(FileInvalid, match="cannot continue writing"):
                 fill(writer, 1, 20)
             written = writer.records
     finally:

@@ -148,7 +148,7 @@ def test_a_run_is_the_same_as_itself(changes: list[tuple[int, float | None, str]
 
 
 def test_a_scenario_takes_something_to_expect() -> None:
-    with pytest.raises(UsageError, match="nothing in this run can be expected"):
+    with pytest.raises(UsageError, match="this run has nothing to expect"):
         as_scenario(SYSTEM, Story(), Wanted("x", "observatory"))
 
 

@@ -116,7 +116,7 @@ def test_a_log_of_the_same_device_under_another_node_id(tmp_path: Path) -> None:
     assert objects.initial[0x2006, 0] == b"\x63\x00"
     assert [objects(at_ms * 10**6)[0x2002, 0] for at_ms in (0, 15, 25)] == [b"\x34\x12", b"\x34\x12", b"\x78\x56"]
     path.write_text(LOG + "(100.5) can0 586#4300180186010000\n", encoding="ascii")
-    with pytest.raises(UsageError, match="holds nothing of node 9") as e:
+    with pytest.raises(UsageError, match="has no frames of node 9") as e:
         recorded_objects(log, parse_eds(RICH), 9)
     assert e.value.got == "node 5, node 6"
     with pytest.raises(FileInvalid, match="cannot be read"):

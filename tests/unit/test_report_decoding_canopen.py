@@ -125,7 +125,7 @@ def test_frames_outside_canopen() -> None:
         note(5, Kind.FRAME, "can0", id=1, bytes="zz"),
     ]
     assert texts(odd)[:4] == [
-        "18DA00F1#01: no CANopen (29-bit identifier)", "error frame", "asks for 705h", "6E1#00: no identifier of CANopen",
+        "18DA00F1#01: not CANopen (29-bit identifier)", "error frame", "asks for 705h", "6E1#00: not a CANopen identifier",
     ]  # fmt: skip
     assert all(text.startswith("unreadable") for text in texts(odd)[4:])
     assert exchanges(observatory(), odd) == []

@@ -112,7 +112,7 @@ def test_a_reply_that_comes_twice_is_a_stray() -> None:
 def test_a_reply_to_a_different_request_is_malformed() -> None:
     found = only([ask(0, "06 0001 0005"), answer(5, "06 0001 0006")])
     assert found.problem == "malformed"
-    assert "acknowledges something else" in found.reply_text
+    assert "does not acknowledge the request" in found.reply_text
 
 
 def test_tcp_replies_are_matched_by_their_transaction() -> None:
@@ -137,7 +137,7 @@ def test_a_mailbox_shows_its_payload() -> None:
 
 def test_a_header_that_cannot_be_right_is_noise() -> None:
     decoded = Decoder(observatory()).decode(chunk(0, False, "0001 0000 FFFF 01 03", "lan"))
-    assert decoded.text == "8 bytes of noise (a header that cannot be right)"
+    assert decoded.text == "8 bytes of noise (an impossible header)"
 
 
 def test_an_echo_is_not_a_reply() -> None:
@@ -253,7 +253,7 @@ def test_on_tcp_an_answer_ends_earlier_requests() -> None:
     assert (first.t_ns, first.problem) == (0, "no reply")
     assert (second.t_ns, second.ok) == (50 * MS, True)
     late = decoder.decode(chunk(70, False, adu(1, "03 02 0009"), "lan"))
-    assert late.text == "modem: an answer that comes too late: transaction 1, unit 1, 00 01 00 00 00 05 01 03 02 00 09"
+    assert late.text == "modem: a late reply: transaction 1, unit 1, 00 01 00 00 00 05 01 03 02 00 09"
     assert [e.problem for e in late.exchanges] == ["stray"]
     assert decoder.finish() == []
 

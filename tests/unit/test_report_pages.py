@@ -113,7 +113,7 @@ def test_coverage_lists_missing_items() -> None:
     said = page(report(scenario())).said
     assert "7 of 8 read" in said
     assert "Never: sample_period_s (written) serial (read)" in said
-    assert "0 of 9 of the standard seen" in said
+    assert "0 of 9 of the standard occurred" in said
     assert "01 illegal function" in said
     assert "3 of 6 taken" in said
     assert "STANDBY – 1 never" in said  # from STANDBY: to ACTIVE once, to OFF never
@@ -157,7 +157,7 @@ def test_a_run_of_nothing() -> None:
     said = page(empty).said
     assert "No scenario was run" in said
     assert "No scenario names a requirement" in said
-    assert page(report()).said.count("No frame was seen") == 1
+    assert page(report()).said.count("No frame was recorded") == 1
 
 
 def test_a_failure_without_a_trace() -> None:
@@ -168,7 +168,7 @@ def test_a_failure_without_a_trace() -> None:
 
 def test_losses_of_a_full_trace_are_reported() -> None:
     late = [e for e in TRACE if e.t_ns > 12_500 * MS]
-    assert "no longer holds the beginning" in page(report(scenario(trace=late, dropped=500))).said
+    assert "no longer contains the beginning" in page(report(scenario(trace=late, dropped=500))).said
 
 
 def test_five_hundred_failures_are_listed_and_few_are_drawn() -> None:

@@ -259,7 +259,7 @@ def test_a_master_that_was_silent_for_long_ends_the_asking() -> None:
         found = await scanner.run()
         assert 5 < found.took_s < 8
         assert found.asked < 20
-        assert any("another master began" in note for note in found.notes)
+        assert any("started to send" in note for note in found.notes)
 
     run_virtually(main())
 
@@ -269,7 +269,7 @@ def test_unproved_settings_are_not_used_for_sending_unless_given() -> None:
         line = UartLine({7: meter()}, SerialSettings(9600, "8E1"), chatter=(exchange(5, 1), exchange(6, 2)))
         found = await scan(line, share_bus=True, units=(7,))
         assert line.sent == []
-        assert any("not proved" in note for note in found.notes)
+        assert any("not certain" in note for note in found.notes)
         said = UartLine({7: meter()}, SerialSettings(9600, "8E1"), chatter=(exchange(5, 1), exchange(6, 2)))
         found = await scan(said, f"{PORT}?baudrate=9600&frame=8E1", share_bus=True, units=(7,))
         assert [f.answer.unit for f in found.units] == [7]

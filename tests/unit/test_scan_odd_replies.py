@@ -52,10 +52,10 @@ def test_the_same_reply_of_many_units_is_one_line_whose_advice_fits_tcp(capsys: 
     assert len(found.damaged) == 1
     assert len(found.damaged[0].units) > 240
     show_modbus(found)
-    lines = [line for line in capsys.readouterr().err.splitlines() if "does not fit" in line]
+    lines = [line for line in capsys.readouterr().err.splitlines() if "does not match" in line]
     assert len(lines) == 1
-    assert "units (0, 2-247, 255): a reply that does not fit the question (80 0B): exception 0B" in lines[0]
-    assert "some servers answer so for unit ids that they do not have" in lines[0]
+    assert "units (0, 2-247, 255): a reply that does not match the request (80 0B): exception 0B" in lines[0]
+    assert "some servers answer this for unit IDs that they do not have" in lines[0]
     assert "two devices" not in lines[0]
     assert "bad line" not in lines[0]
     listed = modbus_json(found)["damaged"]
@@ -79,11 +79,11 @@ def test_different_replies_are_different_findings() -> None:
 
 def test_the_advice_fits_the_wire() -> None:
     line = SerialSettings()
-    assert OddReply((2,), line, b"").advice == "damaged each time: two devices with one unit id, or a bad line"
-    assert "two devices with one unit id" in OddReply((2,), line, b"\x80\x0b").advice
+    assert OddReply((2,), line, b"").advice == "damaged each time: two devices with the same unit ID, or a bad line"
+    assert "two devices with the same unit ID" in OddReply((2,), line, b"\x80\x0b").advice
     assert (
         OddReply((2,), None, b"").advice
-        == "no Modbus frame: another protocol or framing at this port, or a faulty server"
+        == "not a Modbus frame: another protocol or framing at this port, or a faulty server"
     )
 
 

@@ -121,7 +121,7 @@ def test_a_unit_at_which_the_host_disconnects_is_reported_and_the_others_are_ask
         host = Host(lambda u: b"" if u == 2 else value(u))
         found = await scan(host, units=(1, 2, 3))
         assert [f.answer.unit for f in found.units] == [1, 3]
-        assert any("hangs up whenever unit 2" in note for note in found.notes)
+        assert any("closes the connection whenever unit 2" in note for note in found.notes)
         assert host.asked.count(2) == 3
 
     run_virtually(main())

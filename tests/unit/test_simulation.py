@@ -74,9 +74,9 @@ def test_after_long_silence_old_steps_are_left_out_and_counted() -> None:
 
 
 def test_invalid_names_and_inputs() -> None:
-    with pytest.raises(UsageError, match="nothing computes 'y'"):
+    with pytest.raises(UsageError, match="no formula or step computes 'y'"):
         simulation({"x": "1"}, y=1.0)
-    with pytest.raises(UsageError, match="no name for a value"):
+    with pytest.raises(UsageError, match="not a valid name for a value"):
         simulation({"t": "1"})
     with pytest.raises(UsageError, match="no input 'v'"):
         simulation({"x": "u"}, ("u",)).put("v", 1.0, START)
@@ -155,7 +155,7 @@ def test_a_python_model_that_fails_is_its_files_fault(tmp_path: Path, name: str,
 def test_a_file_that_is_not_python(tmp_path: Path) -> None:
     with pytest.raises(FileInvalid, match="cannot be imported: SyntaxError"):
         model(tmp_path, "Tank", text="class")
-    with pytest.raises(FileInvalid, match="no Python file"):
+    with pytest.raises(FileInvalid, match="not a Python file"):
         PythonModel(tmp_path / "none.py", "Tank", {})
 
 

@@ -68,16 +68,20 @@ def changed(tmp_path: Path, old: str, new: str) -> Path:
     [
         ("wheel: drive.velocity,", "wheel: driver.velocity,", r":10:\d+: .*no emulated device 'driver'"),
         ("wheel: drive.velocity,", "wheel: drive.speed,", r":10:\d+: .*drive has no number 'speed'"),
-        ("cos(turned)", "cos(turnt)", r":14:\d+: .*nothing is called 'turnt'.*did you mean 'turned'"),
+        ("cos(turned)", "cos(turnt)", r":14:\d+: .*there is no value or function 'turnt'.*did you mean 'turned'"),
         ("cos(turned)", "cosine(turned)", r":14:\d+: .*no function 'cosine'.*did you mean"),
         ("{simulation: floor}", "{simulation: flor}", r"no simulation 'flor'; expected floor"),
-        ("{simulation: floor}", "{simulation: floor, plays: {z: x}}", r"fieldtwin/vehicle-localiser has no number 'z'"),
-        ("{simulation: floor}", "{simulation: floor, plays: {x: z}}", r"nothing computes 'z'"),
-        ("{simulation: floor}", "{model: profile, plays: {x: x}}", r"nothing to play"),
-        ("{simulation: floor}", "{simulation: floor, model: profile}", r"what stands in for 'localiser'"),
-        ("step_ms: 10", "step_ms: 10\n    python: a.py:B", r"what computes 'floor'"),
-        ("step_ms: 10", "start: {z: 1}", r"nothing computes 'z'"),
-        ("heading: turned", "dt: turned", r"'dt' means something already"),
+        (
+            "{simulation: floor}",
+            "{simulation: floor, plays: {z: x}}",
+            r"fieldtwin/vehicle-localiser has no numeric tag 'z'",
+        ),
+        ("{simulation: floor}", "{simulation: floor, plays: {x: z}}", r"no formula or step computes 'z'"),
+        ("{simulation: floor}", "{model: profile, plays: {x: x}}", r"`plays` without a simulation"),
+        ("{simulation: floor}", "{simulation: floor, model: profile}", r"the data source of 'localiser'"),
+        ("step_ms: 10", "step_ms: 10\n    python: a.py:B", r"the simulation of 'floor'"),
+        ("step_ms: 10", "start: {z: 1}", r"no formula or step computes 'z'"),
+        ("heading: turned", "dt: turned", r"'dt' already has a meaning"),
     ],
 )
 def test_errors_are_reported_with_their_place(tmp_path: Path, old: str, new: str, message: str) -> None:

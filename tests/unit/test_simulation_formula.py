@@ -75,7 +75,7 @@ def test_noise_is_of_its_seed() -> None:
 @pytest.mark.parametrize(
     ("text", "message", "hint"),
     [
-        ("lewel + 1", "nothing is called 'lewel'", "level"),
+        ("lewel + 1", "there is no value or function 'lewel'", "level"),
         ("sinus(1)", "no function 'sinus'", "sin"),
         ("ramp(1, 2)", "ramp.. in a formula", ""),
         ("level.real", "not understood", ""),

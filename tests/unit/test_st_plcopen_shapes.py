@@ -85,5 +85,5 @@ def test_methods_and_actions_are_refused_at_their_position(tmp_path: Path) -> No
     path = tmp_path / "tank.xml"
     data = '<addData><data name="http://www.3s-software.com/plcopenxml/method"><Method name="Reset"/></data></addData>'
     path.write_text(text.replace("<addData />", data))
-    with pytest.raises(FileInvalid, match="FB_Ramp has what is not supported: method"):
+    with pytest.raises(FileInvalid, match="FB_Ramp has an unsupported part: method"):
         load_file(path)

@@ -39,7 +39,7 @@ def test_the_link_of_a_killed_emulator_is_not_followed_to_another_terminal(tmp_p
             while not others or os.ttyname(others[-1][1]) != device:  # the kernel gives the lowest free number
                 others.append(os.openpty())
                 assert len(others) < 200
-            with pytest.raises(Unreachable, match="its link leads to a newer terminal"):
+            with pytest.raises(Unreachable, match="its link points to a newer pseudo-terminal"):
                 await connector.open_bytes(PLANT)
         finally:
             for pair in others:

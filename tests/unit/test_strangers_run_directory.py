@@ -39,9 +39,9 @@ def test_the_users_own_folder_is_taken(default: Path) -> None:
 def test_a_folder_of_another_user_is_refused(default: Path) -> None:
     default.mkdir(mode=0o777)
     os.chown(default, STRANGER, STRANGER)
-    with pytest.raises(Unreachable, match="not yours alone"):
+    with pytest.raises(Unreachable, match="other users have access"):
         Instance("a")
-    with pytest.raises(Unreachable, match="not yours alone"):
+    with pytest.raises(Unreachable, match="other users have access"):
         runtime_root()
 
 
@@ -49,18 +49,18 @@ def test_a_folder_of_another_user_is_refused(default: Path) -> None:
 def test_a_folder_that_others_may_write_to_is_refused(default: Path, mode: int) -> None:
     default.mkdir()
     default.chmod(mode)
-    with pytest.raises(Unreachable, match="not yours alone"):
+    with pytest.raises(Unreachable, match="other users have access"):
         runtime_root()
 
 
 def test_a_link_or_a_file_in_its_place_is_refused(default: Path, tmp_path: Path) -> None:
     (tmp_path / "elsewhere").mkdir(mode=0o700)
     default.symlink_to(tmp_path / "elsewhere")
-    with pytest.raises(Unreachable, match="not yours alone"):
+    with pytest.raises(Unreachable, match="other users have access"):
         runtime_root()
     default.unlink()
     default.write_text("")
-    with pytest.raises(Unreachable, match="not yours alone"):
+    with pytest.raises(Unreachable, match="other users have access"):
         runtime_root()
 
 
@@ -68,12 +68,12 @@ def test_a_link_or_a_file_in_its_place_is_refused(default: Path, tmp_path: Path)
 def test_the_directory_of_an_instance_of_another_user_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a").mkdir(mode=0o777)
     os.chown(tmp_path / "a", STRANGER, STRANGER)
-    with pytest.raises(Unreachable, match="somebody else"), Instance("a", tmp_path):
+    with pytest.raises(Unreachable, match="a different user"), Instance("a", tmp_path):
         pass
 
 
 def test_a_link_in_place_of_an_instances_directory_is_refused(tmp_path: Path) -> None:
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "a").symlink_to(tmp_path / "elsewhere")
-    with pytest.raises(Unreachable, match="somebody else"), Instance("a", tmp_path):
+    with pytest.raises(Unreachable, match="a different user"), Instance("a", tmp_path):
         pass

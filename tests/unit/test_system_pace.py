@@ -90,7 +90,7 @@ def test_everything_that_a_bus_may_state(tmp_path: Path) -> None:
     ("stated", "where"),
     [
         ({"url": "tcp://x:502", "bus": ", echo: true"}, "only a serial line echoes"),
-        ({"url": "ascii:/dev/ttyS0", "bus": ", strict: true"}, "only RTU has silences"),
+        ({"url": "ascii:/dev/ttyS0", "bus": ", strict: true"}, "only RTU frames are separated"),
         ({"url": "rtu+tcp://x:4001", "bus": ", strict: true"}, "baud rate"),
         ({"poll": ", phase_ms: 200"}, "less than 200"),
         ({"device": ", backoff_first_ms: 500, backoff_limit_ms: 499"}, "at least 500"),

@@ -173,5 +173,5 @@ def test_a_foreign_file_counts_as_missing(tmp_path: Path, text: str) -> None:
 
 def test_a_disk_that_refuses_is_reported(tmp_path: Path) -> None:
     file = TakenFile(tmp_path / "nowhere" / "taken.json")
-    with pytest.raises(Unreachable, match="cannot write what was taken"):
+    with pytest.raises(Unreachable, match="cannot store the executed commands"):
         file.note("modem", b"\1")

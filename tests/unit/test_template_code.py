@@ -42,7 +42,7 @@ def test_without_a_terminal_the_answer_is_no_and_trust_answers_yes(dam: Path, tm
     packed(dam, tmp_path / "T.zip")
     checked = fieldtwin(tmp_path, "template", "check", str(tmp_path / "T.zip"))
     assert (checked.returncode, marker.exists()) == (0, False), checked.stderr
-    assert "its control logic was not looked at" in checked.stderr
+    assert "its control logic was not checked" in checked.stderr
     run = ["run", str(tmp_path / "T.zip"), "--prototype", "--virtual", "--for", "1s"]
     refused = fieldtwin(tmp_path, *run)
     assert "control logic in Python: systems/helper.py, systems/site_logic.py" in refused.stderr
@@ -102,8 +102,8 @@ def test_a_program_declared_as_a_document_is_asked_about_nevertheless(dam: Path,
     [
         ("{listen: 'can:fieldtwin/127.0.0.1:0'}", "plant", "it opens can:socketcan/can0, as the plant does (bus can0)"),
         ("fieldtwin/127.0.0.1:0", "socketcan/can0", "it sends on can:socketcan/can0, an interface of this computer (bus can0)"),
-        ("127.0.0.1", "0.0.0.0", "it listens on 0.0.0.0, where others can reach it (bus can0)"),
-        ("127.0.0.1", "127.evil.example", "it listens on 127.evil.example, where others can reach it (bus can0)"),
+        ("127.0.0.1", "0.0.0.0", "it listens on 0.0.0.0, where other computers can reach it (bus can0)"),
+        ("127.0.0.1", "127.evil.example", "it listens on 127.evil.example, where other computers can reach it (bus can0)"),
     ],
 )  # fmt: skip
 def test_a_prototype_that_does_not_keep_to_itself_is_asked_about(
@@ -141,8 +141,8 @@ def test_links_and_servers_of_a_prototype_are_reported(dam: Path, tmp_path: Path
     system = load_system(str(tmp_path / "observatory.yaml"))
     assert [said.split(" (")[0] for said in reach(system, load_prototype(system))] == [
         "it makes a link at /home/ada/bin/python, outside of its run directory",
-        "it listens on ::, where others can reach it",
-        "it listens on 0.0.0.0, where others can reach it",
+        "it listens on ::, where other computers can reach it",
+        "it listens on 0.0.0.0, where other computers can reach it",
     ]
     shipped = load_system("observatory")
     assert reach(shipped, load_prototype(shipped)) == ()
@@ -154,5 +154,5 @@ def test_without_a_terminal_no_port_is_opened_and_the_message_names_it(dam: Path
     packed(dam, tmp_path / "T.zip")
     refused = fieldtwin(tmp_path, "run", str(tmp_path / "T.zip"), "--prototype", "--for", "1s")
     assert refused.returncode == 2
-    assert "T.zip does not keep to itself as a prototype:\n  it opens can:socketcan/can0" in refused.stderr
+    assert "T.zip affects more than its run directory as a prototype:\n  it opens can:socketcan/can0" in refused.stderr
     assert "nothing of this template was run" in refused.stderr

@@ -72,7 +72,7 @@ def test_the_second_is_refused_while_the_first_answers_and_accepted_when_it_left
         await second.start()
         await asyncio.sleep(30)
         assert second.end.links == 0
-        assert "another shadow or twin follows this thread already: " in second.end.trouble
+        assert "another shadow or twin already follows this thread: " in second.end.trouble
         assert place.listening.refused >= 2, "it comes again: perhaps the first one went"
         assert (first.end.links, first.end.trouble) == (1, ""), "nobody took its place"
         await place.plant.log(value(20))
@@ -138,7 +138,7 @@ def test_a_follower_that_need_not_wait_ends_with_the_reason(tmp_path: Path) -> N
         first = place.follower("first")
         await first.start()
         await place.all_there(first)
-        with pytest.raises(Unwelcome, match=r"follows this thread already: .*stop it first, or use a broker"):
+        with pytest.raises(Unwelcome, match=r"already follows this thread: .*stop it first, or use a broker"):
             await TcpDialler(place.at, place.net, [SCHEMA]).open()
         await first.kill()
 

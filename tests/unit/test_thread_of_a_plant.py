@@ -131,12 +131,12 @@ def test_the_last_values_of_a_dead_gateway_are_not_reported_as_good() -> None:
 def test_a_system_with_one_transmitter_lends_that() -> None:
     assert lent_transmitter("modem:", OBSERVATORY) == lent_transmitter("modem:modem", OBSERVATORY) == "modem"
     assert lent_transmitter("tcp://127.0.0.1:7700", OBSERVATORY) == lent_transmitter("", OBSERVATORY) == ""
-    with pytest.raises(UsageError, match="'ctd' is no transmitter of observatory"):
+    with pytest.raises(UsageError, match="'ctd' is not a transmitter of observatory"):
         lent_transmitter("modem:ctd", OBSERVATORY)
-    with pytest.raises(UsageError, match="a system with one"):
+    with pytest.raises(UsageError, match="a system with a transmitter"):
         lent_transmitter("modem:", load_system(str(PROFILES / "lab_vehicle.yaml")))
     for wrong in ("modem:", "modem:modem", "modem:modem@udp://127.0.0.1:1"):
-        with pytest.raises(UsageError, match="where is the far modem"):
+        with pytest.raises(UsageError, match="endpoint of the topside modem is missing"):
             twin_carrier(wrong, OBSERVATORY, WallClock())
     assert twin_carrier("modem:tcp://127.0.0.1:1", OBSERVATORY, WallClock()).name == "thread over modem_thread"
 
@@ -155,6 +155,6 @@ def test_a_plant_assigns_its_modem_only_if_it_is_writable_and_unused() -> None:
     with pytest.raises(UsageError, match="writes into its mailbox; expected --allow-writes"):
         lent(prototype=False)
     assert lent(prototype=False, allow_writes=True) == "modem"
-    with pytest.raises(UsageError, match="is the digital twin's; expected --commands none"):
+    with pytest.raises(UsageError, match="belongs to the digital twin; expected --commands none"):
         lent(prototype=True, commands=(1, 2))
     assert lent(prototype=True) == "modem"

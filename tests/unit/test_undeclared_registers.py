@@ -58,7 +58,7 @@ def test_a_read_across_undeclared_registers_gets_zeros_for_them(undeclared: str)
     unit = stated(undeclared)
     assert asked(unit, "03 0000 0005") == "03 0A 00 07 00 00 00 00 00 00 00 09"
     assert asked(unit, "03 FFFF 0001") == "03 02 00 00"
-    assert asked(unit, "03 FFFF 0002") == "83 02"  # beyond the end of the table
+    assert asked(unit, "03 FFFF 0002") == "83 02"  # after the end of the table
     assert asked(unit, "03 0004 0003") == "83 02"  # 6 is declared, and cannot be read
     assert asked(unit, "04 0000 0001") == "84 02"  # a table without any tag does not exist
 

@@ -150,7 +150,7 @@ def test_expect_takes_bounds(device: Device) -> None:
         device.wire.expect(at_most=2, function=4)
     with pytest.raises(AssertionError, match="at least 4 times exchanges expected, 3 seen"):
         device.wire.expect(at_least=4, within_s=0.1)
-    with pytest.raises(TypeError, match="exact number"):
+    with pytest.raises(TypeError, match="times is exact"):
         device.wire.expect(2, at_most=3)
 
 

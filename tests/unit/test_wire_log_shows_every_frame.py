@@ -52,7 +52,7 @@ def test_a_reply_with_a_wrong_unit_id_is_a_stray_of_the_device(device: Device) -
     assert got[6] == 99
     (stray,) = device.wire.expect(problem="stray", within_s=PATIENCE_S)
     assert (stray.unit, stray.transaction) == (99, 1)
-    assert "device: a frame that answers nothing: transaction 1, unit 99" in stray.text
+    assert "device: a reply without a request: transaction 1, unit 99" in stray.text
     assert device.wire.count() == 1
 
 
@@ -97,8 +97,10 @@ def test_an_rtu_reply_with_another_byte_count_and_a_right_check_sum_is_malformed
     """Defect: pymodbus accepted the short reply, and the log reported no reply; for the long one it reported a wrong checksum."""
     short = with_crc(bytes.fromhex("010402 4366")).hex()
     long = with_crc(bytes.fromhex("010406 436680000000")).hex()
-    assert _answers(short) == _answers(short[:4], short[4:]) == [("malformed", "4 bytes that answer something else")]
-    assert _answers(long) == [("malformed", "8 bytes that answer something else")]
+    assert (
+        _answers(short) == _answers(short[:4], short[4:]) == [("malformed", "4 bytes that do not answer the request")]
+    )
+    assert _answers(long) == [("malformed", "8 bytes that do not answer the request")]
 
 
 def test_a_whole_reply_and_a_part_of_one_are_unchanged() -> None:
@@ -123,8 +125,8 @@ def _decode(*frames: CanFrame) -> list[Exchange]:
 @pytest.mark.parametrize(
     ("frames", "problems", "says"),
     [
-        ((REQUEST, REPLY, REPLY), ["", "stray"], "an SDO reply that no request waits for: 43 00 10 00 91 01 00 00"),
-        ((REQUEST, ABORT, REPLY), ["abort", "stray"], "an SDO reply that no request waits for"),
+        ((REQUEST, REPLY, REPLY), ["", "stray"], "an SDO reply without a request: 43 00 10 00 91 01 00 00"),
+        ((REQUEST, ABORT, REPLY), ["abort", "stray"], "an SDO reply without a request"),
         ((REQUEST, OTHER), ["stray", "no reply"], "an SDO reply to another request: 43 01 10 00 91 01 00 00"),
         ((REQUEST, CanFrame(0x585, b"\x43")), ["stray", "no reply"], "an SDO reply of 1 byte: 43"),
         ((CanFrame(0x585, bytes.fromhex("8000100000000206")),), ["stray"], "abort 06020000h"),

@@ -47,7 +47,7 @@ def test_scalars(scalar: str, value: object) -> None:
         ("a: 1\n\tb: 2\n", 2, 1, "spaces, never tabs"),
         ("a: 1\n  b: 2\n", 2, 4, "not YAML"),
         ("a: [1, 2\n", 2, 1, "not YAML"),
-        ("a: 1\nb: 2\na: 3\n", 3, 1, "stands twice"),
+        ("a: 1\nb: 2\na: 3\n", 3, 1, "is defined twice"),
         ("x:\n  a: 1\n  a: 2\n", 3, 3, "first at line 2"),
         ("- 1\n- 2\n", 1, 0, "no keys"),
         ("", 1, 0, "no keys"),

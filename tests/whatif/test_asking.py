@@ -101,8 +101,8 @@ def test_a_twin_queries_in_a_separate_process_and_an_unanswered_command_is_refus
 
     refused, sent, told = run(main(), timeout_s=60)
     assert sent == [encode_period(2).data]
-    assert refused[0].startswith("period 0 s: a prototype was asked: \"relay.state == 'ACTIVE'\" does not hold")
-    assert refused[1] == "period 3 s: a prototype was asked: no answer within 0.05 s"
+    assert refused[0].startswith("period 0 s: simulated: \"relay.state == 'ACTIVE'\" does not hold")
+    assert refused[1] == "period 3 s: simulated: no answer within 0.05 s"
     assert told == [0, 2, 3], "one after the other"
 
 
@@ -129,7 +129,7 @@ def test_nothing_is_forked_from_nothing() -> None:
             await eventually(lambda: asking.answer() is not None)
         return asking.answer()
 
-    assert "nothing is known of the plant" in (run(main()) or "")
+    assert "the present state of the plant is not known" in (run(main()) or "")
 
 
 # -- rules ------------------------------------------------------------------------------------------------------------------
@@ -163,7 +163,7 @@ def _at(period_s: int) -> DigitalModel:
 @pytest.mark.parametrize(
     ("text", "why"),
     [
-        ("{horizon: 30min}", "nothing is required"),
+        ("{horizon: 30min}", "no requirement is given"),
         ("{horizon: soon, require: [x > 1]}", "a time"),
         ("{require: [x > 1]}", "horizon"),
         ("true", "what_if"),

@@ -135,7 +135,7 @@ def test_impossible_plans() -> None:
         parsed("fast")
     assert parsed("60@10min") == Scripted(600.0, 60)
     nobody = answer(Fork("lab_vehicle", KnownState(), 1.0), Plan("x", (Scripted(0, 1),)))
-    assert "nobody can command this system" in nobody.error
+    assert "this system cannot be commanded" in nobody.error
     assert not nobody.met
 
 
@@ -152,12 +152,12 @@ def test_a_state_file_reports_its_contents(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ('"fieldtwin_state": 1', '"fieldtwin_state": 9', "another version.*expected 1; got 9"),
-        ('"system": "observatory"', '"system": "pump"', "another system's state"),
+        ('"fieldtwin_state": 1', '"fieldtwin_state": 9', "a different format version.*expected 1; got 9"),
+        ('"system": "observatory"', '"system": "pump"', "the state of a different system"),
         ("ctd.pressure", "ctd.presure", "no tag 'ctd.presure'"),
         ('"relay"', '"rely"', "no program 'rely'"),
-        ('"values"', '"valeus"', "no state of a system"),
-        ("{", "", "no state of a system"),
+        ('"values"', '"valeus"', "not a state of a system"),
+        ("{", "", "not a state of a system"),
     ],
 )
 def test_a_wrong_state_file(tmp_path: Path, old: str, new: str, message: str) -> None:
@@ -257,7 +257,7 @@ def test_a_plan_of_the_command_line_is_named_after_its_actions(
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("name: stop", "name: keep", r"two plans of one name"),
+        ("name: stop", "name: keep", r"two plans with the same name"),
         ("period_s: 0", "period_s: 99999", r"plans.yaml:7:\d+: a command"),
         ("finally:", "finaly:", r"finaly.*did you mean"),
     ],

@@ -261,7 +261,7 @@ def test_files_that_cannot_be_used_are_named(pki: Pki, tmp_path: Path) -> None:
         for endpoint, kind, says in (
             (listening(pki, ca=""), UsageError, "no ca"),
             (listening(pki, cert="", ca=""), UsageError, "no cert and no ca"),
-            (listening(pki, name="x"), UsageError, "who connects"),
+            (listening(pki, name="x"), UsageError, "only for clients"),
             (listening(pki, cert=str(tmp_path / "none.pem")), Unreachable, "cannot read the TLS files"),
             (listening(pki, key=pki.key("client")), Unreachable, "cannot use the TLS files"),
         ):

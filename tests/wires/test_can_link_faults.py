@@ -136,10 +136,13 @@ def test_whose_frame_it_is(frame: CanFrame, node: int) -> None:
 @pytest.mark.parametrize(
     ("fault", "told"),
     [
-        ({"name": "bus-off"}, "one of a bus that is modelled"),
-        ({"name": "emcy-burst"}, "expected unit: the node's id"),
+        ({"name": "bus-off"}, "needs a modelled bus"),
+        ({"name": "emcy-burst"}, "expected unit: the node ID"),
         ({"name": "silence"}, "expected one of a CAN bus"),
-        ({"name": "lost-frame", "device": "inclinometer"}, "a link knows no names; expected unit, cob_id, index"),
+        (
+            {"name": "lost-frame", "device": "inclinometer"},
+            "a link has no device or bus names; expected unit, cob_id, index",
+        ),
         ({"name": "stuck", "device": "ctd", "register": "pressure"}, "expected one of a CAN bus"),
     ],
 )

@@ -182,7 +182,7 @@ def _examples() -> list[tuple[str, str]]:
     found = []
     for name in cli.list_commands(click.Context(cli)):
         command = cli.get_command(click.Context(cli), name)
-        text = (command.help or "") if command else ""
+        text = re.sub(r"\\\n\s*", "", (command.help or "") if command else "")  # a line goes on after a backslash
         found += [(name, line.strip()) for line in text.splitlines() if line.strip().startswith(f"fieldtwin {name} ")]
     return found
 

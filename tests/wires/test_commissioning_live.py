@@ -66,13 +66,13 @@ def test_a_log_continues_and_reports_when_it_is_full(tmp_path: Path) -> None:
     lines = [json.loads(line) for line in path.read_text("ascii").splitlines()]
     assert [("started" in line) for line in lines].count(True) == 2
     assert len(lines) == 4  # whole lines only
-    with pytest.raises(FileInvalid, match="log of what is sent"):
+    with pytest.raises(FileInvalid, match="log of sent frames"):
         WireLog(tmp_path / "no" / "folder", "x")
 
 
 def test_a_url_of_the_wrong_kind_is_a_users_error_and_a_missing_device_is_unreachable() -> None:
     async def main() -> None:
-        with pytest.raises(UsageError, match="Modbus is not spoken"):
+        with pytest.raises(UsageError, match="does not carry Modbus"):
             async with modbus_at("can:fieldtwin/127.0.0.1:1"):
                 pass
         with pytest.raises(UsageError, match="CAN bus"):

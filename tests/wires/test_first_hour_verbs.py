@@ -99,7 +99,7 @@ def test_rtu_over_tcp_and_a_missing_device() -> None:
         server.close()
         await server.wait_closed()
         code, report, _ = await fieldtwin("line", f"tcp://127.0.0.1:{port}")
-        assert (code, report["causes"][0]["name"]) == (1, "nothing listens there")
+        assert (code, report["causes"][0]["name"]) == (1, "no program listens there")
 
     run(main(), timeout_s=40)
 

@@ -98,7 +98,9 @@ def test_an_older_bus_refuses_can_fd_with_a_clear_error() -> None:
     async def main() -> None:
         server = await asyncio.start_server(serve, "127.0.0.1", 0)
         channel = f"127.0.0.1:{server.sockets[0].getsockname()[1]}"
-        with pytest.raises(can.CanInitializationError, match="another version; expected version 2; got version 1"):
+        with pytest.raises(
+            can.CanInitializationError, match="a different protocol version; expected version 2; got version 1"
+        ):
             await asyncio.to_thread(SoftBus, channel, fd=True)
         server.close()
         await server.wait_closed()

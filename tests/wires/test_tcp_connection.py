@@ -108,7 +108,7 @@ def test_end_of_stream_gives_received_bytes_and_then_the_loss() -> None:
             peer.send(b"last words")
             peer.close()
             assert await collect(connection, 10) == b"last words"
-            with pytest.raises(ConnectionLost, match="far side closed"):
+            with pytest.raises(ConnectionLost, match="peer closed"):
                 await connection.read()
             with pytest.raises(ConnectionLost):
                 await connection.write(b"x")

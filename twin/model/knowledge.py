@@ -148,7 +148,7 @@ class KnowledgeWriter:
     def _look_at_room(self) -> None:
         room = self._store.room_bytes()
         if room is not None and room < self._reserve:
-            self._say(f"the disk of the knowledge is almost full: {room >> 20} MiB left")
+            self._say(f"the disk of the knowledge store is almost full: {room >> 20} MiB left")
         else:
             self._say("")
 

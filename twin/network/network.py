@@ -155,7 +155,7 @@ def _member(file: YamlFile, form: NetworkForm, name: str, path: Path, profiles: 
     if said.modem not in modems:
         raise file.error(
             (*loc, "modem"),
-            f"{said.modem!r} is no modem of {system.name}",
+            f"{said.modem!r} is not a modem of {system.name}",
             expected=", ".join(modems) or "a device with `model: mailbox` in its prototype file",
             hint=did_you_mean(said.modem, modems),
         )
@@ -183,7 +183,7 @@ def _check(file: YamlFile, form: NetworkForm, members: dict[str, Member]) -> Non
             )
     for reserved in (SHIP, WATER):
         if reserved in members:
-            raise file.error(("systems", reserved), f"{reserved!r} is no name for a system of a network")
+            raise file.error(("systems", reserved), f"{reserved!r} is not a valid name for a system of a network")
     smallest = min(m.profile.inbox.bytes for m in members.values() if m.profile.inbox is not None)
     seen: dict[str, str] = {}
     for name, member in members.items():
@@ -191,7 +191,7 @@ def _check(file: YamlFile, form: NetworkForm, members: dict[str, Member]) -> Non
         if outbox is not None and outbox.bytes > smallest:
             raise file.error(
                 ("systems", name, "modem"),
-                "it says what another one's mailbox cannot hold",
+                "its messages are too long for another system's mailbox",
                 expected=f"at most {smallest} bytes",
                 got=str(outbox.bytes),
             )
@@ -200,6 +200,6 @@ def _check(file: YamlFile, form: NetworkForm, members: dict[str, Member]) -> Non
             raise file.error(
                 ("systems", name),
                 f"its modem has the address {address}, as {seen[address]}'s has",
-                expected="one of its own",
+                expected="a different one",
             )
         seen[address] = name

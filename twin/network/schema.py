@@ -20,9 +20,9 @@ class WaterForm(Strict):
     range_m: float = Field(gt=0, le=1_000_000)
     sound_m_per_s: float = Field(default=1500.0, ge=100, le=10_000)
     bytes_per_s: float = Field(default=80.0, gt=0, le=1_000_000)
-    overhead_bytes: int = Field(default=8, ge=0, le=1024, description="of each packet, besides what it carries")
+    overhead_bytes: int = Field(default=8, ge=0, le=1024, description="bytes of each packet in addition to its payload")
     loss: float = Field(
-        default=0.0, ge=0.0, lt=1.0, description="share of the packets that each listener misses by chance"
+        default=0.0, ge=0.0, lt=1.0, description="share of the packets that each listener loses, at random"
     )
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=False)
@@ -34,7 +34,7 @@ class MemberForm(Strict):
     system: str
     modem: Name
     at_m: Place
-    prototype: str | None = Field(default=None, description="default: the one beside the system")
+    prototype: str | None = Field(default=None, description="default: the prototype file next to the system file")
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=False)
 

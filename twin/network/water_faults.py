@@ -45,7 +45,9 @@ class WaterFaults:
         spec = parse_fault(dict(said), number=len(self._wire.active) + 1)
         check_water_fault(self._network, spec)
         if spec.id in self._wire.active:
-            raise UsageError(f"the fault {spec.id!r} is in already", hint="clear it first, or give another id")
+            raise UsageError(
+                f"the fault {spec.id!r} is already active", hint="clear it first, or choose a different id"
+            )
         if len(self._wire.active) >= MOST:
             raise UsageError("too many faults at once", expected=f"at most {MOST}")
         until_ns = None if spec.until_s is None else self.start_ns + round(spec.until_s * NS_PER_S)
@@ -78,8 +80,10 @@ class WaterFaults:
 def check_water_fault(network: Network, spec: FaultSpec) -> None:
     """Raises `WrongAim` for a fault that does not apply to the acoustic channel, or a modem that is not in it."""
     if spec.kind is not Drop:
-        raise WrongAim("name", f"fault {spec.kind.name!r} is nothing of the water", expected=Drop.name)
+        raise WrongAim("name", f"fault {spec.kind.name!r} does not exist on the acoustic channel", expected=Drop.name)
     for key in sorted(spec.aim.model_fields_set - _AIMS):
-        raise WrongAim(key, f"{key!r} says nothing about the water", expected="device: who shall hear nothing")
+        raise WrongAim(
+            key, f"{key!r} has no meaning on the acoustic channel", expected="device: the modem that receives nothing"
+        )
     if spec.aim.device:
-        known("modem in the water", spec.aim.device, network.places, "device")
+        known("modem on the acoustic channel", spec.aim.device, network.places, "device")

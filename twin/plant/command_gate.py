@@ -65,7 +65,7 @@ class CommandGate(PTDigitalThreadProcess):
 
     def _objection(self, command: COMMAND, event: Event) -> str:
         if not self._remote:
-            return "the plant says local"
+            return "the plant is switched to local"
         age_ms = self._clock.utc_ns() // 1_000_000 - event.t_ms
         if age_ms > self._old_ms:
             return f"it is {age_ms // 1000} s old; at most {self._old_ms // 1000} s are obeyed"

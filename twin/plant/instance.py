@@ -58,7 +58,7 @@ def _refuse_a_strangers(folder: Path) -> None:
         return
     if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o022:
         raise Unreachable(
-            "the folder of the run directories is not yours alone",
+            "other users have access to the folder of the run directories",
             where=str(folder),
             expected="a folder that belongs to you, and that no other user may write to",
             got=f"{stat.filemode(found.st_mode)}, owner {found.st_uid}",
@@ -82,14 +82,14 @@ class Instance:
 
     def __enter__(self) -> Instance:
         if not LOCKS:
-            hint = "here: emulate, record, read, scan, check, and run --virtual"
-            raise Unreachable("a run needs Unix sockets and locks, which this system has not", hint=hint)
+            hint = "available on this system: emulate, record, read, scan, check, and run --virtual"
+            raise Unreachable("a run needs Unix sockets and locks, which this system does not have", hint=hint)
         try:
             self.dir.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
             self.dir.mkdir(exist_ok=True, mode=0o700)
             found = self.dir.lstat()
             if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid():
-                raise Unreachable("the run directory belongs to somebody else", where=str(self.dir))
+                raise Unreachable("the run directory belongs to a different user", where=str(self.dir))
             self._lock = (self.dir / "lock").open("w", encoding="utf-8")
         except OSError as e:
             raise Unreachable(f"cannot make the run directory: {e.strerror}", where=str(self.dir)) from e

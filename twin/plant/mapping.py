@@ -28,7 +28,7 @@ class MappedConnector:
             raise UsageError(
                 "a prototype may not open a plant endpoint that is not mapped",
                 where=str(endpoint),
-                hint="map the bus in the prototype file, or say `plant` there",
+                hint="map the bus in the prototype file, or set it to `plant`",
             )
         return target
 
@@ -59,7 +59,9 @@ def _refuse_stale_link(target: Endpoint) -> None:
     except OSError:
         return  # opening it gives the reason
     if stale:
-        raise Unreachable("the virtual serial port is gone, and its link leads to a newer terminal", where=str(target))
+        raise Unreachable(
+            "the virtual serial port is gone, and its link points to a newer pseudo-terminal", where=str(target)
+        )
 
 
 def mapped_endpoint(plant: Endpoint, listening: Endpoint) -> Endpoint:
@@ -70,7 +72,7 @@ def mapped_endpoint(plant: Endpoint, listening: Endpoint) -> Endpoint:
     if listening.scheme == "pty":
         return plant.with_path(listening.path)
     if plant.is_serial:
-        raise UsageError("a serial line behind TCP needs a link to become a port", where=str(listening))
+        raise UsageError("a serial line over TCP needs `fieldtwin link` to become a port", where=str(listening))
     return plant.with_address(listening.host, listening.port) if not plant.is_can else listening
 
 

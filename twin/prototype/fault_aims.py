@@ -40,10 +40,10 @@ def target(system: System, spec: FaultSpec) -> Target:
     tag = None
     if aim.register_:
         if not aim.device:
-            raise WrongAim("register", "a register is one of a device", expected="device: NAME")
+            raise WrongAim("register", "a register needs a device", expected="device: NAME")
         tag = tag_of(system, aim.device, aim.register_, "register")
     if kind is Kind.VALUE and tag is not None and tag.is_text:
-        raise WrongAim("register", f"{aim.device}.{tag.name} is no number", expected="a tag that is one")
+        raise WrongAim("register", f"{aim.device}.{tag.name} is not a number", expected="a tag that is one")
     if aim.device:
         check_fault(spec.make(), aim.register_, system.devices[aim.device].profile.tags.values(), aim.device)
     is_can = system.buses[bus].endpoint.is_can
@@ -88,5 +88,5 @@ def _bus(system: System, spec: FaultSpec) -> str:
             raise WrongAim("bus", f"{aim.device} is on another bus", expected=on, got=aim.bus)
         return on
     if not aim.bus:
-        raise WrongAim("name", f"fault {spec.kind.name} aims at nothing", expected="device: NAME, or bus: NAME")
+        raise WrongAim("name", f"fault {spec.kind.name} has no target", expected="device: NAME, or bus: NAME")
     return aim.bus

@@ -98,7 +98,9 @@ class FieldFaults:
         start_ns = self.start_ns if start_ns is None else start_ns
         spec = parse_fault(dict(said), number=len(self._active) + 1)
         if spec.id in self._active:
-            raise UsageError(f"the fault {spec.id!r} is in already", hint="clear it first, or give another id")
+            raise UsageError(
+                f"the fault {spec.id!r} is already active", hint="clear it first, or choose a different id"
+            )
         if len(self._active) >= MOST:
             raise UsageError("too many faults at once", expected=f"at most {MOST}")
         fault = spec.make()
@@ -126,14 +128,16 @@ class FieldFaults:
             found = self._distortions.get(spec.aim.device)
             if found is None:
                 raise UsageError(
-                    f"what {spec.aim.device} holds cannot be changed", expected="a device that is emulated here"
+                    f"the values of {spec.aim.device} cannot be changed", expected="a device that is emulated here"
                 )
             active.fault.learn(self._system.devices[spec.aim.device].profile.tags.values())
             found.put_in(active, spec.aim.register_)
         elif isinstance(active.fault, BusFault):
             disturb = self._disturb.get(bus)
             if disturb is None:
-                raise UsageError(f"no errors on the wire of bus {bus!r}", expected="the software CAN bus")
+                raise UsageError(
+                    f"no transmission errors can be produced on bus {bus!r}", expected="the software CAN bus"
+                )
             nodes = frozenset(active.units) or frozenset(d.address for d in self._system.devices_on(bus))
             rule = bus_rule(active, self._clock.monotonic_ns, nodes)
             self._rules[spec.id] = bus, rule
@@ -144,7 +148,7 @@ class FieldFaults:
     def clear(self, id: str) -> None:
         """Clear a fault. Raises `UsageError` for an id that is not active."""
         if id not in self._active:
-            raise UsageError(f"no fault {id!r} is in", expected=", ".join(self._active) or "one; there is none")
+            raise UsageError(f"no fault {id!r} is active", expected=", ".join(self._active) or "one; there is none")
         spec, _, bus = self._active.pop(id)
         if spec.aim.device in self._distortions:
             self._distortions[spec.aim.device].take_away(id)

@@ -66,8 +66,8 @@ class FieldLeases:
         if self._lease is not None and self._lease.id != id:
             left_s = (self._lease.until_ns - now_ns) / NS_PER_S
             raise LeaseTaken(
-                f"another judge ({self._lease.id}) uses these simulated field devices",
-                hint=f"wait until it ends; without a sign of life its lease expires in {left_s:.1f} s",
+                f"another test ({self._lease.id}) uses these simulated field devices",
+                hint=f"wait until it ends; unless renewed, its lease expires in {left_s:.1f} s",
             )
         if self._lease is None:
             self._lease = _Lease(id, 0)
@@ -82,7 +82,7 @@ class FieldLeases:
         self.expire(now_ns)
         if self._lease is None or self._lease.id != id:
             raise LeaseEnded(
-                "the judge's lease on the simulated field devices has ended: what it had put in was taken out",
+                "the test's lease on the simulated field devices has ended: its faults and values were removed",
                 expected=f"a lease that is renewed in time (every few seconds; it lasts {LEASE_S:g} s)",
             )
         return self._lease

@@ -289,7 +289,7 @@ class FieldProcess:
         """
         self._leases.of(str(args.get("lease", "")), self._clock.monotonic_ns())
         if self._config.water:
-            raise UsageError("devices in a network's water cannot be made anew one system at a time")
+            raise UsageError("the devices of a network cannot be restarted one system at a time")
         if self._fresh_done is None or self._fresh_done.done():
             self._fresh_done = asyncio.get_running_loop().create_future()
         self._fresh_asked.set()

@@ -99,7 +99,7 @@ def load_prototype(system: System, path: Path | None = None) -> Prototype:
         raise FileInvalid(
             f"there is no prototype file of {system.path.name}",
             path=str(prototype_path(system)),
-            expected="what is emulated, with what and where",
+            expected="a file that states which devices are emulated, how, and where",
             hint="copy one of profiles/systems/, or name one with --prototype-file",
         )
     path = path or prototype_path(system)
@@ -130,7 +130,7 @@ def load_prototype(system: System, path: Path | None = None) -> Prototype:
     }
     missing = [n for n, d in system.devices.items() if buses[d.bus].listen is not None and n not in devices]
     if missing:
-        raise file.error(("devices",), f"nothing stands in for {', '.join(missing)}", expected="an entry each")
+        raise file.error(("devices",), f"no entry for {', '.join(missing)}", expected="an entry each")
     return Prototype(path, form.seed, buses, devices, file, form)
 
 
@@ -152,7 +152,7 @@ def _bus(file: YamlFile, system: System, form: PrototypeForm, name: str) -> Emul
     if listen.scheme not in kinds:
         raise file.error(
             ("buses", name, "listen"),
-            f"nothing that stands in for {plant}",
+            f"no endpoint that replaces {plant}",
             expected=" or ".join(kinds),
             got=listen.scheme,
         )
@@ -190,14 +190,14 @@ def _clash(system: System, buses: Mapping[str, EmulatedBus]) -> _Clash | None:
         other = wires.setdefault(wire, name)
         if other != name and not wire.is_can:
             said = f"{name!r} listens at {wire}, and so does {other!r}"
-            return _Clash((name, other), None, said, "a place of its own for each bus")
+            return _Clash((name, other), None, said, "a separate endpoint for each bus")
         for device in system.devices_on(name) if wire.is_can else ():
             first = nodes.setdefault((wire, device.address), device.name)
             if first != device.name:
                 other = system.devices[first].bus
                 said = f"{device.name!r} of {name!r} has node id {device.address} at {wire}, and so has {first!r} of {other!r}"
                 return _Clash(
-                    (name, other), (device.name, first), said, "a wire of its own for each bus, or other node ids"
+                    (name, other), (device.name, first), said, "a separate bus for each, or different node IDs"
                 )
     return None
 
@@ -209,7 +209,7 @@ def _check_wires(file: YamlFile, system: System, buses: Mapping[str, EmulatedBus
     hint = f"{clash.buses[1]!r} is in line {file.line(('buses', clash.buses[1]))}"
     if clash.nodes is not None:
         lines = [f"{node!r} in line {system.file.line(('devices', node))}" for node in clash.nodes]
-        hint += f"; of {system.path.name}: {' and '.join(lines)}. Two nodes with one id on purpose: the fault duplicate-node"
+        hint += f"; of {system.path.name}: {' and '.join(lines)}. To test two nodes with one ID, use the fault duplicate-node"
     raise file.error(("buses", clash.buses[0], "listen"), clash.message, expected=clash.expected, hint=hint)
 
 
@@ -225,7 +225,7 @@ def _device(file: YamlFile, system: System, name: str, whole: PrototypeForm) -> 
     if [form.recording, form.model, form.simulation].count(None) != 2:
         raise file.error(
             loc,
-            f"what stands in for {name!r}",
+            f"the data source of {name!r}",
             expected="one of `recording: FILE`, `simulation: NAME` and `model: NAME`",
         )
     check_plays(file, whole, name, profile)
@@ -235,7 +235,7 @@ def _device(file: YamlFile, system: System, name: str, whole: PrototypeForm) -> 
         )
     if form.model == "profile" and (profile.sampled is not None or profile.inbox is not None):
         expected = "`recording: FILE`, of its signals" if profile.sampled is not None else "`model: mailbox`"
-        raise file.error((*loc, "model"), f"{name!r} does more than its registers say", expected=expected)
+        raise file.error((*loc, "model"), f"{name!r} needs more than its registers", expected=expected)
     _check_stated(file, loc, form, profile)
     recording = None
     if form.recording is not None:
@@ -258,9 +258,11 @@ def _check_stated(file: YamlFile, loc: tuple[Key, ...], form: EmulatedForm, prof
     recording, and the keys about a data sheet to CANopen devices."""
     for key, said in (("cia", form.cia is not None), ("parameter_values", not form.parameter_values)):
         if said and profile.protocol != "canopen":
-            raise file.error((*loc, key), f"`{key}` is about a data sheet (EDS)", expected="a CANopen device")
+            raise file.error(
+                (*loc, key), f"`{key}` applies to devices with a data sheet (EDS)", expected="a CANopen device"
+            )
     if form.busy is not None and profile.protocol != "modbus":
-        raise file.error((*loc, "busy"), "nothing of this protocol", expected="a Modbus device")
+        raise file.error((*loc, "busy"), "no key of this protocol", expected="a Modbus device")
     if form.values and ((form.model != "profile" and form.simulation is None) or profile.protocol != "modbus"):
         expected = "`model: profile` or a simulation, of a Modbus device"
         raise file.error((*loc, "values"), "values of registers", expected=expected)

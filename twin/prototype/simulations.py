@@ -30,7 +30,9 @@ def check_simulations(file: YamlFile, form: PrototypeForm, system: System) -> No
     for name, simulation in form.simulations.items():
         loc = ("simulations", name)
         if (simulation.python is None) == (not simulation.formulas):
-            raise file.error(loc, f"what computes {name!r}", expected="either `formulas:` or `python: FILE.py:CLASS`")
+            raise file.error(
+                loc, f"the simulation of {name!r}", expected="either `formulas:` or `python: FILE.py:CLASS`"
+            )
         if simulation.python is not None and not _python(file, simulation.python)[0].is_file():
             raise file.error((*loc, "python"), "no such file", expected="FILE.py:CLASS", got=simulation.python)
         for key, known in simulation.inputs.items():
@@ -49,17 +51,19 @@ def check_plays(file: YamlFile, form: PrototypeForm, name: str, profile: DeviceP
     """Check that a device plays numeric tags of its own, from names that its simulation computes where those are known."""
     device = form.devices[name]
     if device.plays and device.simulation is None:
-        raise file.error(("devices", name, "plays"), "nothing to play", expected="`simulation: NAME` beside it")
+        raise file.error(
+            ("devices", name, "plays"), "`plays` without a simulation", expected="`simulation: NAME` beside it"
+        )
     for tag, value in device.plays.items():
         if tag not in profile.tags or profile.tags[tag].is_text:
             expected = ", ".join(t.name for t in profile.tags.values() if not t.is_text)
             raise file.error(
-                ("devices", name, "plays", tag), f"{profile.name} has no number {tag!r}", expected=expected
+                ("devices", name, "plays", tag), f"{profile.name} has no numeric tag {tag!r}", expected=expected
             )
         formulas = form.simulations[device.simulation or ""].formulas
         if formulas and value not in formulas:
             raise file.error(
-                ("devices", name, "plays", tag), f"nothing computes {value!r}", expected=", ".join(formulas)
+                ("devices", name, "plays", tag), f"no formula or step computes {value!r}", expected=", ".join(formulas)
             )
 
 
@@ -68,7 +72,7 @@ def _check_formulas(file: YamlFile, simulation: SimulationForm, name: str) -> No
     for key, text in simulation.formulas.items():
         if key in (TIME, STEP) or key in simulation.inputs:
             loc = ("simulations", name, "formulas", key)
-            raise file.error(loc, f"{key!r} means something already", expected="a name that is not taken")
+            raise file.error(loc, f"{key!r} already has a meaning", expected="an unused name")
         try:
             Formula(text, known, Random(0))
         except UsageError as e:
@@ -78,7 +82,7 @@ def _check_formulas(file: YamlFile, simulation: SimulationForm, name: str) -> No
         if simulation.formulas and key not in simulation.formulas:
             raise file.error(
                 ("simulations", name, "start", key),
-                f"nothing computes {key!r}",
+                f"no formula or step computes {key!r}",
                 expected=", ".join(simulation.formulas),
             )
 
@@ -125,13 +129,13 @@ class Simulations:
             if name not in simulation.names:
                 raise self._file.error(
                     ("devices", device, "plays", tag),
-                    f"nothing computes {name!r}",
+                    f"no formula or step computes {name!r}",
                     expected=", ".join(simulation.names),
                 )
         if not plays:
             raise self._file.error(
                 ("devices", device, "simulation"),
-                f"{form.simulation!r} computes nothing that {device} has",
+                f"{form.simulation!r} computes no tag of {device}",
                 expected="`plays: {TAG: NAME}`",
                 got=", ".join(simulation.names),
             )

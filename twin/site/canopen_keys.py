@@ -83,9 +83,9 @@ def check_rpdo1(file: YamlFile, loc: tuple[Key, ...], form: DeviceForm, profile:
             )
         bits += BITS[tag.type]
     if bits > PDO_BITS:
-        raise file.error((*loc, "map"), "this is too much for one RPDO", expected=f"{PDO_BITS} bits", got=f"{bits}")
+        raise file.error((*loc, "map"), "this is too long for one RPDO", expected=f"{PDO_BITS} bits", got=f"{bits}")
     if form.rpdo1.transmission == "sync" and not sync:
-        raise file.error((*loc, "transmission"), "nobody says when its values count", expected="`sync` of the bus")
+        raise file.error((*loc, "transmission"), "nothing triggers its values", expected="`sync` of the bus")
 
 
 def _rpdo1(form: DeviceForm) -> RpdoConfig | None:
@@ -100,7 +100,7 @@ def _dcf(
     if form.dcf is None:
         for key in ("store", "tpdos", "rpdos"):
             if getattr(form, key) in (True, "dcf"):
-                raise file.error((*loc, key), f"`{key}` says what to do with a DCF", expected="`dcf`, a DCF file")
+                raise file.error((*loc, key), f"`{key}` needs a DCF", expected="`dcf`, a DCF file")
         return None
     try:
         dcf = find("devices", form.dcf, beside=path, extra=profiles)
@@ -115,7 +115,7 @@ def _configuration(
     settings = settings_of(dictionary)
     if not settings:
         raise file.error(
-            (*loc, "dcf"), "this DCF sets nothing", expected="objects with ParameterValue", got=dictionary.path
+            (*loc, "dcf"), "this DCF sets no object", expected="objects with ParameterValue", got=dictionary.path
         )
     return Configuration(settings, configuration_date(dictionary), form.store)
 
@@ -124,7 +124,7 @@ def _address(file: YamlFile, loc: tuple[Key, ...], identity: IdentityForm | None
     parts = [getattr(identity, name, None) for name in ("vendor", "product", "revision", "serial")]
     if any(part is None for part in parts):
         raise file.error(
-            (*loc, "lss"), "LSS tells nodes apart by four numbers", expected="`identity` with vendor to serial"
+            (*loc, "lss"), "LSS identifies a node by four numbers", expected="`identity` with vendor to serial"
         )
     return LssAddress(*[int(part) for part in parts if part is not None])
 

@@ -104,4 +104,4 @@ def find_recording(name: str, beside: Path | None = None) -> Path:
     for folder in folders:
         if (folder / name).is_file():
             return folder / name
-    raise UsageError(f"no recording {name!r}", expected="a file; looked in " + ", ".join(str(f) for f in folders))
+    raise UsageError(f"no recording {name!r}", expected="a file; searched " + ", ".join(str(f) for f in folders))

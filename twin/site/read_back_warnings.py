@@ -28,7 +28,7 @@ def never_read_back(file: YamlFile, devices: Mapping[str, DeviceConfig]) -> tupl
             if tag is not None and tag.readable and not _read_again(device, tag):
                 error = file.error(
                     ("devices", name, "writable", at),
-                    f"{name}.{local} may be written and is never read back, so that nobody knows what the device holds",
+                    f"{name}.{local} may be written but is never read back, so the device's value is unknown",
                     expected=_remedy(device, tag),
                 )
                 found.append(str(error))

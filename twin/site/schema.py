@@ -36,20 +36,25 @@ class BusForm(Strict):
     url: str
     timeout_ms: Milliseconds = 1000
     retries: int = Field(default=1, ge=0, le=10)
-    bitrate: int = Field(default=125_000, ge=10_000, le=1_000_000, description="CAN only; checked, not set")
-    spacing_ms: Pause = Field(default=0, description="Modbus: pause behind every exchange on the bus")
-    turnaround_ms: Milliseconds = Field(default=100, description="Modbus: pause behind a broadcast")
-    connect_pause_ms: Pause | None = Field(
-        default=None, description="Modbus: pause behind connecting; default: the longest of its devices' profiles"
+    bitrate: int = Field(
+        default=125_000, ge=10_000, le=1_000_000, description="only for CAN; the bit rate is checked, not set"
     )
-    echo: bool = Field(default=False, description="serial: the adapter gives back what is sent")
-    strict: bool = Field(default=False, description="RTU: refuse frames with pauses that the standard forbids")
+    spacing_ms: Pause = Field(default=0, description="Modbus: pause after every exchange on the bus, ms")
+    turnaround_ms: Milliseconds = Field(default=100, description="Modbus: pause after a broadcast, ms")
+    connect_pause_ms: Pause | None = Field(
+        default=None, description="Modbus: pause after connecting, ms; default: the longest of its devices' profiles"
+    )
+    echo: bool = Field(default=False, description="serial: the adapter echoes the sent bytes")
+    strict: bool = Field(default=False, description="RTU: reject frames with pauses that the standard forbids")
     probe_percent: int = Field(
-        default=10, ge=1, le=100, description="Modbus: time for devices that do not answer, at most, while others do"
+        default=10,
+        ge=1,
+        le=100,
+        description="Modbus: maximum share of the bus time for silent devices while others answer",
     )
     sync: SyncForm | None = None
-    time_ms: Milliseconds | None = Field(default=None, description="CANopen: how often TIME is sent")
-    short_sdo: bool = Field(default=False, description="CANopen: take SDO replies of fewer than 8 bytes")
+    time_ms: Milliseconds | None = Field(default=None, description="CANopen: period of the TIME message, ms")
+    short_sdo: bool = Field(default=False, description="CANopen: accept SDO replies of fewer than 8 bytes")
     sdo_transfer_ms: Milliseconds = Field(default=600_000, description="CANopen: limit of a whole SDO transfer")
 
 
@@ -85,7 +90,7 @@ class RpdoForm(Strict):
 
     map: list[Name] = Field(min_length=1, max_length=8)
     transmission: Literal["event", "sync"] = "event"
-    event_ms: Milliseconds | None = Field(default=None, description="how often it is sent although nothing changed")
+    event_ms: Milliseconds | None = Field(default=None, description="period in which it is sent without a change, ms")
 
 
 class IdentityForm(Strict):
@@ -112,26 +117,31 @@ class DeviceForm(Strict):
     spacing_ms: Pause | None = Field(
         default=None, description="Modbus: pause between a reply and the next request for it"
     )
-    backoff_first_ms: Milliseconds = Field(default=250, description="how long it is left alone when it is lost")
-    backoff_limit_ms: Milliseconds = Field(default=10_000, description="that doubles up to this")
+    backoff_first_ms: Milliseconds = Field(
+        default=250, description="first pause before a lost device is tried again, ms"
+    )
+    backoff_limit_ms: Milliseconds = Field(default=10_000, description="the pause doubles up to this limit, ms")
     stale_after_ms: Milliseconds = 5000
     writable: list[Name] = []
     safe: dict[Name, bool | int | float | str] = Field(
         default={}, description="tag -> its safe value: a number, true or false, or the value's name"
     )
     write_groups: dict[Name, Annotated[list[Name], Field(min_length=2, max_length=32)]] = Field(
-        default={}, description="name -> outputs of programs that are written whole or not at all, in this order"
+        default={},
+        description="name -> outputs of programs that are written all together, in this order, or not at all",
     )
     heartbeat: HeartbeatForm | None = None
     tpdo1: TpdoForm | None = None
     sdo_transfer_ms: Milliseconds | None = Field(default=None, description="CANopen: default: the bus's")
     identity: IdentityForm | None = None
-    dcf: str | None = Field(default=None, description="CANopen: what the node shall hold, written unless it does")
-    store: bool = Field(default=False, description="CANopen: let the node keep its DCF over a restart")
-    lss: bool = Field(default=False, description="CANopen: give the node id over LSS to the one with this identity")
-    tpdos: Literal["node", "dcf"] | None = Field(default=None, description="CANopen: where TPDO mappings are from")
+    dcf: str | None = Field(
+        default=None, description="CANopen: the node's configuration, written if the node holds different values"
+    )
+    store: bool = Field(default=False, description="CANopen: the node stores its configuration permanently")
+    lss: bool = Field(default=False, description="CANopen: assign the node ID over LSS to the node with this identity")
+    tpdos: Literal["node", "dcf"] | None = Field(default=None, description="CANopen: source of the TPDO mappings")
     rpdo1: RpdoForm | None = None
-    rpdos: Literal["node", "dcf"] | None = Field(default=None, description="CANopen: where RPDO mappings are from")
+    rpdos: Literal["node", "dcf"] | None = Field(default=None, description="CANopen: source of the RPDO mappings")
     start: bool = False
 
 
@@ -161,7 +171,7 @@ class StartForm(Strict):
     timeout_ms: int = Field(default=10_000, ge=0, le=3_600_000, description="0: do not wait")
     at_timeout: Literal["wait", "stop", "start_anyway"] = Field(
         default="wait",
-        description="wait: go on waiting and report it; stop: stop the PLC, outputs safe; start_anyway: start with what there is",
+        description="wait: continue to wait and report it; stop: stop the PLC, outputs safe; start_anyway: start as it is",
     )
 
 
@@ -183,7 +193,7 @@ class TaskForm(Strict):
 
     interval_ms: Milliseconds | None = None
     priority: int = Field(default=10, ge=0, le=31)
-    late_ms: Milliseconds | None = Field(default=None, description="default: that of the watchdog")
+    late_ms: Milliseconds | None = Field(default=None, description="default: the watchdog's")
     single: TagName | None = None
 
     @model_validator(mode="after")
@@ -198,7 +208,7 @@ class PlcForm(Strict):
 
     cycle_ms: Milliseconds = 10
     watchdog: WatchdogForm = WatchdogForm()
-    start: StartForm = Field(default=StartForm(), description="when its programs begin")
+    start: StartForm = Field(default=StartForm(), description="how long programs wait for their inputs")
     outputs_at: Literal["start", "end"] = Field(
         default="end", description="start: a scan's outputs change at the next cycle"
     )
@@ -219,7 +229,7 @@ class ServedTagForm(Strict):
     type: Literal["bool", "int16", "uint16", "int32", "uint32", "int64", "uint64", "float32", "float64"] | None = None
     order: Literal["ABCD", "CDAB", "BADC", "DCBA"] = "ABCD"
     quality: Address | None = Field(default=None, description="address of the tag's quality register")
-    write: bool = Field(default=False, description="clients may write it, where the plant allows writes")
+    write: bool = Field(default=False, description="clients may write it if the plant allows writes")
 
 
 class ServeForm(Strict):
@@ -229,11 +239,17 @@ class ServeForm(Strict):
     unit: int = Field(default=1, ge=0, le=255)
     tags: dict[TagName, ServedTagForm] = Field(min_length=1)
     if_bad: Literal["exception", "nan"] = "exception"
-    networks: list[str] = Field(default=["0.0.0.0/0", "::/0"], alias="from", description="who may connect")
+    networks: list[str] = Field(
+        default=["0.0.0.0/0", "::/0"], alias="from", description="the addresses that may connect"
+    )
     clients: int = Field(default=16, ge=1, le=1000)
-    roles: list[str] | None = Field(default=None, description="TLS: roles whose clients may ask; default: every client")
+    roles: list[str] | None = Field(
+        default=None, description="TLS: roles whose clients may read; default: every client"
+    )
     write_roles: list[str] | None = Field(default=None, description="TLS: roles whose clients may write as well")
-    idle_s: int = Field(default=0, ge=0, le=86_400, description="silent clients are closed; 0: never")
+    idle_s: int = Field(
+        default=0, ge=0, le=86_400, description="silent clients are disconnected after this time; 0: never"
+    )
 
 
 class AllowForm(Strict):
@@ -250,15 +266,19 @@ class BridgeForm(Strict):
     """A bridge: lets Modbus TCP clients, or the client on a serial line (`url`), reach units of the system's buses."""
 
     url: str
-    to: Name | None = Field(default=None, description="the bus on which units keep their ids")
-    units: dict[int, str] = Field(default={}, description="unit id of a client -> BUS/UNIT")
+    to: Name | None = Field(default=None, description="the bus whose units keep their unit IDs")
+    units: dict[int, str] = Field(default={}, description="the client's unit ID -> BUS/UNIT")
     allow: list[AllowForm] = Field(default=[], description="default: reading functions, from this host")
-    broadcast: bool | Literal["answer"] = Field(default=False, description="pass unit 0 on to lines; answer: say so")
+    broadcast: bool | Literal["answer"] = Field(
+        default=False, description="forward unit 0 to serial lines; answer: reply to the client as well"
+    )
     cache_ms: int = Field(default=0, ge=0, le=60_000)
     clients: int = Field(default=16, ge=1, le=1000)
     queue: int = Field(default=32, ge=1, le=64)
     in_flight: int = Field(default=16, ge=1, le=64)
-    idle_s: int = Field(default=0, ge=0, le=86_400, description="silent clients are closed; 0: never")
+    idle_s: int = Field(
+        default=0, ge=0, le=86_400, description="silent clients are disconnected after this time; 0: never"
+    )
 
 
 class CommandsForm(Strict):
@@ -267,7 +287,7 @@ class CommandsForm(Strict):
     period_s: list[int] = Field(
         default=[-32768, 32767], min_length=2, max_length=2, description="smallest and largest period in seconds"
     )
-    per_minute: int = Field(default=60, ge=1, le=6000, description="commands in any minute")
+    per_minute: int = Field(default=60, ge=1, le=6000, description="maximum number of commands in any minute")
 
     @model_validator(mode="after")
     def _in_order(self) -> CommandsForm:
@@ -309,7 +329,7 @@ class SystemForm(Strict):
     serve: dict[Name, ServeForm] = {}
     bridge: dict[Name, BridgeForm] = {}
     invariants: InvariantsForm = Field(
-        default=InvariantsForm(), description="what holds in every run, scenario and campaign"
+        default=InvariantsForm(), description="conditions that hold in every run, scenario and campaign"
     )
 
 
@@ -369,14 +389,13 @@ class EmulatedForm(Strict):
     """The data source of an emulated device: a recording (time-keyed signals), a simulation, or a model."""
 
     recording: str | None = None
-    simulation: str | None = Field(default=None, description="one of `simulations:`; the device plays values of it")
-    plays: dict[Name, Name] = Field(
-        default={}, description="tag -> name in the simulation; without, those of equal name"
-    )
+    simulation: str | None = Field(default=None, description="one of `simulations:`, whose values the device plays")
+    plays: dict[Name, Name] = Field(default={}, description="tag -> name in the simulation; default: equal names")
     model: Literal["mailbox", "profile"] | None = None
     profile: str | None = Field(default=None, description="the emulated device's own profile, where it differs")
     cia: Literal["401", "402", "404", "406", "410", "none"] | None = Field(
-        default=None, description="CANopen: the device profile whose model is behind the objects; default as 1000h says"
+        default=None,
+        description="CANopen: the device profile whose model computes the objects; default: from object 1000h",
     )
     parameter_values: bool = Field(
         default=True, description="CANopen: false starts with the data sheet's DefaultValues"
@@ -386,10 +405,10 @@ class EmulatedForm(Strict):
     latency_ms: float = Field(default=0.0, ge=0, le=60_000)
     identity: dict[Name, str] = {}
     values: dict[Name, int | float | str] = Field(
-        default={}, description="model profile, Modbus: tag -> what it holds at first"
+        default={}, description="model profile, Modbus: tag -> its initial value"
     )
     busy: BusyForm | None = None
-    far: str | None = Field(default=None, description="where the far modem listens")
+    far: str | None = Field(default=None, description="the endpoint of the topside modem")
     far_link: FarLinkForm = FarLinkForm()
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=False)

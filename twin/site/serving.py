@@ -113,7 +113,7 @@ def _served(
     device, tag = _tag(file, loc, name, devices)
     places = [(table, at) for table in TABLES if (at := getattr(form, table)) is not None]
     if len(places) != 1:
-        raise file.error(loc, f"where is {name!r} served?", expected="one of " + ", ".join(TABLES))
+        raise file.error(loc, f"{name!r} has no table", expected="one of " + ", ".join(TABLES))
     table, address = places[0]
     is_bit = table in BIT_TABLES
     kind = form.type or ("bool" if is_bit else _usual_type(tag))
@@ -123,7 +123,7 @@ def _served(
         raise file.error(loc, f"{name!r} is text and cannot be served")
     served = ServedTag(name, table, address, kind, form.order, form.quality, form.write)
     if address + served.count > ADDRESSES:
-        raise file.error((*loc, table), f"{name!r} ends behind the last register", expected="at most 65535")
+        raise file.error((*loc, table), f"{name!r} ends after the last register", expected="at most 65535")
     if form.write:
         _check_writable(file, (*loc, "write"), served, device, tag, outputs)
     elif not tag.readable:
@@ -168,7 +168,7 @@ def _check_writable(
     if tag.name not in device.writable:
         raise file.error(loc, f"{served.tag!r} is not in `writable` of {device.name!r}")
     if served.tag in outputs:
-        raise file.error(loc, f"{served.tag!r} is written by a program already", hint="one writer a tag")
+        raise file.error(loc, f"{served.tag!r} is already written by a program", hint="one writer per tag")
 
 
 def _check_overlaps(file: YamlFile, loc: tuple[Key, ...], tags: Iterable[ServedTag]) -> None:
@@ -196,7 +196,7 @@ def _bridge(file: YamlFile, name: str, form: BridgeForm, buses: Mapping[str, Bus
     loc: tuple[Key, ...] = ("bridge", name)
     listen = _endpoint(file, loc, form.url, ("tcp", "tls", "rtu"))
     if form.to is None and not form.units:
-        raise file.error(loc, "where does this bridge lead?", expected="`to: BUS`, or `units: {1: BUS/1}`")
+        raise file.error(loc, "this bridge has no target", expected="`to: BUS`, or `units: {1: BUS/1}`")
     if form.to is not None:
         _modbus_bus(file, (*loc, "to"), form.to, buses)
     routes = {unit: _route(file, (*loc, "units", unit), unit, text, buses) for unit, text in form.units.items()}

@@ -98,9 +98,11 @@ def _bus(file: YamlFile, name: str, form: BusForm) -> BusConfig:
     try:
         endpoint = Endpoint.parse(form.url)
         if endpoint.scheme == "pty":
-            raise UsageError("a pty is made by an emulator", expected="the plant's endpoint, such as rtu:/dev/ttyS0")
+            raise UsageError(
+                "only an emulator can create a pty", expected="the plant's endpoint, such as rtu:/dev/ttyS0"
+            )
         if endpoint.scheme not in SCHEMES:
-            raise UsageError(f"this version does not speak {endpoint.scheme}", expected=", ".join(SCHEMES))
+            raise UsageError(f"this version does not support {endpoint.scheme}", expected=", ".join(SCHEMES))
     except UsageError as e:
         raise file.error(("buses", name, "url"), e.message, expected=e.expected, got=e.got) from e
     canopen = canopen_bus(file, name, form, is_can=endpoint.is_can)
@@ -236,7 +238,7 @@ def _check_addresses(file: YamlFile, buses: dict[str, BusConfig], devices: dict[
             raise file.error(
                 ("devices", name, what),
                 f"{name!r} has {what} {device.address} on {device.bus!r}, and so has {other!r}{where}",
-                expected=f"a {what} id of its own",
+                expected=f"a {what} different id",
                 hint=f"{other!r} is in line {file.line(('devices', other, what))}",
             )
         taken[key] = name
@@ -265,7 +267,7 @@ def _check_programs(system: System) -> None:
             if local not in device.writable:
                 raise system.file.error(spot, f"{tag!r} is not in `writable` of {device.name!r}")
             if tag in written:
-                raise system.file.error(spot, f"{tag!r} is written by {written[tag]!r} already")
+                raise system.file.error(spot, f"{tag!r} is already written by {written[tag]!r}")
             written[tag] = name
 
 
@@ -281,12 +283,12 @@ def _check_write_groups(system: System) -> None:
                     outputs = [t.partition(".")[2] for t in sorted(written) if t.partition(".")[0] == name]
                     raise system.file.error(
                         at,
-                        f"{tag!r} is no output of a program, so it cannot be in a group",
+                        f"{tag!r} is not an output of a program, so it cannot be in a group",
                         expected=", ".join(outputs) or "outputs of programs; this device has none",
                         hint=did_you_mean(tag, outputs),
                     )
                 if tag in seen:
-                    raise system.file.error(at, f"{tag!r} is in the group {seen[tag]!r} already")
+                    raise system.file.error(at, f"{tag!r} is already in the group {seen[tag]!r}")
                 seen[tag] = group
 
 

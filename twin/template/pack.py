@@ -104,9 +104,9 @@ def _place(folder: str, reference: str, named_in: Path) -> str:
     path = PurePosixPath(reference)
     if path.is_absolute():
         raise FileInvalid(
-            f"{reference!r} is a place on this computer alone",
+            f"{reference!r} is a path of this computer",
             path=str(named_in),
-            expected="a path beside the file, or a bare name",
+            expected="a path relative to the file, or a plain name",
         )
     if len(path.parts) == 1 and not (named_in.parent / reference).is_file():
         return f"{folder}/{reference}"
@@ -156,8 +156,8 @@ def _program(got: Collected, system: Path, source: str) -> None:
         module = rest.strip().partition(":")[0].strip()
         if not _python(got, system.parent, module) and module.partition(".")[0] != OUR_PROGRAMS:
             raise FileInvalid(
-                f"the program {source!r} is installed on this computer and no part of the system", path=str(system),
-                expected="a module beside the system file", hint="move it there, so that the template can hold it",
+                f"the program {source!r} is installed on this computer and is not part of the system", path=str(system),
+                expected="a module next to the system file", hint="move it there, so that the template can hold it",
             )  # fmt: skip
         return
     name = source.strip().partition(":")[0]
@@ -191,7 +191,7 @@ def _imports(path: Path) -> Iterator[str]:
     try:
         tree = ast.parse(path.read_bytes(), str(path))
     except (SyntaxError, ValueError, OSError, RecursionError) as e:
-        raise FileInvalid(f"no Python: {e}", path=str(path)) from e
+        raise FileInvalid(f"not Python: {e}", path=str(path)) from e
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -243,7 +243,7 @@ def _add_wheel(collected: Collected, wheel: Path, version: str, hash_here: str) 
     its_version, its_hash = wheel_hash(wheel)
     if its_hash != hash_here:
         raise FileInvalid(
-            "this wheel is other software than is running here", path=str(wheel),
+            "this wheel is different software from the running one", path=str(wheel),
             expected=f"{version}, modules {hash_here[:12]}", got=f"{its_version}, modules {its_hash[:12]}",
         )  # fmt: skip
     place = f"software/{wheel.name}"

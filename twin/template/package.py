@@ -99,7 +99,11 @@ class Package(ABC):
     def _wrong(self, file: TemplateFile, expected: str, got: str) -> FileInvalid:
         hint = "`fieldtwin template diff` shows what was edited; pack the template again" if self.path.is_dir() else ""
         return FileInvalid(
-            f"{file.path}: not what was packed", path=str(self.path), expected=expected, got=got, hint=hint
+            f"{file.path}: the file has changed since it was packed",
+            path=str(self.path),
+            expected=expected,
+            got=got,
+            hint=hint,
         )
 
     def verify(self) -> None:
@@ -210,7 +214,7 @@ def _folder_manifest(path: Path) -> Manifest:
         with open_input(path / MANIFEST) as file:
             text = file.read(MAX_MANIFEST_BYTES + 1)
     except OSError as e:
-        raise FileInvalid(f"no template: {e.strerror}", path=str(path / MANIFEST)) from e
+        raise FileInvalid(f"not a template: {e.strerror}", path=str(path / MANIFEST)) from e
     return parse_manifest(_bounded(text, str(path)), str(path / MANIFEST))
 
 
@@ -233,7 +237,9 @@ def names_below(folder: Path) -> Iterator[str]:
                 elif entry.is_file(follow_symlinks=False):
                     yield name
                 else:
-                    raise FileInvalid(f"{name!r} is no plain file", path=str(folder), hint="a template has no links")
+                    raise FileInvalid(
+                        f"{name!r} is not a regular file", path=str(folder), hint="a template has no links"
+                    )
 
 
 class ZipPackage(Package):
@@ -266,9 +272,9 @@ class ZipPackage(Package):
         mode = entry.external_attr >> 16
         kind = stat.S_IFMT(mode)
         if kind not in (0, stat.S_IFDIR if name.endswith("/") else stat.S_IFREG):
-            raise FileInvalid(f"{name!r} is no plain file", path=str(self.path), hint="a template has no links")
+            raise FileInvalid(f"{name!r} is not a regular file", path=str(self.path), hint="a template has no links")
         if entry.flag_bits & 1 or entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-            raise FileInvalid(f"{name!r} is encrypted, or packed in a way that we do not read", path=str(self.path))
+            raise FileInvalid(f"{name!r} is encrypted, or its compression is not supported", path=str(self.path))
         if name.endswith("/") and entry.file_size:
             raise FileInvalid(f"{name!r}: a folder with contents", path=str(self.path))
         return name.endswith("/")
@@ -292,8 +298,8 @@ class ZipPackage(Package):
             if entry.file_size > BLOCK and entry.file_size > MAX_RATIO * max(entry.compress_size, 1):
                 ratio = entry.file_size // max(entry.compress_size, 1)
                 raise FileInvalid(
-                    f"{name}: packed too tightly to be what it says", path=str(self.path),
-                    expected=f"at most {MAX_RATIO} to 1", got=f"{ratio} to 1", hint="a zip bomb looks like this",
+                    f"{name}: its compression ratio is too high", path=str(self.path),
+                    expected=f"at most {MAX_RATIO} to 1", got=f"{ratio} to 1", hint="it may be a zip bomb",
                 )  # fmt: skip
 
     def open(self, name: str) -> IO[bytes]:

@@ -32,7 +32,7 @@ def _reach(system: System, prototype: Prototype) -> Iterator[str]:
             yield from _listening(bus.listen, f"bus {name}")
     for device in prototype.devices.values():
         if device.form.far is not None:
-            yield from _listening(Endpoint.parse(device.form.far), f"far end of {device.name}")
+            yield from _listening(Endpoint.parse(device.form.far), f"topside end of {device.name}")
     for section, servers in (("serve", system.serving.serve), ("bridge", system.serving.bridges)):
         for server in servers:
             yield from _listening(server.listen, f"{section} {server.name}")
@@ -54,7 +54,7 @@ def _listening(at: Endpoint, what: str) -> Iterator[str]:
     else:
         host = at.host
     if not _is_loopback(host):
-        yield f"it listens on {host}, where others can reach it ({what})"
+        yield f"it listens on {host}, where other computers can reach it ({what})"
 
 
 def _is_loopback(host: str) -> bool:

@@ -51,7 +51,9 @@ def wheel_hash(wheel: Path) -> tuple[str, str]:
         raise FileInvalid("no wheel of fieldtwin", path=str(wheel), expected="fieldtwin-VERSION-py3-none-any.whl")
     try:
         if wheel.stat().st_size > MAX_WHEEL_BYTES:
-            raise FileInvalid("too large for a wheel of ours", path=str(wheel), expected=f"{MAX_WHEEL_BYTES} bytes")
+            raise FileInvalid(
+                "too large for a wheel of fieldtwin", path=str(wheel), expected=f"{MAX_WHEEL_BYTES} bytes"
+            )
         with zipfile.ZipFile(wheel) as archive:
             return match[1], _hash(_modules_in(archive, f"fieldtwin-{match[1]}.dist-info/"))
     except (OSError, zipfile.BadZipFile, NotImplementedError, RuntimeError, zlib.error) as e:
@@ -65,7 +67,9 @@ def _modules_in(archive: zipfile.ZipFile, about: str) -> Iterator[tuple[str, byt
     """
     entries = archive.infolist()
     if len(entries) > MAX_MODULES:
-        raise FileInvalid("too many files for a wheel of ours", path=str(archive.filename), expected=f"{MAX_MODULES}")
+        raise FileInvalid(
+            "too many files for a wheel of fieldtwin", path=str(archive.filename), expected=f"{MAX_MODULES}"
+        )
     room = 16 * MAX_WHEEL_BYTES
     for entry in entries:
         if not entry.is_dir() and not entry.filename.startswith((_DATA, about)):

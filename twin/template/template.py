@@ -112,7 +112,7 @@ def parse_manifest(text: bytes, where: str) -> Manifest:
     try:
         version = msgspec.json.decode(text).get("fieldtwin_template")
     except (msgspec.MsgspecError, AttributeError, RecursionError) as e:
-        raise FileInvalid("no manifest of a template", path=where, expected=MANIFEST, got=str(e)[:120]) from e
+        raise FileInvalid("not a manifest of a template", path=where, expected=MANIFEST, got=str(e)[:120]) from e
     if isinstance(version, int) and version > VERSION:
         raise FileInvalid(
             "the template was packed by a newer fieldtwin", path=where, expected=f"form {VERSION}", got=str(version)
@@ -120,7 +120,7 @@ def parse_manifest(text: bytes, where: str) -> Manifest:
     try:
         manifest = msgspec.json.decode(text, type=Manifest)
     except msgspec.MsgspecError as e:
-        raise FileInvalid(f"no manifest of a template: {e}", path=where) from e
+        raise FileInvalid(f"not a manifest of a template: {e}", path=where) from e
     _check(manifest, where)
     return manifest
 
@@ -138,7 +138,7 @@ def _check(manifest: Manifest, where: str) -> None:
     for file in manifest.files:
         check_path(file.path, where)
         if file.path.lower() in seen:
-            raise FileInvalid(f"{file.path!r} stands twice in the manifest", path=where)
+            raise FileInvalid(f"{file.path!r} is twice in the manifest", path=where)
         seen.add(file.path.lower())
         if not _HASH.fullmatch(file.sha256):
             raise FileInvalid(f"{file.path}: no SHA-256", path=where, expected="64 digits", got=file.sha256[:80])
@@ -147,7 +147,7 @@ def _check(manifest: Manifest, where: str) -> None:
                 f"{file.path}: too large", path=where, expected=f"at most {MAX_FILE_BYTES}", got=str(file.bytes)
             )
         if (file.kind == "document") != bool(file.document):
-            raise FileInvalid(f"{file.path}: `document` says which kind of document a document is", path=where)
+            raise FileInvalid(f"{file.path}: `document` states the kind of a document", path=where)
     total = sum(file.bytes for file in manifest.files)
     if total > MAX_TOTAL_BYTES:
         raise FileInvalid("too large", path=where, expected=f"at most {MAX_TOTAL_BYTES} bytes", got=str(total))
@@ -168,10 +168,10 @@ def check_path(path: str, where: str) -> None:
     wrong = (
         "it is absolute" if path.startswith("/")
         else "it is empty, or has an empty part" if not all(parts)
-        else "it leads outside" if any(part in (".", "..") for part in parts)
+        else "it leads out of the folder" if any(part in (".", "..") for part in parts)
         else "it is too long" if len(path.encode()) > MAX_PATH or max(len(p.encode()) for p in parts) > MAX_NAME
-        else "it has characters that not every system takes" if _BAD_CHARACTER.search(path)
-        else "it ends in a point or a space" if any(part[-1] in ". " for part in parts)
+        else "it has characters that some systems do not support" if _BAD_CHARACTER.search(path)
+        else "it ends in a dot or a space" if any(part[-1] in ". " for part in parts)
         else "it is the name of a device" if any(_DEVICE_NAME.match(part) for part in parts)
         else ""
     )  # fmt: skip

@@ -76,14 +76,16 @@ def _split(place: str) -> tuple[Any, str, str, dict[str, str]]:
         raise UsageError("no broker", expected=EXPECTED, got=without_password(place)) from e
     if url.password is not None:
         hint = f"{PASSWORD} in the environment, or {PASSWORD}_FILE"
-        raise UsageError("a password in a URL can be read by everybody", got=without_password(place), hint=hint)
+        raise UsageError(
+            "every user of this computer can read a password in a URL", got=without_password(place), hint=hint
+        )
     if not url.hostname or len(names) != 2 or not all(names) or not port_is_fine:
         raise UsageError("no broker, group and node", expected=EXPECTED, got=place)
     said = dict(parse_qsl(url.query))
     known = ("host", *(FILES if url.scheme == "mqtts" else ()))
     if unknown := [name for name in said if name not in known]:
-        hint = "certificates go with mqtts://" if unknown[0] in FILES else ""
-        raise UsageError(f"{unknown[0]}= says nothing of a broker", expected=", ".join(known), got=place, hint=hint)
+        hint = "certificates need mqtts://" if unknown[0] in FILES else ""
+        raise UsageError(f"{unknown[0]}= is not a setting of a broker", expected=", ".join(known), got=place, hint=hint)
     return url, names[0], names[1], said
 
 
@@ -95,5 +97,5 @@ def _password() -> str | None:
     try:
         return Path(path).read_text(encoding="utf-8").splitlines()[0].strip()
     except (OSError, UnicodeDecodeError, IndexError) as e:
-        why = getattr(e, "strerror", None) or "no text in it"
+        why = getattr(e, "strerror", None) or "the file is empty"
         raise UsageError(f"the broker's password: {why}", got=f"{PASSWORD}_FILE={path}") from e

@@ -138,8 +138,8 @@ class ThreadEnd:
             self.out.linger_ns = link.linger_ns
             self.out.connected(self._clock.monotonic_ns())
         async with Nursery() as nursery:
-            nursery.start(self._listen(link), f"{self._carrier.name}: what comes")
-            nursery.start(self._talk(link), f"{self._carrier.name}: what goes")
+            nursery.start(self._listen(link), f"{self._carrier.name}: incoming")
+            nursery.start(self._talk(link), f"{self._carrier.name}: outgoing")
             await nursery.wait()
 
     # -- what goes --------------------------------------------------------------------------------------------------------
@@ -194,14 +194,14 @@ class ThreadEnd:
             await self._do(self.into.receive(frame, now_ns))
             if self.into.unknown_schema:
                 self.trouble = (
-                    f"the other side writes with a schema that this one does not have: {self.into.unknown_schema.hex()}"
+                    f"the other side uses a schema that this one does not have: {self.into.unknown_schema.hex()}"
                     " (another system, or another version of its file)"
                 )
         elif out is not None and frame.tag == out.tag:
             if isinstance(frame, Ack):
                 out.on_ack(frame, now_ns)
                 if out.contradicted:
-                    self.trouble = f"the other side has more of {out.origin} than its own store: was a backup put back?"
+                    self.trouble = f"the other side has more of {out.origin} than its own store: was a backup restored?"
             elif isinstance(frame, Ask):
                 out.on_ask(now_ns)
             elif isinstance(frame, Refused):

@@ -308,7 +308,7 @@ class FrameCodec:
 
     def _fitting(self, data: bytes) -> bytes:
         if len(data) > self.mtu:
-            raise Bug("a frame is larger than the carrier takes", expected=f"{self.mtu} bytes", got=str(len(data)))
+            raise Bug("a frame is larger than the carrier allows", expected=f"{self.mtu} bytes", got=str(len(data)))
         return data
 
     def _encode_data(self, frame: Data) -> bytes:
@@ -332,7 +332,9 @@ class FrameCodec:
         reader = Reader(data)
         head = reader.take(1)[0]
         if head >> 4 != VERSION:
-            raise Desync("a frame of another version of threads", expected=str(VERSION), got=str(head >> 4))
+            raise Desync(
+                "a frame of a different version of the thread protocol", expected=str(VERSION), got=str(head >> 4)
+            )
         tag = reader.take(TAG_BYTES)
         kind = head & 15
         if kind == DATA:
@@ -401,5 +403,5 @@ class FrameCodec:
         self._pieces.pop(key, None)
         whole = b"".join(pieces[i] for i in range(count))
         if whole[:1] != bytes([VERSION << 4 | DATA]):
-            raise Desync("pieces of something else than DATA")
+            raise Desync("pieces of a frame that is not DATA")
         return self.decode(whole)

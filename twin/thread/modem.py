@@ -77,7 +77,7 @@ class ModemLink(DatagramLink):
 
     def _look(self) -> None:
         if (failure := self._nursery.failure()) is not None:
-            raise ConnectionLost(f"the transmitter is not served any more: {failure}", where=self._driver.config.name)
+            raise ConnectionLost(f"the transmitter is no longer served: {failure}", where=self._driver.config.name)
 
     async def _pump(self) -> None:
         """Start the next exchange with the modem's mailboxes periodically, one at a time."""

@@ -29,7 +29,7 @@ GOODBYE_S = 1.0
 
 FAILURE = 0x80
 """SUBACK codes from here on are refusals (MQTT 3.9.3)."""
-ACCESS = "the user needs to read and write the topics of group and node, and STATE (docs/thread.md)"
+ACCESS = "the user needs permission to read and write the topics of group and node, and STATE (docs/thread.md)"
 
 
 class _Socket(ssl.SSLSocket):
@@ -58,22 +58,24 @@ def _refusal(e: aiomqtt.MqttError, heard: str, where: str) -> Unreachable:
     """Return why there is no session. A broker that is not reachable may be later; one that refuses will go on refusing."""
     cause = e.__context__  # aiomqtt keeps the exception that paho raised
     if isinstance(cause, ssl.SSLCertVerificationError):
-        hint = "ca= names who is trusted; the certificate is for the host in the URL"
+        hint = "ca= is the trusted authority; the certificate must name the host in the URL"
         return Unwelcome(f"the broker's certificate is refused: {cause.verify_message}", where=where, hint=hint)
     if isinstance(cause, ssl.SSLError):
         reason = (cause.reason or str(cause)).replace("_", " ").lower()
         return Unwelcome(
-            f"no TLS with the broker: {reason}", where=where, hint="cert= and key= are ours, if it asks for them"
+            f"no TLS with the broker: {reason}",
+            where=where,
+            hint="cert= and key= are our own certificate, if the broker requires one",
         )
     if isinstance(e, aiomqtt.MqttCodeError) and e.rc:
         hint = "the user is in the URL, the password in FIELDTWIN_MQTT_PASSWORD or FIELDTWIN_MQTT_PASSWORD_FILE"
-        return Unwelcome(f"the broker refuses: {str(e).partition('] ')[2] or e}", where=where, hint=hint)
+        return Unwelcome(f"the broker refuses the connection: {str(e).partition('] ')[2] or e}", where=where, hint=hint)
     if heard:
-        hint = "does it want mqtts://, or a certificate of ours (cert= and key=)?"
+        hint = "it may require mqtts://, or a certificate (cert= and key=)"
         return Unreachable(f"the broker ends the connection: {heard}", where=where, hint=hint)
     why = cause.strerror if isinstance(cause, OSError) and cause.strerror else str(e)
-    hint = "TLS is asked for: does it speak that on this port?" if isinstance(cause, ConnectionResetError) else ""
-    return Unreachable(f"the broker is not there: {why}", where=where, hint=hint)
+    hint = "check that the broker supports TLS on this port" if isinstance(cause, ConnectionResetError) else ""
+    return Unreachable(f"the broker cannot be reached: {why}", where=where, hint=hint)
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +107,8 @@ class MqttLink(Link):
         self._clock = clock
         self._where = where
         self.quiet = (
-            f"nothing came through {where}: nobody there, or our user may not read or write {side.subscriptions[0]}"
+            f"no messages through {where}: the other side is not connected, "
+            f"or the user has no permission for {side.subscriptions[0]}"
         )
         self._messages: AsyncIterator[aiomqtt.Message] = aiter(client.messages)
 
@@ -115,7 +118,7 @@ class MqttLink(Link):
             for topic in self.side.subscriptions:
                 granted = await self._client.subscribe(topic, qos=1)
                 if any(getattr(code, "value", code) >= FAILURE for code in granted):
-                    raise Unwelcome(f"the broker does not let us hear {topic}", where=self._where, hint=ACCESS)
+                    raise Unwelcome(f"the broker denies the subscription to {topic}", where=self._where, hint=ACCESS)
         except aiomqtt.MqttError as e:
             raise ConnectionLost(f"the broker is gone: {e}", where=self._where) from e
         for message in self.side.hello():

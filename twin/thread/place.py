@@ -39,9 +39,13 @@ def lent_transmitter(place: str, system: System) -> str:
 def _transmitter(name: str, system: System) -> str:
     there = [d.name for d in system.devices.values() if d.profile.inbox is not None]
     if name and name not in there:
-        raise UsageError(f"{name!r} is no transmitter of {system.name}", expected=", ".join(there) or "none has one")
+        raise UsageError(
+            f"{name!r} is not a transmitter of {system.name}", expected=", ".join(there) or "no device has one"
+        )
     if not name and len(there) != 1:
-        raise UsageError("which transmitter?", expected=" or ".join(MODEM + n for n in there) or "a system with one")
+        raise UsageError(
+            "which transmitter?", expected=" or ".join(MODEM + n for n in there) or "a system with a transmitter"
+        )
     return name or there[0]
 
 
@@ -60,7 +64,7 @@ async def plant_carrier(
     endpoint = _stream(place)
     if endpoint.scheme == "tcp" and not _is_loopback(endpoint.host):
         raise UsageError(
-            "whoever reaches this port may command the plant", expected="a loopback address, or tls://",
+            "every client that reaches this port may command the plant", expected="a loopback address, or tls://",
             got=without_password(place), hint="tls://HOST:PORT?ca=FILE&cert=FILE&key=FILE asks for a certificate",
         )  # fmt: skip
     listening = await TcpListening.start(endpoint, TcpListener.open, [schema_of(system)])
@@ -73,7 +77,9 @@ def twin_carrier(place: str, system: System, clock: Clock) -> Carrier:
         name, _, far = place.removeprefix(MODEM).rpartition("@")
         if not far.startswith("tcp:"):
             raise UsageError(
-                "where is the far modem?", expected="modem:[DEVICE@]tcp://HOST:PORT", got=without_password(place)
+                "the endpoint of the topside modem is missing",
+                expected="modem:[DEVICE@]tcp://HOST:PORT",
+                got=without_password(place),
             )
         return _modem(system, _transmitter(name, system), Endpoint.parse(far), OsConnector(), clock)
     if is_broker(place):
@@ -84,7 +90,7 @@ def twin_carrier(place: str, system: System, clock: Clock) -> Carrier:
 def _stream(place: str) -> Endpoint:
     endpoint = Endpoint.parse(place)
     if endpoint.scheme not in ("tcp", "tls"):
-        raise UsageError("a thread cannot go there", expected=EXPECTED, got=without_password(place))
+        raise UsageError("a thread cannot use this endpoint", expected=EXPECTED, got=without_password(place))
     return endpoint
 
 

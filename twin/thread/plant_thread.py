@@ -190,7 +190,7 @@ class PlantThread:
             if lent := lent_transmitter(c.place, system):
                 audit = AuditLog(Path(c.run_dir) / "audit.jsonl", clock)
                 stack.callback(audit.close)
-                audit.note("lend", lent, by="digital thread", result="its mailboxes are the thread's")
+                audit.note("lend", lent, by="digital thread", result="the thread uses its mailboxes")
             connector: Connector = OsConnector()
             if c.mapping is not None:
                 connector = MappedConnector(connector, mapping_from_json(c.mapping))
@@ -253,7 +253,9 @@ class PlantThread:
             self._process.tell_again()
             return
         if not (await client.call("command", payload=command.data.hex(), by=origin))["taken"]:
-            self._gate.share(Kind.REFUSAL, "gateway", f"number {event.sequence} of {origin}: the plant says local")
+            self._gate.share(
+                Kind.REFUSAL, "gateway", f"number {event.sequence} of {origin}: the plant is switched to local"
+            )
             self._process.tell_again()
 
     async def _look(self, connection: PTtoDTConnection, readers: Any) -> None:

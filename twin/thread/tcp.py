@@ -68,7 +68,7 @@ class StreamLink(DatagramLink):
         """
         if data.startswith(TAKEN):
             raise Unwelcome(
-                f"another shadow or twin follows this thread already: {data.removeprefix(TAKEN).decode(errors='replace')}",
+                f"another shadow or twin already follows this thread: {data.removeprefix(TAKEN).decode(errors='replace')}",
                 where=str(self._connection.endpoint),
                 hint="stop it first, or use a broker (mqtt://), which serves several at a time",
             )  # fmt: skip
@@ -113,7 +113,7 @@ class StreamLink(DatagramLink):
                 end = 2 + int.from_bytes(self._pending[:2])
                 if end > 2 + MTU:
                     raise ConnectionLost(
-                        "this is no thread", expected=f"frames of at most {MTU} bytes", got=str(end - 2)
+                        "this is not a thread", expected=f"frames of at most {MTU} bytes", got=str(end - 2)
                     )
                 if len(self._pending) >= end:
                     data = bytes(self._pending[2:end])

@@ -1,4 +1,4 @@
-"""A node that boots again and again."""
+"""A node that boots repeatedly."""
 
 from __future__ import annotations
 

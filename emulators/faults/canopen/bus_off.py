@@ -7,5 +7,7 @@ from fieldtwin.emulators.faults.can_fault import BusFault
 
 class BusOff(BusFault):
     name = "bus-off"
-    summary = "each attempt of the node to send is destroyed until its controller is in bus-off (a modelled bus only)"
+    summary = (
+        "each attempt of the node to send is destroyed until its controller is in bus-off (only on a modelled bus)"
+    )
     attempts = 32

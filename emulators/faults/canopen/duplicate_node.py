@@ -10,7 +10,7 @@ from fieldtwin.gateway.core.canframe import CanFrame
 
 class DuplicateNode(CanFault):
     name = "duplicate-node"
-    summary = "a second node with this id answers each SDO request and beats, in another state"
+    summary = "a second node with this node ID answers each SDO request and sends heartbeats with a different state"
 
     def aims_at(self, frame: CanFrame, node: int) -> bool:
         return frame.can_id in (HEARTBEAT + node, SDO_REPLY + node)

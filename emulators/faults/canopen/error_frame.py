@@ -7,4 +7,6 @@ from fieldtwin.emulators.faults.can_fault import BusFault
 
 class ErrorFrame(BusFault):
     name = "error-frame"
-    summary = "the node's frames are destroyed on the wire now and then, and sent again by its controller (a modelled bus only)"
+    summary = (
+        "some frames of the node are destroyed on the bus, and its controller repeats them (only on a modelled bus)"
+    )

@@ -17,7 +17,7 @@ class Form(Parameters):
 
 class HeartbeatLate(CanFault):
     name = "heartbeat-late"
-    summary = "the node's heartbeat comes up to `most_ms` late"
+    summary = "the node's heartbeat arrives up to `most_ms` late"
     form = Form
 
     def aims_at(self, frame: CanFrame, node: int) -> bool:

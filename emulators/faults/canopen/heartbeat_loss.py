@@ -10,7 +10,7 @@ from fieldtwin.gateway.core.canframe import CanFrame
 
 class HeartbeatLoss(CanFault):
     name = "heartbeat-loss"
-    summary = "the node sends no heartbeat; all else goes on"
+    summary = "the node sends no heartbeat, but works otherwise"
 
     def aims_at(self, frame: CanFrame, node: int) -> bool:
         return frame.can_id == HEARTBEAT + node

@@ -17,7 +17,7 @@ class Form(Parameters):
 
 class LateFrame(CanFault):
     name = "late-frame"
-    summary = "a frame of the node comes `by_ms` late (narrow it with `cob_id`)"
+    summary = "a frame of the node arrives `by_ms` late (narrow it with `cob_id`)"
     form = Form
 
     def strike(self, frame: CanFrame, node: int, random: Random) -> tuple[CanPiece, ...]:

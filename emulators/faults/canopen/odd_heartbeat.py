@@ -18,7 +18,8 @@ class Form(Parameters):
 class OddHeartbeat(CanFault):
     name = "odd-heartbeat"
     summary = (
-        "the node's heartbeat tells `state`: 4 stopped, 5 operational, 127 pre-operational, 0 boot-up, others none"
+        "the node's heartbeat reports `state`: 4 stopped, 5 operational, 127 pre-operational, 0 boot-up, other "
+        "values undefined"
     )
     form = Form
 

@@ -26,8 +26,9 @@ class Form(Parameters):
 class OddSdo(CanFault):
     name = "odd-sdo"
     summary = (
-        "SDO replies carry `command` (-1: their own), an index that is `index_by` more, a segmented size that is `size_by` "
-        "more, no size at all (`no_size`) or an extended identifier; `before` them come so many of an unknown command"
+        "SDO replies carry `command` (-1: unchanged), an index increased by `index_by`, a segmented size increased "
+        "by `size_by`, no size (`no_size`) or an extended identifier; `before` replies with an unknown command "
+        "precede them"
     )
     form = Form
 

@@ -10,7 +10,7 @@ from fieldtwin.gateway.core.canframe import CanFrame
 
 class SdoToggle(CanFault):
     name = "sdo-toggle"
-    summary = "segments of SDO transfers carry the other toggle bit"
+    summary = "segments of SDO transfers carry the wrong toggle bit"
 
     def aims_at(self, frame: CanFrame, node: int) -> bool:
         segment = frame.data[:1] and frame.data[0] >> 5 in (0, 1)

@@ -17,7 +17,7 @@ class Form(Parameters):
 
 class ShortFrame(CanFault):
     name = "short-frame"
-    summary = "a frame of the node ends behind `length` bytes (narrow it with `cob_id`)"
+    summary = "a frame of the node ends after `length` bytes (narrow it with `cob_id`)"
     form = Form
 
     def strike(self, frame: CanFrame, node: int, random: Random) -> tuple[CanPiece, ...]:

@@ -18,7 +18,7 @@ class Form(Parameters):
 
 class SyncJitter(CanFault):
     name = "sync-jitter"
-    summary = "the node hears SYNC up to `most_ms` late"
+    summary = "the node receives SYNC up to `most_ms` late"
     form = Form
     ways = frozenset((Way.REQUEST,))
 

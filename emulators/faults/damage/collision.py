@@ -16,7 +16,7 @@ class Form(Parameters):
 
 class Collision(WireFault):
     name = "collision"
-    summary = "another sender talks over the frame from byte `at` on: each byte is the AND of both, as on RS485"
+    summary = "a second sender collides with the frame from byte `at` on: each byte is the AND of both, as on RS485"
     form = Form
 
     def strike(self, frame: Frame, random: Random) -> Outcome:

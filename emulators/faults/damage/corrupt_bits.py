@@ -19,8 +19,8 @@ class Form(Parameters):
 class CorruptBits(WireFault):
     name = "corrupt-bits"
     summary = (
-        "`bits` bits of the frame, anywhere, are turned over; with `fits` they are behind the function code, and its check "
-        "sum fits"
+        "`bits` random bits of the frame are inverted; with `fits` only bits after the function code, and the "
+        "check sum is corrected"
     )
     form = Form
 

@@ -10,7 +10,7 @@ from fieldtwin.emulators.faults.frames import Frame, Framing
 
 class CorruptCrc(WireFault):
     name = "corrupt-crc"
-    summary = "the check sum (CRC of RTU, LRC of ASCII) is wrong; over TCP, which has none, nothing happens"
+    summary = "the check sum (CRC of RTU, LRC of ASCII) is wrong; no effect over TCP, which has none"
 
     def strike(self, frame: Frame, random: Random) -> Outcome:
         data = frame.data

@@ -18,7 +18,8 @@ class Form(Parameters):
 class CorruptLength(WireFault):
     name = "corrupt-length"
     summary = (
-        "the length says `by` more than there is: MBAP's, or on a line a read reply's byte count (its check sum fits)"
+        "the length field is `by` too large: the MBAP length, or on a serial line the byte count of a read reply "
+        "(with a correct check sum)"
     )
     form = Form
 

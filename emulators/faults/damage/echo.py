@@ -10,7 +10,7 @@ from fieldtwin.emulators.faults.frames import Frame, Way
 
 class Echo(WireFault):
     name = "echo"
-    summary = "the sender gets its own frame back, before anything else"
+    summary = "the sender receives its own frame before the reply"
     ways = frozenset((Way.REQUEST,))
 
     def strike(self, frame: Frame, random: Random) -> Outcome:

@@ -17,7 +17,7 @@ class Form(Parameters):
 
 class Garbage(WireFault):
     name = "garbage"
-    summary = "`count` bytes that mean nothing, or those of `data` (hex), follow the frame at once"
+    summary = "`count` random bytes, or the bytes of `data` (hex), follow the frame immediately"
     form = Form
 
     def strike(self, frame: Frame, random: Random) -> Outcome:

@@ -18,7 +18,7 @@ class Form(Parameters):
 
 class Noise(WireFault):
     name = "noise"
-    summary = "`count` bytes that mean nothing, or those of `data` (hex), precede the frame, `lead_ms` before it"
+    summary = "`count` random bytes, or the bytes of `data` (hex), precede the frame by `lead_ms`"
     form = Form
 
     def strike(self, frame: Frame, random: Random) -> Outcome:

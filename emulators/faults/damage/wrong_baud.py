@@ -16,7 +16,7 @@ class Form(Parameters):
 
 class WrongBaud(WireFault):
     name = "wrong-baud"
-    summary = "each byte arrives as others, or not at all, as at a baud rate that differs by a factor of `factor`"
+    summary = "each byte arrives as different bytes, or not at all, as with a baud rate that is wrong by `factor`"
     form = Form
 
     def strike(self, frame: Frame, random: Random) -> Outcome:

@@ -10,7 +10,7 @@ from fieldtwin.emulators.faults.frames import Frame
 
 class WrongParity(WireFault):
     name = "wrong-parity"
-    summary = "bytes whose parity bit does not fit are dropped; which, depends on their bits"
+    summary = "bytes whose parity bit is wrong are dropped, which depends on their bits"
 
     def strike(self, frame: Frame, random: Random) -> Outcome:
         heard = bytes(byte for byte in frame.data if byte.bit_count() % 2 == 0)

@@ -11,7 +11,7 @@ from fieldtwin.emulators.faults.frames import Frame, Way
 class Disconnect(WireFault):
     name = "disconnect"
     summary = (
-        "connections are ended at once, and new ones refused, until the fault is over; a serial line is dead meanwhile"
+        "connections are closed at once and new ones refused until the fault ends; a serial line is dead meanwhile"
     )
     ways = frozenset(Way)
     refuses = True

@@ -17,7 +17,7 @@ class Form(Parameters):
 
 class Duplicate(WireFault):
     name = "duplicate"
-    summary = "the frame arrives again, `after_ms` behind itself"
+    summary = "the frame arrives again, `after_ms` later"
     form = Form
 
     def strike(self, frame: Frame, random: Random) -> Outcome:

@@ -10,7 +10,7 @@ from fieldtwin.emulators.faults.frames import Frame
 
 class HalfOpen(WireFault):
     name = "half-open"
-    summary = "from the frame on nothing passes on this connection, and nobody is told"
+    summary = "from this frame on, the connection silently carries no data"
 
     def strike(self, frame: Frame, random: Random) -> Outcome:
         return Outcome(hang=Hang.HALF_OPEN)

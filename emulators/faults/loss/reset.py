@@ -16,7 +16,7 @@ class Form(Parameters):
 
 class Reset(WireFault):
     name = "reset"
-    summary = "the connection is torn down behind the first `at` bytes of the frame"
+    summary = "the connection is reset after the first `at` bytes of the frame"
     form = Form
 
     def strike(self, frame: Frame, random: Random) -> Outcome:

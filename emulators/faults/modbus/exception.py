@@ -15,7 +15,7 @@ CODES = {
     2: "illegal data address",
     3: "illegal data value",
     4: "server device failure",
-    5: "acknowledge: it takes longer",
+    5: "acknowledge: processing takes longer",
     6: "server device busy",
     7: "negative acknowledge (older devices)",
     8: "memory parity error",

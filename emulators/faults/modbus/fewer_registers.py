@@ -21,8 +21,8 @@ class Form(Parameters):
 class FewerRegisters(WireFault):
     name = "fewer-registers"
     summary = (
-        "the reply to a read lacks its last `by` registers (of bits: bytes); its byte count and check sum fit what is left, "
-        "which is one register at least"
+        "the reply to a read lacks its last `by` registers (of bits: bytes); its byte count and check sum match "
+        "the remaining data, at least one register"
     )
     form = Form
 

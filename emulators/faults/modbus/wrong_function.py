@@ -17,7 +17,7 @@ class Form(Parameters):
 
 class WrongFunction(WireFault):
     name = "wrong-function"
-    summary = "the frame carries function `code` (its check sum fits)"
+    summary = "the frame carries function `code` (with a correct check sum)"
     form = Form
 
     def strike(self, frame: Frame, random: Random) -> Outcome:

@@ -19,8 +19,8 @@ class Form(Parameters):
 class WrongTransaction(WireFault):
     name = "wrong-transaction"
     summary = (
-        "the transaction id is `by` more, or `to` (-1: not), and the protocol id `protocol`; on a line, which has none, "
-        "nothing happens"
+        "the transaction ID is increased by `by`, or is `to` (-1: unset), and the protocol ID is `protocol`; no "
+        "effect on a serial line, which has none"
     )
     form = Form
 

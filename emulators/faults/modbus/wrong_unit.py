@@ -17,7 +17,7 @@ class Form(Parameters):
 
 class WrongUnit(WireFault):
     name = "wrong-unit"
-    summary = "the frame carries unit id `unit_id` (its check sum fits)"
+    summary = "the frame carries unit ID `unit_id` (with a correct check sum)"
     form = Form
 
     def strike(self, frame: Frame, random: Random) -> Outcome:

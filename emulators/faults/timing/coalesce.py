@@ -16,7 +16,7 @@ class Form(Parameters):
 
 class Coalesce(WireFault):
     name = "coalesce"
-    summary = "frames are kept for `every_ms` and arrive in one piece"
+    summary = "frames are collected for `every_ms` and arrive in one piece"
     form = Form
 
     def strike(self, frame: Frame, random: Random) -> Outcome:

@@ -16,7 +16,7 @@ class Form(Parameters):
 
 class Delay(WireFault):
     name = "delay"
-    summary = "the frame arrives `by_ms` later, and what follows waits behind it"
+    summary = "the frame arrives `by_ms` later, and delays the frames after it"
     form = Form
 
     def strike(self, frame: Frame, random: Random) -> Outcome:

@@ -16,7 +16,7 @@ class Form(Parameters):
 
 class Jitter(WireFault):
     name = "jitter"
-    summary = "the frame arrives up to `most_ms` later, evenly spread"
+    summary = "the frame arrives up to `most_ms` later (uniform distribution)"
     form = Form
 
     def strike(self, frame: Frame, random: Random) -> Outcome:

@@ -16,7 +16,7 @@ class Form(Parameters):
 
 class LateReply(WireFault):
     name = "late-reply"
-    summary = "the reply comes `by_ms` late, past whatever was answered meanwhile"
+    summary = "the reply arrives `by_ms` late, and later replies may overtake it"
     form = Form
 
     def strike(self, frame: Frame, random: Random) -> Outcome:

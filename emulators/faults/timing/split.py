@@ -18,9 +18,7 @@ class Form(Parameters):
 
 class Split(WireFault):
     name = "split"
-    summary = (
-        "the frame arrives cut behind `at` bytes, up to `times` times, each piece `pause_ms` behind the one before"
-    )
+    summary = "the frame is split after `at` bytes, up to `times` times, with `pause_ms` between the pieces"
     form = Form
     divides = True
 

@@ -13,7 +13,7 @@ class Form(Parameters):
 
 class Drift(ValueFault):
     name = "drift"
-    summary = "the value moves away by `per_s` a second"
+    summary = "the value drifts by `per_s` per second"
     form = Form
 
     def distort(self, value: float, since_s: float, held: float, random: Random) -> float:

@@ -9,7 +9,9 @@ from fieldtwin.emulators.faults.fault import ValueFault
 
 class NotANumber(ValueFault):
     name = "nan"
-    summary = "no number; an integer register holds what its type has for that, an integer object what it held"
+    summary = (
+        "the value is not a number; an integer register holds its type's substitute, an integer object keeps its value"
+    )
 
     def distort(self, value: float, since_s: float, held: float, random: Random) -> float:
         return float("nan")

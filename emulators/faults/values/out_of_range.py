@@ -17,13 +17,13 @@ from fieldtwin.gateway.core.files.profile import Tag
 class Form(Parameters):
     value: float | None = Field(
         default=None,
-        description="default: the largest value that the tag's type can carry outside of its declared range",
+        description="default: the largest value that the tag's type can carry outside its declared range",
     )
 
 
 class OutOfRange(ValueFault):
     name = "out-of-range"
-    summary = "the value is `value`, by default one outside of the tag's range"
+    summary = "the value is `value`, by default a value outside the tag's range"
     form = Form
 
     def __init__(self, parameters: Parameters) -> None:
@@ -44,5 +44,5 @@ class OutOfRange(ValueFault):
 
     def distort(self, value: float, since_s: float, held: float, random: Random) -> float:
         if self.parameters.value is None:
-            raise Bug("the fault out-of-range without a value strikes tags, and each has a value of its own")
+            raise Bug("the fault out-of-range without a value affects tags, and each has its own value")
         return float(self.parameters.value)

@@ -16,7 +16,7 @@ class Form(Parameters):
 
 class Spike(ValueFault):
     name = "spike"
-    summary = "with `probability_each` the value is `by` away for one reading"
+    summary = "with `probability_each` the value is wrong by `by` for one reading"
     form = Form
 
     def distort(self, value: float, since_s: float, held: float, random: Random) -> float:

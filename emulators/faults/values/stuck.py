@@ -9,7 +9,7 @@ from fieldtwin.emulators.faults.fault import ValueFault
 
 class Stuck(ValueFault):
     name = "stuck"
-    summary = "the value stays what it was when the fault began"
+    summary = "the value keeps the value that it had when the fault began"
 
     def distort(self, value: float, since_s: float, held: float, random: Random) -> float:
         return held

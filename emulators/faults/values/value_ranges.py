@@ -98,7 +98,7 @@ def check_fault(fault: Fault, register: str, tags: Iterable[Tag], device: str = 
             if value is None:
                 beyond(tag, f"{whose}{tag.name}")
             else:
-                hint = "" if register else "say `register: TAG`: without it the fault strikes every tag of the device"
+                hint = "" if register else "say `register: TAG`: without it the fault affects every tag of the device"
                 check_value(tag, value, f"{whose}{tag.name}", hint)
         except WrongAim as e:
             refused.append(e)

@@ -43,7 +43,7 @@ class CanopenWire:
         if frame.error:
             return "error frame", []
         if frame.extended:
-            return f"{frame}: no CANopen (29-bit identifier)", []
+            return f"{frame}: not CANopen (29-bit identifier)", []
         if frame.remote:
             return f"asks for {frame.can_id:03X}h", []
         number, node = frame.can_id, frame.can_id & 0x7F
@@ -70,7 +70,7 @@ class CanopenWire:
             return self._pdo(
                 Pdo(node, f"{'TPDO' if sends else 'RPDO'}{at - (not sends)}", sends, None), frame.data, t_ns
             )
-        return f"{frame}: no identifier of CANopen", []
+        return f"{frame}: not a CANopen identifier", []
 
     def finish(self) -> list[Exchange]:
         """Conclude the trace: requests that still wait have no answer."""

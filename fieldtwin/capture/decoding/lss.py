@@ -67,7 +67,7 @@ class LssWatch:
     def _reply(self, data: bytes, t_ns: int) -> tuple[str, list[Exchange]]:
         now = self._open
         if now is None or _ANSWERED[now.request[0]] != data[0]:
-            return f"LSS {_named(data)[0]}, which nobody asked for", []
+            return f"LSS {_named(data)[0]}, without a request", []
         self._open = None
         text, problem = "yes", ""
         if data[0] in _RESULT:

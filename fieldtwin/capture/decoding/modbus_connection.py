@@ -91,7 +91,7 @@ class ModbusWire:
             self._echo_due = data if self._echo else b""
         for frame in frames:
             if frame.bad:
-                texts.append(f"{_bytes(len(frame.raw))} that are no request ({frame.bad})")
+                texts.append(f"{_bytes(len(frame.raw))} that are not a request ({frame.bad})")
                 continue
             if self._serial:
                 self._settle(texts, done)
@@ -196,7 +196,7 @@ class ModbusWire:
         unit = self._units.get(frame.unit) or self._sender_of(frame)
         name = unit.name if unit else ""
         late = frame.transaction in self._given_up
-        why = "an answer that comes too late" if late else "a frame that answers nothing"
+        why = "a late reply" if late else "a reply without a request"
         transaction = frame.transaction if frame.transaction >= 0 else None
         hidden = unit is not None and unit.tags.has_secrets
         text = f"{name or f'unit {frame.unit}'}: {why}: {_identified(frame.unit, transaction)}, "

@@ -208,13 +208,13 @@ class MbapSplitter(Splitter):
         while len(self._buffer) >= 6:
             size = 6 + int.from_bytes(self._buffer[4:6])
             if not 8 <= size <= MAX_ADU:
-                found.append(self._noise(len(self._buffer), "a header that cannot be right"))
+                found.append(self._noise(len(self._buffer), "an impossible header"))
                 return found
             if len(self._buffer) < size:
                 break
             foreign = self._buffer[2:4] != b"\0\0"
             t_ns, raw = self._cut(size)
-            bad = "not Modbus: a protocol id other than 0" if foreign else ""
+            bad = "not Modbus: the protocol id is not 0" if foreign else ""
             found.append(Frame(t_ns, raw[6], raw[7:], raw, bad, int.from_bytes(raw[:2])))
         if settled and self._buffer:
             found.append(self._noise(len(self._buffer), "no frame"))

@@ -138,11 +138,11 @@ def parse_reply(asked: Asked, request: bytes, pdu: bytes) -> Answer:
     if len(pdu) == 2 and pdu[0] == asked.function | 0x80:
         return Answer(exception=pdu[1], problem="exception", detail=f"exception {exception_text(pdu[1])}")
     if not pdu or pdu[0] != asked.function or (asked.reply_bytes and len(pdu) != asked.reply_bytes):
-        return Answer(problem="malformed", detail=f"{len(pdu)} bytes that answer something else")
+        return Answer(problem="malformed", detail=f"{len(pdu)} bytes that do not answer the request")
     if asked.echoes:
         if pdu == request[: asked.echoes]:
             return Answer(detail="done")
-        return Answer(problem="malformed", detail=f"acknowledges something else: {pdu[1:].hex(' ')}")
+        return Answer(problem="malformed", detail=f"does not acknowledge the request: {pdu[1:].hex(' ')}")
     span = asked.read_span
     if span is None or asked.function in (0x14, 0x18):
         return Answer(detail=pdu[1:].hex(" "))

@@ -107,7 +107,7 @@ class SdoWatch:
         if data[0] == _ABORT:
             return self._aborted(data, "server")
         if now is None:
-            return Seen("an SDO reply that no request waits for", stray=True)
+            return Seen("an SDO reply without a request", stray=True)
         first, kind, ours = data[0], data[0] >> 5, data[1:4] == now.request[1:4]
         if now.in_segments and now.upload:
             return _segment_of_block(now, data)

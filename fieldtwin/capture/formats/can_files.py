@@ -156,7 +156,7 @@ def _frame(message: Any, left: LeftOut) -> tuple[int, str, CanFrame] | None:
         return None
     t_s = float(message.timestamp)
     if not 0 <= t_s < MAX_TIME_S:
-        raise FileInvalid("a time that none is", got=str(t_s))
+        raise FileInvalid("an invalid time", got=str(t_s))
     remote = bool(message.is_remote_frame)
     frame = CanFrame(
         message.arbitration_id, b"" if remote else bytes(message.data), extended=bool(message.is_extended_id),

@@ -126,7 +126,7 @@ def import_cnv(
     0 with the first row. Raises `FileInvalid` with path and line.
     """
     if not out.parent.is_dir():
-        raise FileInvalid("the recording's directory is not there", path=str(out))
+        raise FileInvalid("the recording's directory does not exist", path=str(out))
     part = out.with_name(f".{out.name}.{os.getpid()}.part")
     part.unlink(missing_ok=True)
     try:
@@ -206,13 +206,11 @@ def read_header(lines: _Lines) -> CnvHeader:
     if not header.lines:
         raise lines.invalid("the header has no end", expected="a line *END*")
     if not header.names:
-        raise lines.invalid("the header names no columns", expected="# name 0 = ...")
+        raise lines.invalid("the header has no columns", expected="# name 0 = ...")
     width = max(header.names) + 1
     header.nquan = header.nquan or width
     if header.nquan != len(header.names) or header.nquan != width:
-        raise lines.invalid(
-            "the header contradicts itself", expected=f"{header.nquan} names", got=f"{len(header.names)}"
-        )
+        raise lines.invalid("the header is inconsistent", expected=f"{header.nquan} names", got=f"{len(header.names)}")
     return header
 
 
@@ -232,7 +230,7 @@ def _read_header_line(header: CnvHeader, text: str, lines: _Lines) -> None:
         elif key == "interval" and value.startswith("seconds:"):
             header.interval_s = float(value.partition(":")[2])
     except ValueError:
-        raise lines.invalid(f"{key} is no number", got=repr(value)) from None
+        raise lines.invalid(f"{key} is not a number", got=repr(value)) from None
     if key == "file_type" and value != "ascii":
         raise lines.invalid("only ASCII .cnv files can be read", expected="ascii", got=value)
     if key == "start_time":
@@ -321,7 +319,9 @@ def _cells(line: str, header: CnvHeader, lines: _Lines) -> list[str]:
         return cells
     if len(line) == COLUMN_WIDTH * header.nquan:
         return [line[i : i + COLUMN_WIDTH] for i in range(0, len(line), COLUMN_WIDTH)]
-    raise lines.invalid("a row of another width", expected=f"{header.nquan} columns", got=f"{len(cells)}")
+    raise lines.invalid(
+        "a row with a different number of columns", expected=f"{header.nquan} columns", got=f"{len(cells)}"
+    )
 
 
 def _time(cells: list[str], header: CnvHeader, plan: _Plan, lines: _Lines, row: int) -> float:

@@ -142,7 +142,7 @@ def _time_column(names: list[str], path: Path) -> int:
         for i, name in enumerate(names):
             if _split(name)[0].lower() == wanted:
                 return i
-    raise UsageError(f"{path.name}: which column is the time?", expected="--time COLUMN", got=", ".join(names[:20]))
+    raise UsageError(f"{path.name}: the time column is not known", expected="--time COLUMN", got=", ".join(names[:20]))
 
 
 def _chosen(names: list[str], columns: Mapping[str, str], time_at: int) -> dict[str, int]:
@@ -154,7 +154,7 @@ def _chosen(names: list[str], columns: Mapping[str, str], time_at: int) -> dict[
             plain = re.sub(r"\W+", "_", _split(name)[0].strip().lower()).strip("_") or f"column_{i + 1}"
             chosen[plain if plain not in chosen else f"{plain}_{i + 1}"] = i
     if not chosen:
-        raise UsageError("the table has no column besides the time")
+        raise UsageError("the table has no column except the time")
     return chosen
 
 

@@ -30,7 +30,7 @@ def too_much(path: Path, packed_bytes: int) -> FileInvalid:
     """Return the error for a packed file that holds more than `most_unpacked` allows."""
     expected = f"at most {most_unpacked(packed_bytes)} bytes ({FREE_BYTES >> 20} MiB, or {MOST_TIMES} times its size)"
     hint = "if the file is yours, unpack it and give the unpacked file"
-    return FileInvalid("the packed file holds too much", path=str(path), expected=expected, hint=hint)
+    return FileInvalid("the unpacked file is too large", path=str(path), expected=expected, hint=hint)
 
 
 def unpacked(raw: io.BufferedReader, path: Path) -> BinaryIO | None:

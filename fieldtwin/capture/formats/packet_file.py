@@ -109,7 +109,7 @@ class PacketFile:
             raise self._invalid("the file header is cut off", expected="24 bytes")
         major, _, _, _, _, link = struct.unpack(f"{order}HHiIII", head)
         if major != 2:
-            raise self._invalid("another version of the format", expected="2", got=str(major), at=4)
+            raise self._invalid("a different version of the format", expected="2", got=str(major), at=4)
         link &= 0xFFFF  # above it: whether frames end with a check sum
         read, unpack = self._read, struct.Struct(f"{order}IIII").unpack
         while head := read(16):

@@ -329,7 +329,7 @@ def _outcome(exchange: Exchange | None) -> str:
     if exchange is None:
         return "not asked"
     if exchange.reply is None:
-        return {"timeout": "no reply", "crc": "a damaged reply", "desync": "an answer to something else"}.get(
+        return {"timeout": "no reply", "crc": "a damaged reply", "desync": "an answer to a different request"}.get(
             exchange.error or "", "the connection was lost"
         )
     if not exchange.reply:

@@ -118,7 +118,7 @@ def _text(unit: _Unit, unit_id: int, name: str, origin: str) -> str:
     plain = "".join(c if c.isalnum() or c == "-" else "-" for c in name.lower()).strip("-") or "device"
     functions = ", ".join(map(str, sorted(unit.functions)))
     lines = [
-        "# A draft, made from traffic: names, types over several registers, scales and units are still to be said.",
+        "# A draft, made from traffic: add names, types over several registers, scales and units.",
         f"# {unit.exchanges} exchanges, {unit.unanswered} without an answer.",
         f"device: draft/{plain}-unit-{unit_id}",
         f'source: "traffic: {origin}"'.replace("\\", "/"),

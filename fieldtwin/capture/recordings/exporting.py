@@ -90,7 +90,7 @@ def _work(path: Path, kind: str, profile: DeviceProfile | None, framing: str, ur
     if kind == ".pcap":
         return lambda out: _write_exchanges(path, header, out, framing)
     if kind == ".log":
-        raise UsageError("exchanges of Modbus are no CAN log", expected=".csv, .parquet or .pcap")
+        raise UsageError("Modbus exchanges cannot become a CAN log", expected=".csv, .parquet or .pcap")
     if profile is not None:
         tags = [t for t in profile.tags.values() if t.readable or t.writable]
         columns = [*_EXCHANGE_COLUMNS[:4], *(Column(t.name, str if t.is_text else float) for t in tags)]

@@ -134,7 +134,7 @@ class MbapPairer(Pairer):
     def lost(self, sent: bool) -> None:
         rest, self._rest[sent] = self._rest[sent], b""
         if rest:
-            self._bad(self._zero_ns, sent, rest, "a frame of which the capture lost a part")
+            self._bad(self._zero_ns, sent, rest, "a frame that is incomplete in the capture")
 
     def finish(self) -> list[Exchange]:
         for sent, rest in self._rest.items():
@@ -161,7 +161,7 @@ class MbapPairer(Pairer):
     def _reply(self, transaction: int, unit: int, pdu: bytes, t_ns: int, found: list[Exchange]) -> None:
         asked = self._open.get(transaction)
         if asked is None or transaction in self._done:
-            self._bad(t_ns, False, pdu, f"answers nothing (transaction {transaction}, unit {unit})", stray=True)
+            self._bad(t_ns, False, pdu, f"has no request (transaction {transaction}, unit {unit})", stray=True)
             return
         asked_ns, asked_unit, request = asked
         fits = unit == asked_unit and (pdu[0] ^ request[0]) & 0x7F == 0

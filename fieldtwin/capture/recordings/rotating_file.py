@@ -103,7 +103,7 @@ class RotatingFile:
                 done += os.write(self._fd, line[done:])
         except OSError as e:
             os.ftruncate(self._fd, self._size)
-            raise FileInvalid(f"cannot write on: {e.strerror}", path=str(self.parts[-1])) from e
+            raise FileInvalid(f"cannot continue writing: {e.strerror}", path=str(self.parts[-1])) from e
         self._size += len(line)
 
 

@@ -21,25 +21,33 @@ from fieldtwin.gateway.core.errors import UsageError
 F = TypeVar("F", bound=Callable[..., Any])
 
 _DEVICE = (
-    click.option("--unit", type=click.IntRange(0, 255), help="Modbus unit id; default: the profile's, else 1."),
-    click.option("--node", type=click.IntRange(1, 127), help="CANopen node id; default: the profile's, else 1."),
-    click.option("--profile", "profile_name", default="", metavar="NAME", help="A device profile: tags by name."),
+    click.option("--unit", type=click.IntRange(0, 255), help="Modbus unit ID; default: the profile's, else 1."),
+    click.option("--node", type=click.IntRange(1, 127), help="CANopen node ID; default: the profile's, else 1."),
     click.option(
-        "--eds", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="CANopen: its EDS or DCF."
+        "--profile", "profile_name", default="", metavar="NAME", help="A device profile, which defines tags by name."
     ),
-    click.option("--bitrate", type=click.IntRange(10_000, 1_000_000), help="CAN: bit/s; default: the bus's."),
-    click.option("--timeout", "timeout_s", type=Duration(), default="1s", show_default=True, help="For each reply."),
-    click.option("--echo", is_flag=True, help="Serial: what we send comes back first."),
     click.option(
-        "--log", type=click.Path(dir_okay=False, path_type=Path), help="Keep all that is sent and received here."
+        "--eds", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="CANopen: the device's EDS or DCF."
+    ),
+    click.option(
+        "--bitrate", type=click.IntRange(10_000, 1_000_000), help="CAN: bit rate in bit/s; default: the bus's."
+    ),
+    click.option(
+        "--timeout", "timeout_s", type=Duration(), default="1s", show_default=True, help="Timeout for each reply."
+    ),
+    click.option("--echo", is_flag=True, help="Serial: the adapter echoes the sent bytes."),
+    click.option(
+        "--log",
+        type=click.Path(dir_okay=False, path_type=Path),
+        help="Append all sent and received frames to this file.",
     ),
     profiles_option,
 )
 _RAW = (
-    click.option("--type", "kind", type=click.Choice(TYPES), help="Of raw addresses; default uint16, bool for bits."),
+    click.option("--type", "kind", type=click.Choice(TYPES), help="Type of raw addresses; default: uint16, for bits bool."),
     click.option("--order", type=click.Choice(ORDERS, case_sensitive=False), default="ABCD", show_default=True,
                  help="Byte order of raw values longer than a register."),
-    click.option("--count", type=click.IntRange(1, 2000), default=1, help="How many values from each raw address on."),
+    click.option("--count", type=click.IntRange(1, 2000), default=1, help="Number of values from each raw address on."),
     click.option("--registers", type=click.IntRange(1, 125), default=1, help="Length of a raw string or of bytes."),
 )  # fmt: skip
 

@@ -27,11 +27,20 @@ DIFFERENT = 1
 @click.argument("left", type=click.Path(dir_okay=False, path_type=Path), metavar="DUMP")
 @click.argument("right", metavar="DUMP|PROFILE|EDS")
 @click.option(
-    "--profile", "profile_name", default="", metavar="NAME", help="Names for two dumps; default: the dump's own."
+    "--profile",
+    "profile_name",
+    default="",
+    metavar="NAME",
+    help="Profile with the names for two dumps; default: the dump's.",
 )
 @click.option("--ignore", multiple=True, metavar="PATTERN", help="Tags or addresses to leave out, e.g. 'energy_*'.")
-@click.option("--tolerance", multiple=True, metavar="NAME=NUMBER", help="Nearer is the same; NAME * for all others.")
-@click.option("--settings", is_flag=True, help="Two dumps: only what can be written.")
+@click.option(
+    "--tolerance",
+    multiple=True,
+    metavar="NAME=NUMBER",
+    help="Smaller differences count as equal; NAME * sets all other tags.",
+)
+@click.option("--settings", is_flag=True, help="With two dumps: only writable values.")
 @profiles_option
 @json_option
 def command(
@@ -44,7 +53,7 @@ def command(
     profiles: tuple[str, ...],
     as_json: bool,
 ) -> int:
-    """Show what differs between a DUMP and another, or between a DUMP and a PROFILE or EDS. Exit code 1 if something does.
+    """Compare a DUMP with another dump, a PROFILE or an EDS. Exit code 1 if they differ.
 
     \b
     fieldtwin diff before.jsonl after.jsonl --settings

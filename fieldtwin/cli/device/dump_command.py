@@ -31,24 +31,36 @@ from fieldtwin.gateway.wallclock import run as run_precise
 @click.option(
     "-o", "--out", type=click.Path(dir_okay=False, path_type=Path), help="The dump; default dump-ADDRESS.jsonl."
 )
-@click.option("--resume", is_flag=True, help="Go on with the file that is there.")
+@click.option("--resume", is_flag=True, help="Continue the existing file.")
 @click.option(
-    "--passes", type=click.IntRange(1, 100_000), default=1, show_default=True, help="Times through, for `infer`."
+    "--passes", type=click.IntRange(1, 100_000), default=1, show_default=True, help="Number of passes, for `infer`."
 )
-@click.option("--every", "every_s", type=Duration(), default="10s", show_default=True, help="From pass to pass.")
+@click.option("--every", "every_s", type=Duration(), default="10s", show_default=True, help="Time from pass to pass.")
 @click.option(
-    "--rate", type=click.FloatRange(0, 1000), default=50, show_default=True, help="Requests a second; 0: any."
+    "--rate",
+    type=click.FloatRange(0, 1000),
+    default=50,
+    show_default=True,
+    help="Maximum requests per second; 0: no limit.",
 )
-@click.option("--thorough", is_flag=True, help="Ask every address; else in a void every eighth, and round numbers.")
+@click.option(
+    "--thorough",
+    is_flag=True,
+    help="Read every address; by default only every eighth one, and round numbers, in unreadable ranges.",
+)
 @click.option(
     "--budget", "budget_s", type=Duration(), default=f"{DEFAULT_BUDGET_S / 60:g}m", show_default=True,
-    help="Time for each table to look where nothing was read: beyond silence, and with other read lengths.",
+    help="Time for each table to search unreadable ranges: after silence, and with different read lengths.",
 )  # fmt: skip
-@click.option("--longest", type=click.IntRange(1, 2000), help="Values in a read; default: as many as the device takes.")
-@click.option("--pairs", is_flag=True, help="The device knows pairs of registers only.")
-@click.option("--retries", type=click.IntRange(0, 10), default=2, show_default=True, help="After no good reply.")
-@click.option("--no-functions", is_flag=True, help="Do not ask for functions 07h, 08h, 0Bh, 0Ch, 11h, 2Bh.")
-@click.option("--dry-run", is_flag=True, help="Print the frames of a device that refuses nothing, and send nothing.")
+@click.option(
+    "--longest", type=click.IntRange(1, 2000), help="Values per read; default: as many as the device accepts."
+)
+@click.option("--pairs", is_flag=True, help="The device supports only pairs of registers.")
+@click.option(
+    "--retries", type=click.IntRange(0, 10), default=2, show_default=True, help="Repetitions without a valid reply."
+)
+@click.option("--no-functions", is_flag=True, help="Do not test functions 07h, 08h, 0Bh, 0Ch, 11h, 2Bh.")
+@click.option("--dry-run", is_flag=True, help="Print the frames for a device that refuses nothing; send nothing.")
 @json_option
 def command(
     endpoint: str,
@@ -69,15 +81,17 @@ def command(
     log: Path | None,
     **options: Any,
 ) -> int:
-    """Dump the device at ENDPOINT: values, holes, longest read, latency, functions. It only reads.
+    """Dump the device at ENDPOINT: values, unreadable ranges, longest read, latency, supported functions. It sends only reads.
 
-    RANGEs are holding, holding:0..999 or 40001..40100, and 6000..6FFF on a CAN bus; without any, what the profile or EDS names,
-    else everything. All that is sent is logged in a file next to the dump. Exit code 4 if most of the ranges is still unknown at
-    the end: no reply, no valid reply, or not asked.
+    RANGEs are holding, holding:0..999 or 40001..40100, and 6000..6FFF on a CAN bus. The default is all tags of the profile or
+    EDS, else everything. A log of all sent frames is written next to the dump.
+
+    Exit code 4 if most of the ranges is still unknown at the end: no reply, no valid reply, or not asked.
 
     \b
     fieldtwin dump tcp://192.168.0.7 -o meter.jsonl
-    fieldtwin dump 'rtu:/dev/ttyUSB0?baudrate=9600&frame=8N1' holding:0..999 --passes 20 --every 15s
+    fieldtwin dump 'rtu:/dev/ttyUSB0?baudrate=9600&frame=8N1' \\
+        holding:0..999 --passes 20 --every 15s
     fieldtwin dump can:socketcan/can0 --node 5 --eds drive.eds
     """
     target = target_from(endpoint, options)
@@ -111,7 +125,7 @@ def command(
                 dump(job, out, words=words(), resume=resume, retries=retries, spacing_s=spacing_s, progress=progress)
             )
     except KeyboardInterrupt:
-        talk.print(f"stopped; what was answered is in {out}, and --resume goes on", soft_wrap=True)
+        talk.print(f"stopped; the values read so far are in {out}, and --resume continues", soft_wrap=True)
         raise
     found = load_dump(out)
     if as_json:

@@ -32,7 +32,7 @@ def estimate_text(estimate: Estimate, passes: int, rate: float) -> str:
     text += f" at {rate:g} a second at most" if rate else ""
     text += f"; then {passes - 1} more passes" if passes > 1 else ""
     if estimate.budgets_s:
-        text += f"; up to {_time(estimate.budgets_s)} more where the device gives nothing (--budget)"
+        text += f"; up to {_time(estimate.budgets_s)} more in unreadable ranges (--budget)"
     return text + ". Ctrl-C stops; --resume continues"
 
 
@@ -60,8 +60,8 @@ def notes(dump: Dump) -> list[str]:
     if gaps:
         lines.append("for a profile:  gaps: [" + ", ".join(f'"{g}"' for g in gaps) + "]")
     if (same := mirrored(dump)) is not None:
-        lines.append(f"holding and input registers are the same at all {same} addresses that both have")
-    lines += [f"{m['map']}: not everything was asked: {m['stopped']}" for m in dump.maps.values() if m.get("stopped")]
+        lines.append(f"holding and input registers are equal at all {same} common addresses")
+    lines += [f"{m['map']}: not every address was read: {m['stopped']}" for m in dump.maps.values() if m.get("stopped")]
     lines += [text for m in dump.maps.values() if (text := _lengths_text(m))]
     if dump.unknown[0]:
         lines.append(unknown_text(dump))
@@ -72,7 +72,7 @@ def notes(dump: Dump) -> list[str]:
             f"{len(dump.passes)} passes; {changed} of {len(last.cells)} values differ from the first to the last"
         )
         lines += [
-            f"pass {n + 1}: {p.failed} reads brought no values" for n, p in enumerate(dump.passes) if n and p.failed
+            f"pass {n + 1}: {p.failed} reads returned no values" for n, p in enumerate(dump.passes) if n and p.failed
         ]
     return lines
 
@@ -94,7 +94,7 @@ def _lengths_text(line: dict[str, Any]) -> str:
     if not missing:
         return ""
     texts = " and ".join("single registers" if n == 1 else "pairs" for n in missing)
-    return f"{line['map']}: {texts} were not asked for everywhere: blocks that can be read only so may be missing"
+    return f"{line['map']}: {texts} were not asked for everywhere: blocks that accept only these lengths may be missing"
 
 
 def _objects(dump: Dump) -> str:
@@ -193,7 +193,7 @@ def _table_access(line: dict[str, Any]) -> str:
         return "answers"
     if line["codes"]:
         code = max(line["codes"], key=lambda c: line["codes"][c])
-        return f"refused with {code}h wherever it was answered"
+        return f"every answer was refusal {code}h"
     if line["invalid"]:
         return "no valid reply"
     return "no reply" if line["silent"] or line["sampled"] else "not asked"

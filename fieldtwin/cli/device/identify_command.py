@@ -36,22 +36,24 @@ UNREACHABLE = 4
 
 @click.command("identify")
 @click.argument("endpoint")
-@click.option("--unit", type=click.IntRange(0, 255), help="Modbus unit id; default 1.")
-@click.option("--node", type=click.IntRange(1, 127), help="CANopen node id; default 1.")
-@click.option("--bitrate", type=click.IntRange(10_000, 1_000_000), help="CAN: bit/s; default: the bus's.")
+@click.option("--unit", type=click.IntRange(0, 255), help="Modbus unit ID; default 1.")
+@click.option("--node", type=click.IntRange(1, 127), help="CANopen node ID; default 1.")
+@click.option("--bitrate", type=click.IntRange(10_000, 1_000_000), help="CAN: bit rate in bit/s; default: the bus's.")
 @click.option(
     "--timeout",
     "timeout_s",
     type=Duration(),
     default="1s",
     show_default=True,
-    help="For each reply. Some devices take longer than 500 ms to refuse a request.",
+    help="Timeout for each reply. Some devices need more than 500 ms to refuse a request.",
 )
-@click.option("--rate", "per_s", type=click.FloatRange(0.1, 1000), default=20.0, help="Requests a second, at most.")
-@click.option("--echo", is_flag=True, help="Serial: what we send comes back first.")
-@click.option("--dry-run", is_flag=True, help="Print the first frames that would be sent, and open nothing.")
-@click.option("--all", "show_all", is_flag=True, help="Show the profiles that were ruled out, and why, as well.")
-@click.option("--log", type=click.Path(dir_okay=False, path_type=Path), help="Keep all that is sent and received here.")
+@click.option("--rate", "per_s", type=click.FloatRange(0.1, 1000), default=20.0, help="Maximum requests per second.")
+@click.option("--echo", is_flag=True, help="Serial: the adapter echoes the sent bytes.")
+@click.option("--dry-run", is_flag=True, help="Print the first frames that would be sent; open nothing.")
+@click.option("--all", "show_all", is_flag=True, help="Also show the profiles that were ruled out, with the reason.")
+@click.option(
+    "--log", type=click.Path(dir_okay=False, path_type=Path), help="Append all sent and received frames to this file."
+)
 @profiles_option
 @json_option
 def command(
@@ -68,10 +70,12 @@ def command(
     profiles: tuple[str, ...],
     as_json: bool,
 ) -> int:
-    """Ask one device at ENDPOINT what it is, and say which profile fits, how surely, and why. Only reads.
+    """Read the identification of one device at ENDPOINT, and show which profile fits, with confidence and reasons. It sends
+    only reads.
 
-    Modbus: 2Bh/0Eh, 11h, the SunSpec header, then the registers of each profile. CANopen: 1000h, 1008h, 1009h, 100Ah, 1018h.
-    Certain is only what the device itself says. Exit code 1: no profile fits; 4: it does not answer.
+    Modbus: functions 2Bh/0Eh and 11h, the SunSpec header, then the registers of each profile. CANopen: objects 1000h, 1008h,
+    1009h, 100Ah, 1018h. Only the device's own identification is certain; register values are not. Exit code 1: no profile
+    fits; 4: the device does not answer.
     """
     can = Endpoint.parse(endpoint).is_can
     if (unit if can else node) is not None:
@@ -165,7 +169,7 @@ def _show(result: ModbusIdentity | CanIdentity, show_all: bool) -> None:
             _show_candidate(candidate)
     hidden = sum(1 for c in result.candidates if c.sureness is Sureness.RULED_OUT)
     if hidden and not show_all:
-        talk.print(f"{hidden} other profiles ruled out (--all says why)")
+        talk.print(f"{hidden} other profiles ruled out (--all shows the reasons)")
     data.print(Text(result.summary, "bold"), soft_wrap=True)
 
 

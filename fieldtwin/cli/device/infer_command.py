@@ -29,29 +29,28 @@ COLOUR = {Level.CERTAIN: "green", Level.LIKELY: "", Level.GUESS: "yellow", Level
 @click.argument("dumps", nargs=-1, required=True, type=click.Path(dir_okay=False, path_type=Path), metavar="DUMP...")
 @click.option("-o", "--out", type=click.Path(dir_okay=False, path_type=Path), help="Write a draft profile here.")
 @click.option("--name", default="", help="The draft's name; default: the unit.")
-@click.option("--unit", type=click.IntRange(0, 255), help="Of a recording with several units: this one.")
-@click.option("--all", "everything", is_flag=True, help="Show registers that were always 0, too.")
+@click.option("--unit", type=click.IntRange(0, 255), help="The unit of a recording with several units.")
+@click.option("--all", "everything", is_flag=True, help="Also show registers that were always 0.")
 @json_option
 def command(
     dumps: tuple[Path, ...], out: Path | None, name: str, unit: int | None, everything: bool, as_json: bool
 ) -> int:
-    """Find out types, orders, scales, counters, states and times from DUMPs of one unit, taken over time.
+    """Infer types, byte orders, scales, counters, states and times of registers from DUMPs of one unit, taken over time.
 
-    A DUMP may also be a recording: of `fieldtwin record`, also with --sniff or --tap, or of `fieldtwin import`.
-
-    The more passes, and the more the values moved meanwhile, the surer: `fieldtwin dump --passes 20 --every 15s`.
+    A DUMP may also be a recording of `fieldtwin record` (also with --sniff or --tap) or of `fieldtwin import`. More passes,
+    and larger changes of the values between them, give more certain results: `fieldtwin dump --passes 20 --every 15s`.
 
     \b
     fieldtwin infer meter.jsonl -o meter.yaml
     fieldtwin emulate ./meter.yaml --on tcp://127.0.0.1:1502
     """
     if out is not None and out.exists():
-        raise FileInvalid("there is such a file already", path=str(out))
+        raise FileInvalid("the file already exists", path=str(out))
     loaded = [_load(path, unit) for path in dumps]
     inference = infer(series_of(loaded))
     if inference.series.passes < FEWEST_PASSES:
         talk.print(
-            f"{inference.series.passes} passes: nothing is certain below {FEWEST_PASSES}; `dump --passes 20` makes more",
+            f"{inference.series.passes} passes: results are uncertain below {FEWEST_PASSES}; use `dump --passes 20`",
             soft_wrap=True,
         )
     draft = draft_profile(inference, loaded, name)

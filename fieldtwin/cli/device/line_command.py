@@ -28,19 +28,27 @@ from fieldtwin.gateway.wallclock import run as run_precise
     "probe_unit",
     type=click.IntRange(1, 247),
     metavar="UNIT",
-    help="Serial: send one read to UNIT, to see an echo and an answer.",
+    help="Serial: send one read to UNIT, to detect an echo and an answer.",
 )
-@click.option("--share-bus", is_flag=True, help="Send that read although somebody talks on the line.")
+@click.option("--share-bus", is_flag=True, help="Send the probe although the line carries traffic.")
 @click.option(
-    "--timeout", "timeout_s", type=Duration(), default="500ms", show_default=True, help="For the probe's answer."
+    "--timeout",
+    "timeout_s",
+    type=Duration(),
+    default="500ms",
+    show_default=True,
+    help="Timeout for the probe's answer.",
 )
-@click.option("--bitrate", type=click.IntRange(10_000, 1_000_000), help="CAN: bit/s that the bus should have.")
-@click.option("--log", type=click.Path(dir_okay=False, path_type=Path), help="Keep all that is sent and received here.")
+@click.option("--bitrate", type=click.IntRange(10_000, 1_000_000), help="CAN: expected bit rate of the bus, in bit/s.")
+@click.option(
+    "--log", type=click.Path(dir_okay=False, path_type=Path), help="Append all sent and received frames to this file."
+)
 @json_option
 def command(endpoint: str, log: Path | None, as_json: bool, **options: Any) -> int:  # fmt: skip
-    """Look at the wire at ENDPOINT and send nothing: traffic, what the port counts, and what may be wrong, likely first.
+    """Examine the serial line or bus at ENDPOINT without sending: traffic, the port's error counters, and possible faults, the
+    most likely first.
 
-    Settings that ENDPOINT leaves open are found from traffic where there is any. Exit code 1: something looks wrong.
+    Settings that ENDPOINT leaves open are found from the traffic, if there is any. Exit code 1: there is a sign of a fault.
     """
     report = run_precise(_look(endpoint, log, LineLook(**options | {"bitrate": options["bitrate"] or 0})))
     if as_json:
@@ -63,10 +71,10 @@ def _show(report: LineReport) -> None:
         table.add_row(name, Text(text))
     data.print(table)
     if not report.causes:
-        data.print(Text("nothing speaks for a fault", "green"))
+        data.print(Text("no sign of a fault", "green"))
         return
     data.print()
-    causes = Table(box=None, pad_edge=False, header_style="bold", title="what may be the cause, likely first",
+    causes = Table(box=None, pad_edge=False, header_style="bold", title="possible causes, the most likely first",
                    title_justify="left", title_style="bold")  # fmt: skip
     for name in ("cause", "because", "try"):
         causes.add_column(name, overflow="fold")

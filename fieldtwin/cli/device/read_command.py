@@ -25,20 +25,22 @@ from fieldtwin.gateway.wallclock import run as run_precise
 @click.argument("items", nargs=-1, metavar="[ITEM]...")
 @device_options
 @raw_options
-@click.option("--dry-run", is_flag=True, help="Print the frames that would be sent, and send nothing.")
+@click.option("--dry-run", is_flag=True, help="Print the frames that would be sent; send nothing.")
 @json_option
 def command(
     endpoint: str, items: tuple[str, ...], log: Path | None, dry_run: bool, as_json: bool, **options: Any
 ) -> int:
-    """Read ITEMs of the device at ENDPOINT: tags of a profile, or addresses; without any, the whole profile.
+    """Read ITEMs of the device at ENDPOINT: tags of a profile, or addresses; by default all tags of the profile.
 
-    An item that cannot be read has its reason in its place; the others are read all the same. Exit code: 0 if every value
-    came, 4 if the wire lost one, else 5 if the device refused one.
+    If an item cannot be read, the table shows the reason, and the other items are read all the same. Exit code: 0 if every
+    item was read, 4 if a reply was lost, else 5 if the device refused an item.
 
     \b
     fieldtwin read tcp://192.168.0.7 holding:100 --count 4
-    fieldtwin read 'rtu:/dev/ttyUSB0?baudrate=9600&frame=8N1' 40101 --type float32 --order CDAB
-    fieldtwin read rtu:/dev/ttyUSB0 --profile eastron-sdm630 'voltage_*' frequency
+    fieldtwin read 'rtu:/dev/ttyUSB0?baudrate=9600&frame=8N1' \\
+        40101 --type float32 --order CDAB
+    fieldtwin read rtu:/dev/ttyUSB0 --profile eastron-sdm630 \\
+        'voltage_*' frequency
     fieldtwin read can:socketcan/can0 --node 5 6041h:00 1018h:01 --count 4
     """
     target = target_from(endpoint, options)

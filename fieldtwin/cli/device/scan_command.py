@@ -31,32 +31,42 @@ _PART = re.compile(r"^([0-9]{1,3})(?:-([0-9]{1,3}))?$")
 
 @click.command("scan")
 @click.argument("endpoint")
-@click.option("--units", metavar="LIST", help="Modbus units, such as 1-20,247; default 1 to 247, on TCP 0 and 255 too.")
-@click.option("--nodes", metavar="LIST", help="CANopen nodes; default 1 to 127.")
+@click.option(
+    "--units", metavar="LIST", help="Modbus unit IDs, such as 1-20,247; default 1 to 247, on TCP also 0 and 255."
+)
+@click.option("--nodes", metavar="LIST", help="CANopen node IDs; default 1 to 127.")
 @click.option("--listen", "listen_only", is_flag=True, help="Only listen: send nothing.")
 @click.option("--listen-for", type=Duration(), help="How long to listen first; default 3s, on CAN 5s.")
-@click.option("--share-bus", is_flag=True, help="Ask although somebody talks on the wire: between its exchanges.")
-@click.option("--timeout", "timeout_s", type=Duration(), help="For each reply; default 600ms, TCP 1s, CAN 100ms.")
+@click.option("--share-bus", is_flag=True, help="Send although the bus carries traffic: between its exchanges.")
 @click.option(
-    "--rate", "per_s", type=click.FloatRange(0.1, 1000), help="Questions a second, at most; default 20, CAN 10."
+    "--timeout", "timeout_s", type=Duration(), help="Timeout for each reply; default 600ms, TCP 1s, CAN 100ms."
+)
+@click.option(
+    "--rate", "per_s", type=click.FloatRange(0.1, 1000), help="Maximum requests per second; default 20, CAN 10."
 )
 @click.option("--quick", is_flag=True, help="Modbus: only the likely settings and units (30 s).")
-@click.option("--all", "every_setting", is_flag=True, help="Modbus: go on over all settings though units were found.")
-@click.option("--bitrate", type=click.IntRange(10_000, 1_000_000), help="CAN: bit/s that the bus should have.")
-@click.option("--no-lss", is_flag=True, help="CAN: do not look for nodes without a node id.")
-@click.option("--log", type=click.Path(dir_okay=False, path_type=Path), help="Keep all that is sent and received here.")
-@click.option("--dry-run", is_flag=True, help="Print what would be asked, with its time, and open nothing.")
+@click.option("--all", "every_setting", is_flag=True, help="Modbus: try all settings, even after units were found.")
+@click.option("--bitrate", type=click.IntRange(10_000, 1_000_000), help="CAN: expected bit rate of the bus, in bit/s.")
+@click.option("--no-lss", is_flag=True, help="CAN: do not search for nodes without a node ID.")
+@click.option(
+    "--log", type=click.Path(dir_okay=False, path_type=Path), help="Append all sent and received frames to this file."
+)
+@click.option("--dry-run", is_flag=True, help="Print the requests and their duration; open nothing.")
 @json_option
 def command(endpoint: str, log: Path | None, dry_run: bool, as_json: bool, **options: Any) -> int:
-    """Find the units or nodes at ENDPOINT: listen first, then ask, paced.
+    """Find the units or nodes at ENDPOINT: listen first, then ask at a limited rate.
 
     \b
-    fieldtwin scan rtu:/dev/ttyUSB0                      likely settings, then all
-    fieldtwin scan 'rtu:COM5?baudrate=9600&frame=8N1'    every unit at these
-    fieldtwin scan tcp://192.168.0.7                     every unit id of a host
-    fieldtwin scan can:socketcan/can0                    heartbeats, 1000h, LSS
+    Serial line: the likely settings first, then all:
+      fieldtwin scan rtu:/dev/ttyUSB0
+    Serial line: every unit with these settings:
+      fieldtwin scan 'rtu:COM5?baudrate=9600&frame=8N1'
+    Every unit ID of a host:
+      fieldtwin scan tcp://192.168.0.7
+    CAN: heartbeats, object 1000h, LSS:
+      fieldtwin scan can:socketcan/can0
 
-    q or Ctrl-C stops and keeps what was found. Exit code 1: nobody was found.
+    q or Ctrl-C stops the scan and keeps its results. Exit code 1: no device was found.
     """
     can = Endpoint.parse(endpoint).is_can
     _refuse_foreign(can, options)
@@ -98,7 +108,7 @@ def _plan_of_modbus(endpoint: str, options: dict[str, Any]) -> Iterator[str]:
     """Return the phases, settings and frames for `--dry-run`."""
     made = _modbus_options(options)
     if Endpoint.parse(endpoint).is_serial:
-        yield f"listen for {duration(made.listen_s)}; with traffic heard nothing is sent" + (
+        yield f"listen for {duration(made.listen_s)}; if there is traffic, nothing is sent" + (
             ", but between its exchanges" if made.share_bus else " without --share-bus"
         )
     for phase, steps in ModbusScanner(endpoint, made).planned() if not made.listen_only else ():
@@ -112,7 +122,7 @@ def _plan_of_modbus(endpoint: str, options: dict[str, Any]) -> Iterator[str]:
 
 def _plan_of_can(options: dict[str, Any]) -> Iterator[str]:
     made = _can_options(options)
-    yield f"listen for {duration(made.listen_s)}; with traffic heard nothing is sent" + (
+    yield f"listen for {duration(made.listen_s)}; if there is traffic, nothing is sent" + (
         "" if made.share_bus else " without --share-bus"
     )
     if not made.listen_only:
@@ -120,7 +130,7 @@ def _plan_of_can(options: dict[str, Any]) -> Iterator[str]:
         yield f"1000h of {len(made.nodes)} nodes: up to {duration(len(made.nodes) * each_s)}"
         yield f"  {0x600 + made.nodes[0]:03X}#4000100000000000 ... {0x600 + made.nodes[-1]:03X}#4000100000000000"
         if made.lss:
-            yield "nodes without an id: 7E5#4C00000000000000, then LSS fastscan, 14 s for each that is there"
+            yield "nodes without a node ID: 7E5#4C00000000000000, then LSS fastscan, 14 s for each one found"
 
 
 async def _scan_modbus(endpoint: str, log: Path | None, options: dict[str, Any]) -> ModbusScan:

@@ -18,7 +18,7 @@ class ScanProgress:
     """``with ScanProgress(stoppable) as show:``; call it with each `Progress`."""
 
     def __init__(self, stoppable: bool) -> None:
-        self._hint = "q stops and keeps what was found" if stoppable else "Ctrl-C stops and keeps what was found"
+        self._hint = "q stops and keeps the results" if stoppable else "Ctrl-C stops and keeps the results"
         self._live = Live(console=talk, transient=True, auto_refresh=False) if talk.is_terminal else None
         self._phase = ""
         self._shown = -1.0

@@ -39,7 +39,7 @@ def show_modbus(scan: ModbusScan) -> None:
             )
     for unit in sorted(set(heard.live if heard is not None else []) - {f.answer.unit for f in scan.units}):
         at = name_of(scan.verdict.settings) if scan.verdict is not None else ""
-        table.add_row(str(unit), at, Text("answers another master", "dim"), "")
+        table.add_row(str(unit), at, Text("answers another client", "dim"), "")
     if table.row_count:
         data.print(table)
     for odd in scan.damaged:
@@ -48,14 +48,14 @@ def show_modbus(scan: ModbusScan) -> None:
         who = f"unit {odd.units[0]}" if count == 1 else f"{count} units ({unit_ranges(odd.units)})"
         talk.print(f"{who}{at}: {odd.advice}", soft_wrap=True, markup=False)
     if heard is not None and heard.silent:
-        talk.print(f"asked by another master, and silent: {unit_ranges(sorted(heard.silent))}", soft_wrap=True)
+        talk.print(f"polled by another client, and silent: {unit_ranges(sorted(heard.silent))}", soft_wrap=True)
     if scan.behind_gateway:
-        talk.print(f"a gateway says of {len(scan.behind_gateway)} units that they do not answer (exceptions 0A, 0B)")
+        talk.print(f"a gateway reports that {len(scan.behind_gateway)} units do not answer (exceptions 0A, 0B)")
     if scan.alike is not None:
-        words = "one device, whatever unit it is asked as" if scan.alike.one_device else "perhaps one device"
+        words = "one device that answers to every unit ID" if scan.alike.one_device else "perhaps one device"
         talk.print(f"{words}: {scan.alike.why}", soft_wrap=True, markup=False)
     if scan.echo:
-        talk.print("this line echoes what is sent: use --echo with the other verbs")
+        talk.print("this line echoes sent bytes: use --echo with the other commands")
     _end(scan.notes, scan.asked, "question", bool(table.row_count))
 
 
@@ -142,14 +142,14 @@ def show_can(scan: CanScan) -> None:
     if table.row_count:
         data.print(table)
     for address in scan.unconfigured:
-        data.print(f"without a node id: vendor/product/revision/serial {address} (LSS)", markup=False, soft_wrap=True)
+        data.print(f"without a node ID: vendor/product/revision/serial {address} (LSS)", markup=False, soft_wrap=True)
     likely = sorted(n for n, h in heard.nodes.items() if not h.certain)
     if likely:
         names = ", ".join(map(str, likely))
-        talk.print(f"by their PDO identifiers alone, which may be others': nodes {names}", soft_wrap=True)
+        talk.print(f"seen only by PDO identifiers, which may belong to other nodes: nodes {names}", soft_wrap=True)
     if scan.blocked:
         names = ", ".join(map(str, scan.blocked))
-        talk.print(f"not asked, another master speaks SDO: nodes {names}", soft_wrap=True)
+        talk.print(f"not asked, because another master uses SDO: nodes {names}", soft_wrap=True)
     for number, why in sorted(scan.conflicts.items()):
         talk.print(f"node {number}: {why}", soft_wrap=True, markup=False)
     _end(scan.notes, scan.asked, "node", bool(table.row_count or scan.unconfigured))
@@ -198,7 +198,7 @@ def _end(notes: list[str], asked: int, what: str, found: bool) -> None:
     for note in notes:
         talk.print(note, soft_wrap=True, markup=False)
     sent = f"{asked} {what}{'s' * (asked != 1)} asked" if asked else "nothing was sent"
-    talk.print(sent if found else f"nobody was found; {sent}")
+    talk.print(sent if found else f"no device was found; {sent}")
 
 
 def _table(*columns: str) -> Table:

@@ -38,11 +38,13 @@ LEAST_EVERY_S = 0.02
 @click.argument("items", nargs=-1, metavar="[ITEM]...")
 @device_options
 @raw_options
-@click.option("--every", "every_s", type=Duration(), default="1s", show_default=True, help="From sample to sample.")
-@click.option("--samples", "most", type=click.IntRange(1), help="Stop after so many; default: Ctrl-C.")
+@click.option("--every", "every_s", type=Duration(), default="1s", show_default=True, help="Sample interval.")
+@click.option("--samples", "most", type=click.IntRange(1), help="Number of samples; default: until Ctrl-C.")
 @click.option("--for", "for_s", type=Duration(), help="Stop after this time.")
-@click.option("--plot", "plot_path", type=click.Path(dir_okay=False, path_type=Path), help="A picture at the end.")
-@click.option("--dry-run", is_flag=True, help="Print the frames of one sample, and send nothing.")
+@click.option(
+    "--plot", "plot_path", type=click.Path(dir_okay=False, path_type=Path), help="Write a plot to this file at the end."
+)
+@click.option("--dry-run", is_flag=True, help="Print the frames of one sample; send nothing.")
 @json_option
 def command(
     endpoint: str,
@@ -56,12 +58,15 @@ def command(
     as_json: bool,
     **options: Any,
 ) -> int:
-    """Read ITEMs of the device at ENDPOINT again and again, as a table with sparklines; --json: a line for each sample.
+    """Read ITEMs of the device at ENDPOINT periodically, and show a table with sparklines; with --json, one line per sample.
 
     \b
-    fieldtwin watch rtu:/dev/ttyUSB0 --profile eastron-sdm630 'voltage_*' frequency
-    fieldtwin watch tcp://192.168.0.7 holding:100 --type float32 --every 200ms --for 1m --plot pump.png
-    fieldtwin watch can:socketcan/can0 --node 5 --profile drive-cia402 statusword position --json
+    fieldtwin watch rtu:/dev/ttyUSB0 --profile eastron-sdm630 \\
+        'voltage_*' frequency
+    fieldtwin watch tcp://192.168.0.7 holding:100 --type float32 \\
+        --every 200ms --for 1m --plot pump.png
+    fieldtwin watch can:socketcan/can0 --node 5 --profile drive-cia402 \\
+        statusword position --json
     """
     target = target_from(endpoint, options)
     tags = tags_of(items, target.protocol, raw_form(options), target.profile, target.dictionary)
@@ -69,7 +74,9 @@ def command(
     if unreadable:
         raise NotAllowed(f"cannot be read: {', '.join(unreadable)}", hint="the profile says `access: wo`")
     if every_s < LEAST_EVERY_S:
-        raise UsageError("too fast for a field bus", expected=f"--every {LEAST_EVERY_S * 1000:g}ms at least")
+        raise UsageError(
+            "the interval is too short for a field bus", expected=f"--every {LEAST_EVERY_S * 1000:g}ms at least"
+        )
     if dry_run:
         for frame in dry_point(target).read_frames(tags):
             click.echo(frame)
@@ -85,7 +92,9 @@ def command(
         watch.close()
     if plot_path is not None and watch.count:
         panels = plot(plot_path, target.url, tags, watch.histories)
-        talk.print(f"{panels} curves: {plot_path}" if panels else "no numbers, no picture", soft_wrap=True)
+        talk.print(
+            f"{panels} curves: {plot_path}" if panels else "no numeric values, so there is no plot", soft_wrap=True
+        )
     return watch.exit_code
 
 
@@ -168,7 +177,7 @@ class _Watch:
 
     def _caption(self, sample: Sample) -> Text:
         hidden = len(self._tags) - max(3, data.height - 4)
-        more = f", {hidden} more below the edge" if hidden > 0 else ""
+        more = f", {hidden} more rows do not fit" if hidden > 0 else ""
         late = f", {sample.late_s:.1f} s late" if sample.late_s > 0.1 else ""
         return Text(f"{self._target.url}: sample {sample.number}, {sample.t_s:.1f} s{late}{more}. Ctrl-C stops", "dim")
 

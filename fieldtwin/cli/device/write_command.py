@@ -35,17 +35,26 @@ RESTART_COMMUNICATIONS = 1
 @device_options
 @raw_options
 @click.option(
-    "--behaviour", "behaviours", multiple=True, metavar="NAME", help="The writes that the profile has under a name."
+    "--behaviour",
+    "behaviours",
+    multiple=True,
+    metavar="NAME",
+    help="Make the named writes of the profile (`behaviours`).",
 )
 @click.option("--yes", is_flag=True, help="Do not ask.")
-@click.option("--restore", is_flag=True, help="Put the old values back afterwards.")
-@click.option("--hold", "hold_s", type=Duration(), default="0s", help="With --restore: how long the new values stay.")
-@click.option("--blind", is_flag=True, help="Write even where the old value cannot be read.")
+@click.option("--restore", is_flag=True, help="Restore the old values afterwards.")
 @click.option(
-    "--i-know", is_flag=True, help="Leave for what hits more than this value: unit 0, `danger` tags, restarts."
+    "--hold", "hold_s", type=Duration(), default="0s", help="With --restore: time before the old values are restored."
 )
-@click.option("--restart-communications", "restart", is_flag=True, help="Modbus: function 08h/01h instead of a value.")
-@click.option("--dry-run", is_flag=True, help="Print the frames that would be sent, and send nothing.")
+@click.option("--blind", is_flag=True, help="Write even if the old value cannot be read.")
+@click.option("--i-know", is_flag=True, help="Permit writes with wider effects: unit 0, `danger` tags, restarts.")
+@click.option(
+    "--restart-communications",
+    "restart",
+    is_flag=True,
+    help="Modbus: send function 08h/01h (restart) instead of a value.",
+)
+@click.option("--dry-run", is_flag=True, help="Print the frames that would be sent; send nothing.")
 @json_option
 def command(
     endpoint: str,
@@ -62,15 +71,19 @@ def command(
     as_json: bool,
     **options: Any,
 ) -> int:
-    """Write ITEMs of the device at ENDPOINT: read, ask, write once, read back, compare.
+    """Write ITEMs of the device at ENDPOINT: read, ask for confirmation, write once, read back, compare.
 
-    VALUE is a number, the name that the profile has for one, on/off, or hex:BYTES. Ctrl-C during --hold restores.
+    VALUE is a number, a name that the profile defines for a number, on/off, or hex:BYTES. Ctrl-C during --hold restores the
+    old values.
 
     \b
     fieldtwin write tcp://192.168.0.7 holding:100=42
-    fieldtwin write rtu:/dev/ttyUSB0 --profile eastron-sdm630 demand_period=15 --yes
-    fieldtwin write can:socketcan/can0 --node 5 6060h:00=1 --type int8 --restore --hold 10s
-    fieldtwin write can:socketcan/can0 --node 5 --profile drive-cia402 --behaviour quick_stop
+    fieldtwin write rtu:/dev/ttyUSB0 --profile eastron-sdm630 \\
+        demand_period=15 --yes
+    fieldtwin write can:socketcan/can0 --node 5 6060h:00=1 --type int8 \\
+        --restore --hold 10s
+    fieldtwin write can:socketcan/can0 --node 5 --profile drive-cia402 \\
+        --behaviour quick_stop
     """
     target = target_from(endpoint, options)
     items = (*(item for name in behaviours for item in of_behaviour(name, target.profile)), *items)
@@ -85,7 +98,7 @@ def command(
                 click.echo(frame)
         return 0
     if not yes and not sys.stdin.isatty():
-        raise NotAllowed("nobody to ask whether to write", expected="--yes")
+        raise NotAllowed("there is no terminal to confirm the write", expected="--yes")
     done = run_precise(_write(target, writes, log, yes=yes, hold_s=hold_s if restore else None, blind=blind))
     if as_json:
         click.echo(json.dumps([_row(w) for w in done]))
@@ -105,7 +118,7 @@ def _pairs(items: tuple[str, ...], target: Target, options: dict[str, Any]) -> l
             raise UsageError(f"cannot read {item!r}", expected="ITEM=VALUE, such as holding:100=42")
         tags = tags_of([name], target.protocol, raw_form(options), target.profile, target.dictionary)
         if len(tags) != 1:
-            raise UsageError(f"{name!r} means {len(tags)} values", expected="one, each with a value of its own")
+            raise UsageError(f"{name!r} means {len(tags)} values", expected="one tag, or a separate value for each")
         pairs.append((with_care(tags[0], target.profile), value))
     return pairs
 
@@ -117,7 +130,7 @@ async def _write(
         async with point_at(target, taps=taps) as point:
             old = [None if blind else await writing.before(point, w) for w in writes]
             if hold_s is not None and None in old:
-                raise NotAllowed("what cannot be read cannot be put back", expected="no --restore")
+                raise NotAllowed("a value that cannot be read cannot be restored", expected="no --restore")
             _show(writes, old)
             if not yes and not click.confirm("Write?", default=False, err=True):
                 raise click.Abort
@@ -135,7 +148,7 @@ async def _carry_out(
             done.append(Written(write, before.value.raw if before is not None else None, None))
             done[-1] = await writing.carry_out(point, write, before)
         if hold_s is not None:
-            talk.print(f"written; the old values come back in {hold_s:g} s")
+            talk.print(f"written; the old values are restored in {hold_s:g} s")
             await asyncio.sleep(hold_s)
     except BaseException:
         told = done[:-1] if hold_s is None else await _put_back(point, done)
@@ -153,7 +166,7 @@ async def _put_back(point: Point, done: list[Written]) -> list[Written]:
         try:
             back.insert(0, await writing.restore(point, written))
         except FieldtwinError as e:
-            talk.print(Text(f"{written.write.tag.name} was not put back: {e}", "red"), soft_wrap=True)
+            talk.print(Text(f"{written.write.tag.name} was not restored: {e}", "red"), soft_wrap=True)
             failed = failed or e
     if failed is not None:
         raise failed
@@ -184,7 +197,7 @@ def _told(written: Written) -> Text:
     if written.same:
         return Text(f"{tag.name}: {_held(tag, written.after)} already, nothing was written")
     if written.after is None:
-        return Text(f"{tag.name}: written, and cannot be read back")
+        return Text(f"{tag.name}: written, but it cannot be read back")
     return Text(f"{tag.name}: {_held(tag, written.before)} → {_held(tag, written.after)}, read back")
 
 
@@ -203,13 +216,13 @@ def _row(written: Written) -> dict[str, Any]:
 def _restart(target: Target, items: Sequence[str], log: Path | None, *, i_know: bool, yes: bool, dry_run: bool) -> int:
     """Send function 08h, sub-function 01h: the unit restarts its port and clears its counters (AP 6.8.1)."""
     if items or target.protocol != "modbus":
-        raise UsageError("--restart-communications stands alone, for a Modbus unit")
+        raise UsageError("--restart-communications takes no ITEM and needs a Modbus unit")
     request = Diagnostics(RESTART_COMMUNICATIONS)
     if dry_run:
         click.echo(frame_of(target.url, target.address, request).hex(" "))
         return 0
     if not i_know:
-        raise NotAllowed("a restart clears counters and may lose contact", expected="--i-know")
+        raise NotAllowed("a restart clears counters and may interrupt the connection", expected="--i-know")
     if not yes and not (sys.stdin.isatty() and click.confirm("Restart its communications?", default=False, err=True)):
         raise NotAllowed("not restarted", expected="--yes")
 
@@ -223,5 +236,5 @@ def _restart(target: Target, items: Sequence[str], log: Path | None, *, i_know: 
                 return True
 
     answered = run_precise(send())
-    data.print("restarted" if answered else "sent; no reply, as from a unit that was in listen-only mode")
+    data.print("restarted" if answered else "sent; there was no reply, as is normal for a unit in listen-only mode")
     return 0

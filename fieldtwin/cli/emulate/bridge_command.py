@@ -22,30 +22,48 @@ ANYWHERE = ("127.0.0.1", "::1", "localhost", "")
 @click.argument("listen")
 @click.argument("target")
 @click.option(
-    "--allow", "networks", multiple=True, metavar="NETWORK", help="Who may connect; default: this host. Repeatable."
+    "--allow",
+    "networks",
+    multiple=True,
+    metavar="NETWORK",
+    help="Network that may connect; default: this host. Repeatable.",
 )
-@click.option("--allow-writes", is_flag=True, help="Pass on every function; without it, those that only read.")
+@click.option("--allow-writes", is_flag=True, help="Forward every function; default: only functions that read.")
 @click.option(
-    "--unit", "units", multiple=True, metavar="UNIT=UNIT", help="A client's unit id = the target's. Repeatable."
+    "--unit", "units", multiple=True, metavar="UNIT=UNIT", help="Map a client's unit ID to the target's. Repeatable."
 )
 @click.option(
-    "--timeout", "timeout_s", type=Duration(), default="1s", show_default=True, help="How long a unit may take."
+    "--timeout", "timeout_s", type=Duration(), default="1s", show_default=True, help="Reply timeout of a unit."
 )
 @click.option(
-    "--retries", type=click.IntRange(0, 10), default=1, show_default=True, help="Of reads that nobody answered."
+    "--retries", type=click.IntRange(0, 10), default=1, show_default=True, help="Repetitions of unanswered reads."
 )
-@click.option("--cache", "cache_s", type=Duration(), default="0", help="Answer reads from replies at most this old.")
-@click.option("--clients", type=click.IntRange(1, 1000), default=16, show_default=True, help="Connections at a time.")
-@click.option("--queue", type=click.IntRange(1, 64), default=32, show_default=True, help="Requests that may wait.")
-@click.option("--broadcast", is_flag=True, help="Pass unit 0 on to the line; nobody answers.")
-@click.option("--answer-broadcast", is_flag=True, help="The same, and tell the client that it went out.")
-@click.option("--pause", "pause_s", type=Duration(), default="0", help="Between one exchange and the next on TARGET.")
-@click.option("--echo", is_flag=True, help="Serial TARGET: the adapter returns what is sent (RS-485).")
-@click.option("--idle", "idle_s", type=Duration(), default="0", help="Close clients that were silent for so long.")
 @click.option(
-    "--role", "roles", multiple=True, metavar="ROLE", help="tls: only clients whose certificate says so. Repeatable."
+    "--cache", "cache_s", type=Duration(), default="0", help="Answer reads from cached replies of at most this age."
 )
-@click.option("--instance", default="", help="Name of the run directory, where the audit log is.")
+@click.option(
+    "--clients", type=click.IntRange(1, 1000), default=16, show_default=True, help="Maximum number of connections."
+)
+@click.option(
+    "--queue", type=click.IntRange(1, 64), default=32, show_default=True, help="Maximum number of queued requests."
+)
+@click.option("--broadcast", is_flag=True, help="Forward broadcasts (unit 0) to the line; the client gets no answer.")
+@click.option(
+    "--answer-broadcast", is_flag=True, help="Forward broadcasts, and confirm their transmission to the client."
+)
+@click.option("--pause", "pause_s", type=Duration(), default="0", help="Pause between two exchanges on TARGET.")
+@click.option("--echo", is_flag=True, help="Serial TARGET: the adapter echoes the sent bytes (RS-485).")
+@click.option(
+    "--idle", "idle_s", type=Duration(), default="0", help="Disconnect clients that are silent for this time."
+)
+@click.option(
+    "--role",
+    "roles",
+    multiple=True,
+    metavar="ROLE",
+    help="tls: only clients whose certificate has this role. Repeatable.",
+)
+@click.option("--instance", default="", help="Name of the run directory, which contains the audit log.")
 @json_option
 def command(
     listen: str,
@@ -67,15 +85,20 @@ def command(
     instance: str,
     as_json: bool,
 ) -> int:
-    """Let the clients of LISTEN reach the units behind TARGET.
+    """Connect Modbus clients at LISTEN to the units behind TARGET.
 
     \b
-    fieldtwin bridge tcp://0.0.0.0:502 "rtu:/dev/ttyUSB0?baudrate=9600&frame=8N1" --allow 10.0.0.0/24
-    fieldtwin bridge "tls://0.0.0.0:802?cert=us.pem&key=us.key&ca=clients.pem" rtu:/dev/ttyUSB0 --allow 0.0.0.0/0
-    fieldtwin bridge "rtu:/dev/ttyS1?baudrate=19200" tcp://plc:502 --unit 1=255     a master on a line asks a TCP device
+    TCP clients, and serial units:
+      fieldtwin bridge tcp://0.0.0.0:502 \\
+          "rtu:/dev/ttyUSB0?baudrate=9600&frame=8N1" --allow 10.0.0.0/24
+    The same with TLS:
+      fieldtwin bridge "tls://0.0.0.0:802?cert=us.pem&key=us.key&ca=clients.pem" \\
+          rtu:/dev/ttyUSB0 --allow 0.0.0.0/0
+    A client on a serial line, and a TCP device:
+      fieldtwin bridge "rtu:/dev/ttyS1?baudrate=19200" tcp://plc:502 --unit 1=255
 
-    Read-only and for this host, unless told otherwise. Unknown units are refused with exception 0A, silent ones with 0B, and
-    those are then left alone for a while.
+    By default the bridge is read-only and accepts only clients of this host. It answers requests to unknown units with
+    exception 0A, and requests to silent units with 0B; it then pauses the requests to a silent unit.
     """
     here = Endpoint.parse(listen)
     if roles and here.scheme != "tls":
@@ -100,7 +123,7 @@ def command(
         instance=instance,
     )
     if not networks and options.listen.host not in ANYWHERE:
-        talk.print("only clients of this host may ask; --allow NETWORK lets others in")
+        talk.print("only clients of this host have access; --allow NETWORK admits others")
     result = run(run_bridge(options, lambda text: talk.print(text, soft_wrap=True, markup=False)))
     if as_json:
         json.dump(result, sys.stdout, indent=2)

@@ -23,7 +23,7 @@ from fieldtwin.gateway.core.endpoint import Endpoint
     default="127.0.0.1:29536",
     show_default=True,
     metavar="HOST:PORT",
-    help="Where nodes join; port 0 takes a free one.",
+    help="Where nodes join; port 0 selects a free port.",
 )
 @click.option("--bitrate", type=click.IntRange(10_000, 1_000_000), default=125_000, show_default=True, help="bit/s")
 @click.option(
@@ -32,12 +32,12 @@ from fieldtwin.gateway.core.endpoint import Endpoint
     help="bit/s of the data phase of CAN FD frames with the bit-rate switch; default: as --bitrate.",
 )
 @click.option("--unpaced", is_flag=True, help="Deliver frames at once instead of at the bit rate.")
-@click.option("--slcan", metavar="HOST:PORT", help="A second port for programs that speak slcan (LAWICEL).")
+@click.option("--slcan", metavar="HOST:PORT", help="A second port for programs that use slcan (LAWICEL).")
 @click.option(
-    "--bridge", metavar="IFACE", help="A kernel interface, vcan0 for one, that is joined with the bus both ways."
+    "--bridge", metavar="IFACE", help="Kernel interface, such as vcan0, to bridge with the bus in both directions."
 )
 @click.option(
-    "--strict-ack", is_flag=True, help="Only other nodes acknowledge: one that is alone becomes error-passive."
+    "--strict-ack", is_flag=True, help="Require an acknowledging node: a node that is alone becomes error-passive."
 )
 def command(
     listen: str,
@@ -48,11 +48,11 @@ def command(
     bridge: str | None,
     strict_ack: bool,
 ) -> int:
-    """Run a CAN bus where the kernel has none.
+    """Run a software CAN bus, for hosts without a CAN interface.
 
-    Frames take their exact time on the modelled bus and arbitrate by identifier. Any python-can program joins with
-    interface `fieldtwin` and channel HOST:PORT, for example `python -m can.logger -i fieldtwin -c 127.0.0.1:29536`; with
-    `--slcan HOST:PORT` others do too, for example `python -m can.logger -i slcan -c socket://HOST:PORT`.
+    Frames take their exact time on the modelled bus and arbitrate by identifier. A python-can program joins with interface
+    `fieldtwin` and channel HOST:PORT, for example `python -m can.logger -i fieldtwin -c 127.0.0.1:29536`. With `--slcan
+    HOST:PORT` other programs can join, for example `python -m can.logger -i slcan -c socket://HOST:PORT`.
     """
     endpoint = Endpoint.parse(f"can:fieldtwin/{listen}")
     ascii_port = Endpoint.parse(f"tcp://{slcan}") if slcan else None

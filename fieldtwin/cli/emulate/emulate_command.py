@@ -20,28 +20,28 @@ if TYPE_CHECKING:
 @click.command("emulate")
 @click.argument("what")
 @click.option(
-    "--on", "endpoints", multiple=True, metavar="ENDPOINT", help="For a device or recording: where it listens."
+    "--on", "endpoints", multiple=True, metavar="ENDPOINT", help="For a device or recording: the endpoint to listen on."
 )
 @click.option(
-    "--unit", type=click.IntRange(1, 247), default=None, help="For a device: its unit id; default as the profile says."
+    "--unit", type=click.IntRange(1, 247), default=None, help="For a device: its unit ID; default: the profile's."
 )
 @click.option(
     "--node",
     type=click.IntRange(1, 255),
     default=None,
-    help="For a CANopen device or data sheet: its node id; 255: none yet, LSS gives it one.",
+    help="For a CANopen device or data sheet: its node ID; 255: none yet, an LSS master assigns it.",
 )
 @click.option(
     "--bitrate",
     type=click.IntRange(10_000, 1_000_000),
     default=None,
-    help="For a CANopen device: bit/s of the software bus; default 125000 where none is there yet.",
+    help="For a CANopen device: bit/s of the software bus; default 125000 for a new bus.",
 )
 @click.option(
     "--model",
     type=click.Choice(["401", "402", "404", "406", "410", "none"]),
     default=None,
-    help="For a CANopen device: the CiA profile whose model is behind its objects. Default: as 1000h says.",
+    help="For a CANopen device: the CiA profile whose model computes its objects. Default: from object 1000h.",
 )
 @click.option(
     "--defaults", is_flag=True, help="For a CANopen device: start with the DefaultValues, not with ParameterValues."
@@ -51,58 +51,58 @@ if TYPE_CHECKING:
     "recordings",
     multiple=True,
     metavar="[DEVICE=]FILE",
-    help="Play this recording; for a data sheet: a log of candump -L.",
+    help="Replay this recording; for a data sheet: a log of candump -L.",
 )
-@click.option("--speed", type=float, default=0.0, help="Play recordings this much faster.")
+@click.option("--speed", type=float, default=0.0, help="Speed factor for recordings.")
 @click.option(
     "--unknown",
     type=click.Choice(["exception", "silence", "interpolate"]),
     default=None,
-    help="For a recording: what a request gets that nobody made when it was recorded. Default: exception.",
+    help="For a recording: the answer to a request that was not recorded. Default: exception.",
 )
 @click.option(
     "--at-end",
     type=click.Choice(["hold", "loop", "error"]),
     default=None,
-    help="For a recording: when its values are used up: hold the last (default), begin again, or exception 04.",
+    help="For a recording: at the end of its values, hold the last one (default), begin again, or answer with exception 04.",
 )
 @click.option(
     "--values",
     multiple=True,
     metavar="TAG=VALUE|FILE",
-    help="For a Modbus profile: what its registers hold at first, 0 otherwise; nothing is played. FILE: a YAML mapping.",
+    help="For a Modbus profile: initial register values, 0 by default; no recording is replayed. FILE: a YAML mapping.",
 )
 @click.option(
     "--faults",
     "faults_file",
     type=click.Path(exists=True, dir_okay=False),
-    help="For a Modbus device or recording: put these faults in (fieldtwin faults).",
+    help="For a Modbus device or recording: inject these faults (see fieldtwin faults).",
 )
-@click.option("--seed", type=int, default=1, help="With --faults: of what is left to chance; default: 1.")
+@click.option("--seed", type=int, default=1, help="With --faults: seed of random choices; default: 1.")
 @click.option(
     "--any-unit",
     is_flag=True,
-    help="For one Modbus device on TCP, TLS or UDP: answer every unit id, as some devices do.",
+    help="For one Modbus device on TCP, TLS or UDP: answer to every unit ID, as some devices do.",
 )
 @click.option(
-    "--prototype-file", type=click.Path(exists=True, dir_okay=False), help="For a system: another prototype file."
+    "--prototype-file", type=click.Path(exists=True, dir_okay=False), help="For a system: use this prototype file."
 )
 @click.option(
-    "--listen", multiple=True, metavar="BUS=ENDPOINT", help="For a system: let a bus's emulators listen elsewhere."
+    "--listen", multiple=True, metavar="BUS=ENDPOINT", help="For a system: endpoint for the emulators of a bus."
 )
 @click.option(
     "--control",
     default=f"127.0.0.1:{DEFAULT_CONTROL_PORT}",
     show_default=True,
     metavar="HOST:PORT",
-    help="For a system: where `fieldtwin run --field` finds it.",
+    help="For a system: control address, for `fieldtwin run --field`.",
 )
 @click.option(
     "--token",
     type=Secret(),
     default="",
     metavar="@FILE",
-    help="Whoever connects to --control must know it; needed off loopback. Or in FIELDTWIN_EMULATE_TOKEN.",
+    help="Token that --control requires from its clients; needed if not on loopback. Or FIELDTWIN_EMULATE_TOKEN.",
 )
 @click.option("--instance", default="", help="Name of the run directory; default: the system's name and -field.")
 @trust_option
@@ -131,21 +131,28 @@ def command(
     trust: bool,
     profiles: tuple[str, ...],
 ) -> int:
-    """Emulate WHAT: a system, a device profile, a recording, or an EDS or DCF file; a bare name is a profile, then a system.
+    """Emulate WHAT: a system, a device profile, a recording, or an EDS or DCF file. A plain name is a profile, else a system.
 
     \b
-    fieldtwin emulate observatory                                    the whole field side, for run --field localhost
-    fieldtwin emulate ctd-reference --on pty:/tmp/ctd                one sensor on a virtual serial port
-    fieldtwin emulate ctd-reference --on tcp://127.0.0.1:1502        the same on Modbus TCP
-    fieldtwin emulate drive-cia402 --on can:fieldtwin/127.0.0.1:29536     a drive on a software CAN bus, made or joined
-    fieldtwin emulate drive.eds --node 5 --on can:fieldtwin/127.0.0.1:0   a CANopen node from its data sheet
-    fieldtwin emulate site.jsonl --on rtu:/tmp/ttyV0                 what was recorded, answered again, no profile needed
-    fieldtwin emulate renogy-rover --values battery_voltage=12.4 --faults slow.yaml --on tcp://127.0.0.1:1502
-    fieldtwin emulate bus.log --node 5 --on can:fieldtwin/127.0.0.1:29536   a node of a log of candump, no data sheet needed
+    All devices of a system, for `fieldtwin run --field localhost`:
+      fieldtwin emulate observatory
+    One sensor on a virtual serial port, or on Modbus TCP:
+      fieldtwin emulate ctd-reference --on pty:/tmp/ctd
+      fieldtwin emulate ctd-reference --on tcp://127.0.0.1:1502
+    With initial values and faults:
+      fieldtwin emulate renogy-rover --values battery_voltage=12.4 \\
+          --faults slow.yaml --on tcp://127.0.0.1:1502
+    A recording, replayed without a profile:
+      fieldtwin emulate site.jsonl --on rtu:/tmp/ttyV0
+    A drive on a software CAN bus, which is created or joined:
+      fieldtwin emulate drive-cia402 --on can:fieldtwin/127.0.0.1:29536
+    A CANopen node from its data sheet, or from a candump log:
+      fieldtwin emulate drive.eds --node 5 --on can:fieldtwin/127.0.0.1:0
+      fieldtwin emulate bus.log --node 5 --on can:fieldtwin/127.0.0.1:29536
     """
     kind, path = _kind(what, tuple(Path(p) for p in profiles))
     if kind != "recording" and (unknown or at_end):
-        raise UsageError("--unknown and --at-end are for a recording", got=f"a {kind}")
+        raise UsageError("--unknown and --at-end need a recording", got=f"a {kind}")
     if (values or faults_file or any_unit) and kind not in ("device", "recording"):
         raise UsageError(
             "--values, --faults and --any-unit are for a single Modbus device or recording",
@@ -158,8 +165,8 @@ def command(
     if kind == "system":
         if endpoints or (unit, node, bitrate) != (None, None, None):
             raise UsageError(
-                "--on, --unit, --node and --bitrate are for a single device",
-                hint="a system's prototype file says where it listens",
+                "--on, --unit, --node and --bitrate need a single device",
+                hint="a system's endpoints are in its prototype file",
             )
         from fieldtwin.gateway.wallclock import run as run_precise
         from fieldtwin.run.emulate.field import FieldOptions, run_field
@@ -191,27 +198,27 @@ def command(
 
     if not endpoints:
         raise UsageError(
-            "where shall it listen?",
+            "the endpoint to listen on is missing",
             expected="--on pty:PATH, --on tcp://HOST:PORT or, CANopen, --on can:fieldtwin/127.0.0.1:29536",
         )
     options = NodeOptions(model, not defaults) if of_node else None
     if len(recordings) > 1:
-        raise UsageError("one device plays one recording")
+        raise UsageError("one device replays one recording")
     if kind == "data sheet":
         if unit is not None:
-            raise UsageError("a data sheet has no unit id", hint="--node")
+            raise UsageError("a data sheet has no unit ID", hint="--node")
         from fieldtwin.run.emulate.data_sheet import run_data_sheet
 
         log = Path(recordings[0]) if recordings else None
         return run_loop(run_data_sheet(path, endpoints, node, bitrate, log, options))
     if kind == "log":
         if unit is not None or recordings:
-            raise UsageError("a log is its own recording, and has no unit id", expected="--node")
+            raise UsageError("a log needs no --recording, and has no unit ID", expected="--node")
         from fieldtwin.run.emulate.data_sheet import run_log
 
         return run_loop(run_log(path, endpoints, node, bitrate))
     if unit is not None and node is not None:
-        raise UsageError("a device has a unit id or a node id, not both")
+        raise UsageError("a device has a unit ID or a node ID, not both")
     extras = _extras(kind, path, values, recordings, faults_file, seed, any_unit)
     unit = node if unit is None else unit
     recording = Path(recordings[0]) if recordings else None

@@ -18,11 +18,12 @@ from fieldtwin.emulators.faults.fault import Fault
 @click.argument("names", nargs=-1)
 @json_option
 def command(names: tuple[str, ...], as_json: bool) -> int:
-    """List the faults, or say all of NAMES: of `exception` and `sdo-abort` the codes that the standards know as well.
+    """List the faults, or describe the faults NAMES in full. For `exception` and `sdo-abort` this includes the codes of the
+    standards.
 
     A fault file is `faults: [{name: silence, device: ctd, from: 5s, until: 12s}]`, for `fieldtwin run --prototype --faults
-    FILE`, `fieldtwin emulate DEVICE --faults FILE` and `fieldtwin link --faults FILE`. What every fault takes: id, bus or
-    device, unit, function, address or register, registers, cob_id, direction (request, reply, both), nth, every,
+    FILE`, `fieldtwin emulate DEVICE --faults FILE` and `fieldtwin link --faults FILE`. Every fault has these optional keys:
+    id, bus or device, unit, function, address or register, registers, cob_id, direction (request, reply, both), nth, every,
     from, until, probability.
     """
     from fieldtwin.emulators.faults.registry import FAULTS, fault_class

@@ -37,34 +37,41 @@ BITRATE = 125_000
     "--faults",
     "faults_file",
     type=click.Path(exists=True, dir_okay=False),
-    help="Put these faults on it (fieldtwin faults).",
+    help="Inject these faults (see fieldtwin faults).",
 )
 @click.option(
     "--framing",
     type=click.Choice([framing.value for framing in Framing]),
     default="rtu",
-    help="With --faults: how frames look on it; default: rtu.",
+    help="With --faults: framing of the link; default: rtu.",
 )
-@click.option("--seed", type=int, default=1, help="With --faults: of what is left to chance; default: 1.")
+@click.option("--seed", type=int, default=1, help="With --faults: seed of random choices; default: 1.")
 def command(near: str, far: str, faults_file: str | None, framing: str, seed: int) -> int:
-    """Carry a serial line over TCP, byte for byte: a port at NEAR, its line at FAR. With --faults, what goes wrong between
-    any two: sockets, serial lines, CAN buses.
+    """Carry a serial line over TCP: a port at NEAR, its line at FAR. With --faults, connect any two sockets, serial lines or
+    CAN buses, and inject faults between them.
 
-    NEAR and FAR are endpoints; a plain path is a virtual serial port that is made there. Interoperates with
-    `socat pty,raw,echo=0,link=PATH tcp:HOST:PORT` on either side.
+    NEAR and FAR are endpoints; a plain path is a new virtual serial port. The link interoperates with `socat
+    pty,raw,echo=0,link=PATH tcp:HOST:PORT` on either side.
 
     \b
-    fieldtwin link /tmp/line1 tcp://field:4001            a port here, the device's line there
-    fieldtwin link rtu:/dev/ttyUSB0 "tcp://0.0.0.0:4001?listen=1"    a real port, offered to others
-    fieldtwin link --faults noisy.yaml /tmp/line1 tcp://plc:4001     the same, with what goes wrong on lines
-    fieldtwin link --faults noisy.yaml /tmp/master /tmp/device       between two programs with serial ports
-    fieldtwin link --faults lost.yaml "can:fieldtwin/127.0.0.1:29540?listen=1" can:socketcan/can0    masters here, nodes there
-    fieldtwin link --faults bad.yaml --framing mqtt "tcp://127.0.0.1:1884?listen=1" tcp://broker:1883      a bad way to a broker
+    A virtual port here, the device's line there:
+      fieldtwin link /tmp/line1 tcp://field:4001
+    A real port, offered to other computers:
+      fieldtwin link rtu:/dev/ttyUSB0 "tcp://0.0.0.0:4001?listen=1"
+    With faults, over TCP or between two programs with serial ports:
+      fieldtwin link --faults noisy.yaml /tmp/line1 tcp://plc:4001
+      fieldtwin link --faults noisy.yaml /tmp/client /tmp/device
+    Two CAN buses, with the NMT master on the first:
+      fieldtwin link --faults lost.yaml \\
+          "can:fieldtwin/127.0.0.1:29540?listen=1" can:socketcan/can0
+    MQTT clients and a broker:
+      fieldtwin link --faults bad.yaml --framing mqtt \\
+          "tcp://127.0.0.1:1884?listen=1" tcp://broker:1883
     """
     ends = _endpoint(near), _endpoint(far)
     on_can = any(end.is_can for end in ends)
     if on_can and not (all(end.is_can for end in ends) and faults_file):
-        raise UsageError(f"{near} and {far}: a link of CAN buses has two of them, and faults", expected="--faults FILE")
+        raise UsageError(f"{near} and {far}: a CAN link needs two CAN buses and --faults", expected="--faults FILE")
     check = check_can_link if on_can else check_link
     said = load_faults(Path(faults_file), check) if faults_file else ()
     return asyncio.run(_run(*ends, said, Framing.RAW if on_can else Framing(framing), seed, check))

@@ -45,7 +45,7 @@ INCONCLUSIVE = 4
     "tolerances",
     multiple=True,
     metavar="[TAG=]AMOUNT",
-    help="What values may differ by, e.g. 2 or 1% or frequency=0.05; repeatable. Default: not at all.",
+    help="Tolerance of values, such as 2 or 1% or frequency=0.05; repeatable. Default: 0.",
 )
 @click.option(
     "--latency",
@@ -60,39 +60,44 @@ INCONCLUSIVE = 4
     default=100.0,
     show_default=True,
     metavar="PERCENT",
-    help="How many of the exchanges have to be alike.",
+    help="Required share of equal exchanges.",
+)
+@click.option("--most", type=click.IntRange(1), default=None, help="With a live device: send only this many requests.")
+@click.option(
+    "--listen",
+    "listen_s",
+    type=Duration(),
+    default="0s",
+    help="With a live bus: listen for this time, and compare messages too.",
 )
 @click.option(
-    "--most", type=click.IntRange(1), default=None, help="A live device: ask only the first so many requests."
+    "--spacing", "spacing_s", type=Duration(), default="0s", help="With a live device: pause after every exchange."
 )
 @click.option(
-    "--listen", "listen_s", type=Duration(), default="0s", help="A live bus: listen so long, compare messages too."
+    "--writes", is_flag=True, help="With a live device: repeat the recorded writes as well, after a confirmation."
 )
-@click.option(
-    "--spacing", "spacing_s", type=Duration(), default="0s", help="A live device: pause behind every exchange."
-)
-@click.option("--writes", is_flag=True, help="A live device: make the recorded writes again, too. Asks first.")
-@click.option("--yes", is_flag=True, help="With --writes: do not ask.")
-@click.option("--i-know", is_flag=True, help="With --writes: broadcasts and restarts (FC08) too.")
-@click.option("--dry-run", is_flag=True, help="A live device: print the frames that would be sent, and send nothing.")
+@click.option("--yes", is_flag=True, help="With --writes: do not ask for confirmation.")
+@click.option("--i-know", is_flag=True, help="With --writes: repeat broadcasts and restarts (FC08) as well.")
+@click.option("--dry-run", is_flag=True, help="With a live device: print the frames that would be sent; send nothing.")
 @click.option("--all", "everything", is_flag=True, help=f"Show all differences, not only the first {SHOWN}.")
 @device_options
 @json_option
 def command(recording: Path, other: str, as_json: bool, everything: bool, **options: Any) -> int:
-    """Hold OTHER, a device at an endpoint or another recording, against RECORDING: the same requests, the same outcomes?
+    """Compare OTHER, a device at an endpoint or another recording, with RECORDING: the same requests, and their answers.
 
     \b
-    fieldtwin compare meter.jsonl rtu:/dev/ttyUSB0 --profile eastron-sdm630 --tolerance 2%
+    fieldtwin compare meter.jsonl rtu:/dev/ttyUSB0 \\
+        --profile eastron-sdm630 --tolerance 2%
     fieldtwin compare meter.jsonl emulated.jsonl
     fieldtwin compare drive.log can:socketcan/can0 --node 5 --listen 10s
 
-    Prints fidelity: the share of exchanges that are alike (values), and how near the latencies are (timing). Exit code 1
-    when it is not met, 4 when too much could not be compared. A device is only read, unless --writes.
+    It prints the fidelity: the share of equal exchanges (values), and the agreement of the latencies (timing). Exit code 1 if
+    the fidelity is too low, 4 if too much could not be compared. A device is only read, except with --writes.
     """
     rules = Rules(*_tolerances(options["tolerances"]), _latency(options["latency"]), options["least"] / 100)
     live = other.partition(":")[0].lower() in SCHEMES and not Path(other).is_file()
     if not live and (options["writes"] or options["dry_run"]):
-        raise UsageError("--writes and --dry-run are for a live device")
+        raise UsageError("--writes and --dry-run need a live device")
     if options["dry_run"]:
         return _dry(recording, other, options)
     if recording.suffix == ".log":
@@ -242,7 +247,7 @@ def _live_can(recording: Path, url: str, rules: Rules, options: dict[str, Any]) 
     if target.protocol != "canopen":
         raise UsageError(f"{recording.name} is of a CAN bus", got=url)
     if options["writes"]:
-        raise UsageError("--writes is for Modbus")
+        raise UsageError("--writes needs a Modbus device")
     found: list[Comparison] = []
 
     async def work(stop: asyncio.Event, progress: Callable[[int], None]) -> None:
@@ -264,7 +269,7 @@ def _frames(path: Path) -> Frames:
 
 def _expect_exchanges(path: Path) -> None:
     if header_of(path).kind != "exchanges":
-        raise FileInvalid("a recording of signals holds no requests", path=str(path), expected="one of exchanges")
+        raise FileInvalid("a recording of signals contains no requests", path=str(path), expected="one of exchanges")
 
 
 def _allow_writes(recording: Path, url: str, options: dict[str, Any]) -> None:
@@ -278,7 +283,7 @@ def _allow_writes(recording: Path, url: str, options: dict[str, Any]) -> None:
     for exchange in writes[:SHOWN]:
         talk.print(f"  unit {exchange.unit}: {exchange.request.hex(' ')}", soft_wrap=True, markup=False)
     if not sys.stdin.isatty() or not click.confirm(f"make these {len(writes)} writes at {url}?", err=True):
-        raise NotAllowed("the writes were not allowed", hint="--yes")
+        raise NotAllowed("the writes were not confirmed", hint="--yes")
 
 
 def _wearing(profile: DeviceProfile | None) -> set[tuple[str, int]]:
@@ -328,7 +333,7 @@ def _show(result: Comparison, recording: Path, other: str, everything: bool) -> 
         f"{result.compared} compared, {result.alike} alike" + (f"; otherwise: {kinds}" if kinds else ""), soft_wrap=True
     )
     if result.extra:
-        data.print(f"{result.extra} more there, of which the recording says nothing", soft_wrap=True)
+        data.print(f"{result.extra} more in the other one, which the recording does not contain", soft_wrap=True)
     if result.left_out:
         data.print(f"{result.left_out} left out: they may change the device, or cannot be asked", soft_wrap=True)
     if result.left_out_writes and result.by_kind:

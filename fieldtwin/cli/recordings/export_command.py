@@ -18,7 +18,11 @@ from fieldtwin.twin.site.data_files import find
 @click.argument("recording", type=click.Path(path_type=Path))
 @click.argument("out", type=click.Path(dir_okay=False, path_type=Path))
 @click.option(
-    "--profile", "profile_name", default="", metavar="NAME", help="A table of exchanges: its tags as columns."
+    "--profile",
+    "profile_name",
+    default="",
+    metavar="NAME",
+    help="Profile whose tags become the columns of a table of exchanges.",
 )
 @click.option(
     "--framing",
@@ -27,19 +31,21 @@ from fieldtwin.twin.site.data_files import find
     show_default=True,
     help="pcap of exchanges: as Modbus TCP, or as RTU frames (link type USER0).",
 )
-@click.option("--endpoint", default="", metavar="URL", help="A capture with several wires: this one.")
+@click.option("--endpoint", default="", metavar="URL", help="Endpoint to export from a capture with several endpoints.")
 @profiles_option
 @json_option
 def command(
     recording: Path, out: Path, profile_name: str, framing: str, endpoint: str, profiles: tuple[str, ...], as_json: bool
 ) -> int:
-    """Write RECORDING as OUT, whose name says as what: .csv, .parquet, .log (candump) or .pcap.
+    """Convert RECORDING to OUT; the suffix selects the format: .csv, .parquet, .log (candump) or .pcap.
 
     \b
-    meter.jsonl    to .csv or .parquet (with --profile: in the tags' units), to .pcap for Wireshark
-    bus.log        to .csv, .parquet, .pcap
-    cast.jsonl     signals: to .csv or .parquet
-    a capture      (run --capture, record --tap, a verb's --log) to .pcap; of a CAN bus to .log
+    meter.jsonl   to .csv or .parquet (with --profile: in the tags' units),
+                  to .pcap for Wireshark
+    bus.log       to .csv, .parquet, .pcap
+    cast.jsonl    recorded signals: to .csv or .parquet
+    a capture     of run --capture, record --tap or a command's --log:
+                  to .pcap; of a CAN bus to .log
     """
     from fieldtwin.capture.recordings.exporting import export
 

@@ -50,13 +50,15 @@ _SUFFIXES = (
     metavar="SIGNAL=COLUMN",
     help="CSV, .cnv: take a signal from a column, e.g. temperature=t190C or level=#3.",
 )
+@click.option("--time", default="", metavar="COLUMN", help="CSV: the time column; default: by its name.")
+@click.option("--device", default="", metavar="MAKER/TYPE", help="CSV: name of the device.")
 @click.option(
-    "--time", default="", metavar="COLUMN", help="CSV: the column that is the time; default: one named like it."
+    "--port", "ports", type=click.IntRange(1, 65_535), multiple=True, help="pcap: only this TCP port carries Modbus."
 )
-@click.option("--device", default="", metavar="MAKER/TYPE", help="CSV: of which device this is.")
-@click.option("--port", "ports", type=click.IntRange(1, 65_535), multiple=True, help="pcap: only this port is Modbus.")
-@click.option("--endpoint", default="", metavar="URL", help="A capture of fieldtwin's with several wires: this one.")
-@click.option("--framing", type=click.Choice(["rtu", "ascii", "mbap"]), default=None, help="A capture: what is spoken.")
+@click.option(
+    "--endpoint", default="", metavar="URL", help="Endpoint to import from a fieldtwin capture with several endpoints."
+)
+@click.option("--framing", type=click.Choice(["rtu", "ascii", "mbap"]), default=None, help="Protocol of a capture.")
 @json_option
 def command(
     file: Path,
@@ -69,23 +71,25 @@ def command(
     framing: str | None,
     as_json: bool,
 ) -> int:
-    """Turn FILE into a recording, and traffic into draft profiles as well.
+    """Convert FILE to a recording, and network traffic also to draft profiles.
 
     \b
-    site.pcapng            Modbus TCP on any port, RTU over TCP, UDP; CAN (SocketCAN): a recording for each server
-    bus.log .asc .blf .trc  what a CAN bus said: a log that `emulate` plays
-    table.csv              a time column and signals (--time, --column)
-    cast.cnv(.gz .bz2)     a Sea-Bird cast: signals of the `ctd`
-    poll.txt               what mbpoll or modpoll printed
-    capture.jsonl          a capture of `run --capture` or `record --tap`
+    site.pcapng         Modbus TCP on any port, RTU over TCP, UDP, and CAN
+                        (SocketCAN): a recording for each server
+    bus.log .asc .blf .trc
+                        CAN traffic: a log that `emulate` replays
+    table.csv           a time column and signals (--time, --column)
+    cast.cnv(.gz .bz2)  a Sea-Bird cast: signals of the `ctd`
+    poll.txt            output of mbpoll or modpoll
+    capture.jsonl       a capture of `run --capture` or `record --tap`
     """
     from fieldtwin.capture.recordings.importing import import_can, import_capture, import_polls, kind_of
 
     kind = kind_of(file)
     if kind != "csv" and (time or device):
-        raise UsageError("--time and --device are for CSV")
+        raise UsageError("--time and --device need a CSV file")
     if kind not in ("csv", "cnv") and columns:
-        raise UsageError("--column is for CSV and .cnv")
+        raise UsageError("--column needs a CSV or .cnv file")
     out = out or Path(_stem(file) + (".log" if kind == "can" else ".jsonl"))
     if out.exists() and out.samefile(file):
         raise UsageError(f"{file.name} would be its own recording", hint="--out NAME")
@@ -145,22 +149,20 @@ def _packets(file: Path, out: Path, ports: tuple[int, ...], as_json: bool) -> in
         if made.endpoint == "can":
             data.print(f"{made.path}: {made.exchanges} CAN frames", soft_wrap=True)
             continue
-        units = ", ".join(map(str, made.units)) or "none that answered"
+        units = ", ".join(map(str, made.units)) or "no unit answered"
         where = f" of {made.endpoint}" if made.endpoint else ""
         data.print(f"{made.path}: {made.exchanges} exchanges{where}, units {units}", soft_wrap=True)
         for profile in made.profiles:
             data.print(f"  draft profile: {profile}", soft_wrap=True)
     packets, pairs_ = found.packets, found.pairs
-    talk.print(
-        f"{packets.packets} packets in {found.seconds:.1f} s, {packets.carried} with something to say", soft_wrap=True
-    )
+    talk.print(f"{packets.packets} packets in {found.seconds:.1f} s, {packets.carried} with payload", soft_wrap=True)
     notes = [
-        (pairs_.unanswered, "requests without an answer"), (pairs_.strays, "answers to nothing"),
+        (pairs_.unanswered, "requests without an answer"), (pairs_.strays, "answers without a request"),
         (pairs_.malformed, "malformed"), (packets.lost_bytes, "bytes that the capture lost"),
         (packets.fragments, "IP packets of which a piece is missing"), (packets.cut_short, "packets cut short"),
         (found.can_left_out, "CAN frames left out (CAN FD, or cut short)"),
         (found.other_conversations, "conversations that are not Modbus"),
-        (found.servers_left_out, "exchanges of one server too many, left out"),
+        (found.servers_left_out, "exchanges of further servers, left out"),
     ]  # fmt: skip
     for count, what in notes:
         if count:
@@ -168,9 +170,9 @@ def _packets(file: Path, out: Path, ports: tuple[int, ...], as_json: bool) -> in
     if found.truncated:
         talk.print("  the file is cut off in its last packet", soft_wrap=True)
     if found.bad_file is not None:
-        talk.print(f"  what was malformed or answered nothing: {found.bad_file}", soft_wrap=True)
+        talk.print(f"  malformed or unmatched frames: {found.bad_file}", soft_wrap=True)
     if not found.made:
-        talk.print("nothing of Modbus or CAN in it", soft_wrap=True)
+        talk.print("it contains neither Modbus nor CAN", soft_wrap=True)
     return 0
 
 
@@ -182,14 +184,14 @@ def _show_text(found: Any, what: str, as_json: bool) -> int:
         data.print(f"  draft profile: {profile}", soft_wrap=True)
     notes = [
         (found.left_out.fd, "CAN FD frames left out"), (found.left_out.errors, "error frames left out"),
-        (found.pairs.unanswered, "requests without an answer"), (found.pairs.strays, "answers to nothing"),
+        (found.pairs.unanswered, "requests without an answer"), (found.pairs.strays, "answers without a request"),
         (found.pairs.malformed, "malformed"),
     ]  # fmt: skip
     for count, text in notes:
         if count:
             talk.print(f"  {count} {text}", soft_wrap=True)
     if found.bad_file is not None:
-        talk.print(f"  what was malformed or answered nothing: {found.bad_file}", soft_wrap=True)
+        talk.print(f"  malformed or unmatched frames: {found.bad_file}", soft_wrap=True)
     return 0
 
 

@@ -53,10 +53,10 @@ REFRESH_S = 0.5
     "--out",
     type=click.Path(dir_okay=False, path_type=Path),
     required=True,
-    help="The recording: NAME.jsonl, of a CAN bus NAME.log. A file that is there is never touched.",
+    help="The recording: NAME.jsonl, for a CAN bus NAME.log. An existing file is never changed.",
 )
 @click.option(
-    "--tap", "taps", nargs=2, metavar="A B", help="Between a master (A) and its devices (B): pass all on, keep all."
+    "--tap", "taps", nargs=2, metavar="A B", help="Connect a client (A) with its devices (B), and record all traffic."
 )
 @click.option(
     "--sniff", metavar="PORT", help="Listen with one adapter to a serial line between other devices; nothing is sent."
@@ -64,26 +64,35 @@ REFRESH_S = 0.5
 @click.option(
     "--like",
     type=click.Path(exists=True, dir_okay=False, path_type=Path),
-    help="Ask what this recording asked (reads only), instead of the tags of a profile.",
+    help="Repeat the reads of this recording, instead of reading the tags of a profile.",
 )
-@click.option("--group", "groups", multiple=True, help="Of a Modbus profile: only this poll group.")
-@click.option("--every", "every_s", type=Duration(), default="1s", show_default=True, help="How often a round begins.")
-@click.option("--rounds", type=click.IntRange(1), default=None, help="Stop after so many rounds.")
-@click.option("--for", "for_s", type=Duration(), default=None, help="Stop after so long; default: at Ctrl-C.")
-@click.option("--spacing", "spacing_s", type=Duration(), default="0s", help="Pause behind every exchange.")
+@click.option("--group", "groups", multiple=True, help="With a Modbus profile: only this poll group.")
 @click.option(
-    "--part-size", "part_mb", type=click.IntRange(1), default=256, show_default=True, help="MB of a part of the file."
+    "--every", "every_s", type=Duration(), default="1s", show_default=True, help="Period of the polling rounds."
 )
-@click.option("--part-time", "part_s", type=Duration(), default=None, help="Begin a new part after so long, e.g. 1h.")
-@click.option("--keep", type=click.IntRange(1), default=None, help="Keep so many parts; the oldest are removed.")
+@click.option("--rounds", type=click.IntRange(1), default=None, help="Stop after this number of rounds.")
+@click.option("--for", "for_s", type=Duration(), default=None, help="Stop after this time; default: at Ctrl-C.")
+@click.option("--spacing", "spacing_s", type=Duration(), default="0s", help="Pause after every exchange.")
+@click.option(
+    "--part-size",
+    "part_mb",
+    type=click.IntRange(1),
+    default=256,
+    show_default=True,
+    help="Maximum size of a part of the file, in MB.",
+)
+@click.option(
+    "--part-time", "part_s", type=Duration(), default=None, help="Begin a new part after this time, such as 1h."
+)
+@click.option("--keep", type=click.IntRange(1), default=None, help="Keep this number of parts; the oldest are removed.")
 @click.option(
     "--as-scenario",
     default="",
     metavar="SYSTEM",
     help="ENDPOINT is a run of SYSTEM (--trace, --capture): make a scenario of it, with tolerances.",
 )
-@click.option("--emulated", is_flag=True, help="Say in the recording that the device is an emulator.")
-@click.option("--dry-run", is_flag=True, help="Print the frames that a round would send, and send nothing.")
+@click.option("--emulated", is_flag=True, help="Mark the recording as one of an emulator.")
+@click.option("--dry-run", is_flag=True, help="Print the frames that a round would send; send nothing.")
 @device_options
 @json_option
 def command(
@@ -105,25 +114,25 @@ def command(
     fieldtwin record --tap rtu:/dev/ttyUSB0 rtu:/dev/ttyUSB1 -o line.jsonl
     fieldtwin record --sniff 'rtu:/dev/ttyUSB0?baudrate=9600' -o line.jsonl
     fieldtwin record --tap tcp://127.0.0.1:1502 tcp://192.168.0.7 -o line.jsonl
-    fieldtwin record can:socketcan/can0 -o bus.log                 (listens only)
+    fieldtwin record can:socketcan/can0 -o bus.log            (listens only)
     fieldtwin record can:socketcan/can0 --profile drive-cia402 -o drive.log
     fieldtwin record run.jsonl --as-scenario observatory -o run.scenario.yaml
 
-    Play it with `fieldtwin emulate`, hold a device against it with `fieldtwin compare`.
+    Replay the recording with `fieldtwin emulate`, or compare a device with it: `fieldtwin compare`.
     """
     if as_scenario:
         return _scenario_of(endpoint, as_scenario, out, options["profiles"])
     job = _Job(out, for_s, as_json, options)
     if taps is not None:
         if endpoint or like or options["profile_name"]:
-            raise UsageError("--tap takes two endpoints and nothing else to ask")
+            raise UsageError("--tap takes two endpoints and no device to poll")
         return job.tap(*(_end(text) for text in taps))
     if sniff is not None:
         if endpoint or like or options["profile_name"]:
-            raise UsageError("--sniff takes one port and asks nothing")
+            raise UsageError("--sniff takes one port and no device to poll")
         return job.sniff(_end(sniff))
     if endpoint is None:
-        raise UsageError("what is to be recorded?", expected="ENDPOINT, --tap A B, or --sniff PORT")
+        raise UsageError("the source of the recording is missing", expected="ENDPOINT, --tap A B, or --sniff PORT")
     target = target_from(endpoint, options)
     if target.protocol == "canopen":
         if like is not None:
@@ -133,7 +142,7 @@ def command(
         unit = options["unit"]
         same = SameRequests(exchanges_of(like), unit)
         if not same.requests:
-            raise UsageError(f"{like.name} asks nothing that may be asked again", hint="only reads are")
+            raise UsageError(f"{like.name} has no requests that may be repeated", hint="only reads may be repeated")
         if same.left_out:
             talk.print(
                 f"{same.left_out} requests of {like.name} that may change the device are left out", soft_wrap=True
@@ -141,11 +150,14 @@ def command(
         return job.polls(target, same, header_of(like).device)
     if target.profile is None:
         raise UsageError(
-            "what is to be asked?", expected="--profile NAME or --like RECORDING", hint="or --tap A B to ask nothing"
+            "the requests are not defined",
+            expected="--profile NAME or --like RECORDING",
+            hint="or --tap A B to record without polling",
         )
     if target.profile.form.trigger is not None:
         talk.print(
-            f"{target.profile.name} measures when it is told to, and is not told: nothing is written", soft_wrap=True
+            f"{target.profile.name} measures only on command, and no command is sent: nothing is written",
+            soft_wrap=True,
         )
     return job.polls(target, ProfileRound(target.profile, target.address, options["groups"]), target.profile.name)
 

@@ -15,13 +15,15 @@ _OPTIONS = (
         "tolerances",
         multiple=True,
         metavar="[TAG=]AMOUNT",
-        help="What values may differ by: 2% of their size, or DEVICE.TAG=0.5. Repeatable; default: 1%.",
+        help="Tolerance of values: 2% of their size, or DEVICE.TAG=0.5. Repeatable; default: 1%.",
     ),
+    click.option("--window", "window_s", type=Duration(), default="1s", show_default=True, help="Tolerance of times."),
     click.option(
-        "--window", "window_s", type=Duration(), default="1s", show_default=True, help="What times may differ by."
-    ),
-    click.option(
-        "--ignore", "ignored", multiple=True, metavar="NAME", help="A tag, device, state or program. Repeatable."
+        "--ignore",
+        "ignored",
+        multiple=True,
+        metavar="NAME",
+        help="Tag, device, state or program to ignore. Repeatable.",
     ),
 )
 

@@ -114,7 +114,9 @@ def write_scenario(
         with out.open("x", encoding="utf-8") as file:
             file.write(text)
     except FileExistsError:
-        raise UsageError("the file is there already", got=str(out), hint="another name, or remove it") from None
+        raise UsageError(
+            "the file already exists", got=str(out), hint="choose another name, or remove the file"
+        ) from None
     except OSError as e:
         raise UsageError(f"cannot write: {e.strerror or e}", got=str(out)) from e
     steps = text.count("\n  - ")

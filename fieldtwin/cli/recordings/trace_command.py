@@ -24,21 +24,23 @@ from fieldtwin.results.trace import Event, Kind
 @click.argument("file", type=click.Path(path_type=Path))
 @click.argument("system")
 @profiles_option
-@click.option("--only", multiple=True, help="A bus, device, tag, program or fault; all its events. Repeatable.")
-@click.option("--from", "start_s", type=Duration(), default="0s", help="Leave out what was before.")
-@click.option("--to", "end_s", type=Duration(), help="Leave out what was later.")
+@click.option(
+    "--only", multiple=True, help="Show only the events of this bus, device, tag, program or fault. Repeatable."
+)
+@click.option("--from", "start_s", type=Duration(), default="0s", help="Start of the shown time.")
+@click.option("--to", "end_s", type=Duration(), help="End of the shown time.")
 @click.option("--problems", is_flag=True, help="Only requests without a good answer, and refused outputs.")
 @click.option(
     "--against",
     type=click.Path(path_type=Path),
-    help="An older run: what is otherwise, or slower? Exit code 1 if anything.",
+    help="Compare with an older run. Exit code 1 if a value differs or an answer is slower.",
 )
 @click.option("--as-scenario", type=click.Path(path_type=Path), help="Make a scenario of the run, with tolerances.")
-@click.option("--seed", type=int, help="With --as-scenario: the seed that the run had.")
+@click.option("--seed", type=int, help="With --as-scenario: the seed of the run.")
 @click.option(
     "--set-values",
     is_flag=True,
-    help="With --as-scenario: set what devices said, for another prototype than the run's.",
+    help="With --as-scenario: set the devices' values as well, for a different prototype from the run's.",
 )
 @tolerance_options
 @click.option("--vcd", type=click.Path(path_type=Path), help="Write waveforms (IEEE 1364) for GTKWave instead.")
@@ -63,15 +65,14 @@ def command(
     ignored: tuple[str, ...],
     as_json: bool,
 ) -> int:
-    """Show FILE, a trace (run --virtual --trace) or a capture (run --capture) of SYSTEM, frames decoded.
+    """Show FILE, a trace (run --virtual --trace) or a capture (run --capture) of SYSTEM, with decoded frames. With --json,
+    each request with its answer, and each message, is one line.
 
-    With --json, each request with its answer, and each message, is a line.
-
-    
+    \b
     fieldtwin trace new.jsonl observatory --against old.jsonl --tolerance 1%
     fieldtwin trace run.jsonl observatory --as-scenario run.scenario.yaml
 
-    Another run is compared by what it means: states and their order, values, qualities, latencies; never byte by byte.
+    --against compares two runs by states and their order, values, qualities and latencies, not by bytes.
     """
     from fieldtwin.run.template import system_file
     from fieldtwin.twin.site.system import load_system
@@ -85,7 +86,7 @@ def command(
         from fieldtwin.cli.recordings import regression_view
 
         if vcd is not None or only or problems or (against is not None and as_scenario is not None):
-            raise UsageError("--against and --as-scenario take the whole run, and nothing beside it")
+            raise UsageError("--against and --as-scenario use the whole run, without other options")
         allowed = regression_view.allowed_of(tolerances, window_s, ignored)
         if against is not None:
             return regression_view.show(regression_view.judged(plant, against, file, allowed), against, as_json=as_json)
@@ -97,7 +98,7 @@ def command(
     start_ns, end_ns = round(start_s * NS_PER_S), None if end_s is None else round(end_s * NS_PER_S)
     if vcd is not None:
         if only or problems or as_json:
-            raise UsageError("--vcd takes the whole trace", expected="no --only, --problems or --json beside it")
+            raise UsageError("--vcd takes the whole trace", expected="--vcd without --only, --problems or --json")
         from fieldtwin.reports.run.machines import machines_of
         from fieldtwin.reports.run.vcd import write_vcd
 

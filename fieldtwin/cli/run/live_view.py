@@ -45,11 +45,13 @@ def print_mapping(session: RunSession) -> None:
         soft_wrap=True,
     )
     for plant, target in session.mapping.items():
-        talk.print(f"  {plant}  →  {target}" if plant != target else f"  {plant}  (the plant's own)", soft_wrap=True)
+        talk.print(
+            f"  {plant}  →  {target}" if plant != target else f"  {plant}  (the plant's endpoint)", soft_wrap=True
+        )
     for bridge, cable in session.cables.items():
-        talk.print(f"  masters of bridge {bridge}  →  {cable.master}", soft_wrap=True)
+        talk.print(f"  clients of bridge {bridge}  →  {cable.master}", soft_wrap=True)
     for device, endpoint in session.far.items():
-        talk.print(f"  far end of {device}  →  {endpoint}", soft_wrap=True)
+        talk.print(f"  topside end of {device}  →  {endpoint}", soft_wrap=True)
     _print_thread(session)
 
 
@@ -178,7 +180,7 @@ def interference(session: RunSession) -> list[str]:
     plc = session.plc_status
     if plc is None:
         return []
-    found = ["PAUSED: the PLC executes nothing, its outputs stay as they are"] if plc.state == "paused" else []
+    found = ["PAUSED: the PLC executes no program, its outputs keep their values"] if plc.state == "paused" else []
     found += waiting_texts(plc.waiting)
     if plc.forces:
         found.append(f"FORCED: {forces_text(plc.forces)}")
@@ -353,7 +355,7 @@ def print_summary(summary: dict[str, Any]) -> None:
         plays = f", from {device['plays']}" if "plays" in device else ""
         data.print(f"  {name:<14} {mark}{plays}", soft_wrap=True, highlight=False)
     for program, states in summary["states"].items():
-        data.print(f"  {program:<14} {' → '.join(states) or 'no scan seen'}")
+        data.print(f"  {program:<14} {' → '.join(states) or 'no scan observed'}")
     for bus, row in summary["exchanges"].items():
         data.print(f"  {bus:<14} {_exchange_text(row)}", soft_wrap=True)
     print_faults(summary["faults"])
@@ -361,15 +363,15 @@ def print_summary(summary: dict[str, Any]) -> None:
     if summary["prototype"]:
         checked = f"{published['checked']} compared with what the devices held, {published['wrong']} wrong"
         if published.get("unknown"):
-            checked += f"; {published['unknown']} from when the field side went, and nobody can say"
+            checked += f"; {published['unknown']} not verifiable, because the field simulator was lost"
         data.print(f"  published      {checked}", soft_wrap=True)
     else:
         values = "not known" if published["values"] is None else f"{published['values']} good values"
         data.print(f"  published      {values}")
     if (field := summary["field"]) and field["losses"]:
-        data.print(f"  field side     lost {_times(field['losses'])}, away for {field['away_s']:.1f} s", soft_wrap=True)
+        data.print(f"  simulator      lost {_times(field['losses'])}, away for {field['away_s']:.1f} s", soft_wrap=True)
     if far := summary["far_end"]:
-        data.print(f"  far end        commands {far['commands_sent']}, responses {far['responses']}")
+        data.print(f"  topside        commands {far['commands_sent']}, responses {far['responses']}")
     data.print(f"  logged         {summary['logged']} exchanges")
     if thread := summary["thread"]:
         data.print(f"  thread         {_thread_text(thread)}", soft_wrap=True, markup=False, highlight=False)
@@ -379,13 +381,13 @@ def print_summary(summary: dict[str, Any]) -> None:
         data.print(f"  [yellow]start[/yellow]          {text}", soft_wrap=True, highlight=False)
     if acts := summary["plc"].get("acts"):
         left = summary["plc"].get("forces")
-        data.print(f"  [yellow]by hand[/yellow]        the PLC: {acts_text(acts)}", soft_wrap=True)
+        data.print(f"  [yellow]manual[/yellow]         actions on the PLC: {acts_text(acts)}", soft_wrap=True)
         if left:
             data.print(f"  [yellow]FORCED[/yellow]         at the end: {forces_text(left)}", soft_wrap=True)
     _print_refused(summary)
     for one in summary["invariants"]:
         if one["verdict"] != "failed":  # the failed ones are among the errors
-            said = "holds" if one["verdict"] == "passed" else "not judged"
+            said = "holds" if one["verdict"] == "passed" else "not checked"
             text = f"  {one['number']}: {one['text']}: {said}, {one['got']}"
             data.print(text, soft_wrap=True, markup=False, highlight=False)
     told = {f"{name}: {device['error']}" for name, device in summary["devices"].items() if device["state"] != "good"}
@@ -394,7 +396,7 @@ def print_summary(summary: dict[str, Any]) -> None:
             continue
         data.print(f"  [red]error[/red]          {escape(error)}", soft_wrap=True)
     for what in summary["not_judged"]:
-        data.print(f"  [yellow]not judged[/yellow]     {what}", soft_wrap=True, highlight=False)
+        data.print(f"  [yellow]not checked[/yellow]    {what}", soft_wrap=True, highlight=False)
     data.print("[bold green]ok[/bold green]" if summary["ok"] else "[bold red]not ok[/bold red]")
 
 
@@ -423,7 +425,7 @@ def print_faults(faults: list[dict[str, Any]]) -> None:
         )
     if len(faults) > MOST_FAULTS:
         idle = sum(not fault["struck"] for fault in faults)
-        data.print(f"  faults         {len(faults)} in all, {idle} of them never struck", soft_wrap=True)
+        data.print(f"  faults         {len(faults)} in all, {idle} of them never took effect", soft_wrap=True)
 
 
 def _times(count: int) -> str:
@@ -443,9 +445,7 @@ def _learnt_text(learnt: dict[str, Any], kind: str) -> str:
     if learnt["missing"]:
         parts.append(f"does not have {', '.join(learnt['missing'])}")
     if learnt["borders"]:
-        parts.append(
-            f"takes fewer registers at once than `limits: read_registers` says: {', '.join(learnt['borders'])}"
-        )
+        parts.append(f"accepts fewer registers per read than `limits: read_registers`: {', '.join(learnt['borders'])}")
     if learnt["line"]:
         parts.append(f"for the profile of {learnt['profile']}: {learnt['line']}")
     return f"learnt from the {kind}: " + "; ".join(parts)

@@ -44,16 +44,16 @@ MAX_TROUBLES = 5
 def run_network(request: NetworkRequest) -> int:
     """Run the network and return the exit status: 0 if every system passed."""
     if request.virtual and request.duration_s <= 0:
-        raise UsageError("--virtual needs an end", expected="--for 24h")
+        raise UsageError("--virtual needs an end time", expected="--for 24h")
     if not request.virtual and (request.seed is not None or request.trace):
-        raise UsageError("--seed and --trace go with --virtual")
+        raise UsageError("--seed and --trace need --virtual")
     if request.thread and (request.virtual or request.thread != THREAD):
         raise UsageError(
-            "each system of a network has a thread and a port of its own",
+            "each system of a network has a separate thread and port",
             expected=f"--thread {THREAD}, without --virtual",
         )
     if not request.virtual and (request.seeds or request.faults == "random"):
-        raise UsageError("--seeds and random faults go with --virtual")
+        raise UsageError("--seeds and random faults need --virtual")
     network = load_network(request.path, [Path(p) for p in request.profiles])
     members = [(member.system, member.prototype.path) for member in network.members.values()]
     agree(consent(trust=request.trust), request.path, members, beside=request.path, virtual=request.virtual)
@@ -101,7 +101,7 @@ def _options(request: NetworkRequest, network: Network) -> VirtualNetworkOptions
 
 def _many(request: NetworkRequest, network: Network) -> int:
     if request.trace or request.seed is not None:
-        raise UsageError("--seeds makes many runs", hint="--seed and --trace belong to one")
+        raise UsageError("--seeds, which makes several runs", hint="--seed and --trace need a single run")
     ledger = Path(request.ledger) if request.ledger else None
     return run_many(_options(request, network), parse_seeds(request.seeds), request.jobs, request.as_json, ledger)
 
@@ -120,7 +120,7 @@ def _virtual(request: NetworkRequest, network: Network) -> int:
     print_network_summary(summary)
     trace = summary["trace"]
     data.print(f"  trace          {trace['events']} events, sha256 {trace['sha256']}", soft_wrap=True)
-    data.print(f"  took           {took_s:.1f} s, {run.elapsed_s / took_s:,.0f} times as fast as time", soft_wrap=True)
+    data.print(f"  took           {took_s:.1f} s, {run.elapsed_s / took_s:,.0f} times real time", soft_wrap=True)
     return _verdict(summary)
 
 
@@ -271,7 +271,7 @@ def print_network_summary(summary: dict[str, Any]) -> None:
             f"  {name:<14} {'; '.join([*([devices] if devices else []), *bad])}", soft_wrap=True, highlight=False
         )
         for states in one["states"].values():
-            data.print(f"  {'':<14} {' → '.join(states) or 'no scan seen'}", soft_wrap=True, highlight=False)
+            data.print(f"  {'':<14} {' → '.join(states) or 'no scan observed'}", soft_wrap=True, highlight=False)
         published = one["published"]
         data.print(
             f"  {'':<14} published {published['checked']} compared with what the devices held, {published['wrong']} wrong;"

@@ -19,17 +19,17 @@ from fieldtwin.plc.status import PlcStatus
 from fieldtwin.twin.site.system import System, load_system
 
 instance_option = click.option(
-    "--instance", default="", metavar="NAME", help="Which one; default: the only one that runs."
+    "--instance", default="", metavar="NAME", help="Name of the instance; default: the only running one."
 )
 yes_option = click.option("--yes", is_flag=True, help="Do not ask.")
 
 
 @click.group("plc")
 def command() -> None:
-    """The soft PLC: status, tags, forces, single steps, reasons, diagrams and proofs.
+    """Inspect the soft PLC: status, tags, forces, single steps, reasons, diagrams and proofs.
 
-    Forces, pauses and restarts change what a plant does. Each asks first, showing what is and what will be; without a
-    terminal it needs --yes. Forces stay until they are taken away, and every status lists them.
+    Forces, pauses and restarts change the behaviour of a plant. Each asks for confirmation and shows the present and the new
+    value; without a terminal it needs --yes. Forces stay until they are removed, and every status lists them.
     """
 
 
@@ -44,7 +44,9 @@ def _sure(question: str, yes: bool) -> None:
     if yes:
         return
     if not sys.stdin.isatty():
-        raise UsageError(f"{question}: nobody to ask", hint="--yes, if that is what is meant")
+        raise UsageError(
+            f"{question}: there is no terminal for the confirmation", hint="--yes to confirm without a terminal"
+        )
     click.confirm(question, abort=True, err=True)
 
 
@@ -80,7 +82,7 @@ def _act(instance: str, verb: str, **args: Any) -> Any:
 @instance_option
 @json_option
 def status(instance: str, as_json: bool) -> int:
-    """State, cycle statistics of each task, forces, retained variables, counters."""
+    """Show the state, the cycle statistics of each task, forces, retained variables and counters."""
     from fieldtwin.cli.run.plc_views import print_status, tags_as_data
 
     found = _status(instance, brief=not as_json)
@@ -92,13 +94,13 @@ def status(instance: str, as_json: bool) -> int:
 
 @command.command("watch")
 @click.argument("tags", nargs=-1)
-@click.option("--once", is_flag=True, help="Print once and end.")
+@click.option("--once", is_flag=True, help="Print once and exit.")
 @instance_option
 @json_option
 def watch(tags: tuple[str, ...], once: bool, instance: str, as_json: bool) -> int:
-    """Live values of TAGS (all, if none is named), with unit, limits, quality, age and forces. Ctrl-C ends it.
+    """Show live values of TAGS (default: all) with unit, limits, quality, age and forces. Ctrl-C ends it.
 
-    Each is a tag, a device or a program for all of its tags, or a pattern such as '*.state'.
+    Each TAG is a tag, a device or program (all of its tags), or a pattern such as '*.state'.
     """
     import asyncio
 
@@ -121,7 +123,9 @@ def watch(tags: tuple[str, ...], once: bool, instance: str, as_json: bool) -> in
 @yes_option
 @instance_option
 def force(tag: str, value: str, yes: bool, instance: str) -> int:
-    """Put VALUE in the place of TAG, an input, an output or a local, until it is unforced: true, false, a number, a state."""
+    """Force TAG, an input, an output or a local, to VALUE until it is unforced. VALUE is true, false, a number, or a state's
+    name.
+    """
     from fieldtwin.cli.run.plc_views import is_now
     from fieldtwin.run.processes.plc_client import parse_value
 
@@ -137,14 +141,14 @@ def force(tag: str, value: str, yes: bool, instance: str) -> int:
 
 @command.command("unforce")
 @click.argument("tag", required=False)
-@click.option("--all", "every", is_flag=True, help="Take all forces away.")
+@click.option("--all", "every", is_flag=True, help="Remove all forces.")
 @instance_option
 def unforce(tag: str | None, every: bool, instance: str) -> int:
-    """Take the force of TAG away. The safe direction: it does not ask."""
+    """Remove the force of TAG. This is the safe direction, so it asks for no confirmation."""
     if bool(tag) == every:
-        raise UsageError("what is to be unforced", expected="a TAG, or --all")
+        raise UsageError("no tag to unforce", expected="a TAG, or --all")
     done = _act(instance, "unforce", all=True) if every else _act(instance, "unforce", tag=tag)
-    talk.print(f"{done['removed']} taken away", markup=False)
+    talk.print(f"{done['removed']} removed", markup=False)
     return 0
 
 
@@ -152,8 +156,8 @@ def unforce(tag: str | None, every: bool, instance: str) -> int:
 @yes_option
 @instance_option
 def pause(yes: bool, instance: str) -> int:
-    """Execute nothing more; outputs stay as they are, and the plant keeps them."""
-    _sure("pause the PLC: its outputs stay as they are, whatever the plant does", yes)
+    """Pause the execution of programs; the outputs keep their values, and the plant keeps them."""
+    _sure("pause the PLC: its outputs keep their values, whatever happens in the plant", yes)
     _act(instance, "pause")
     talk.print("paused; fieldtwin plc step, fieldtwin plc go")
     return 0
@@ -162,7 +166,7 @@ def pause(yes: bool, instance: str) -> int:
 @command.command("go")
 @instance_option
 def go(instance: str) -> int:
-    """Go on after a pause."""
+    """Continue after a pause."""
     _act(instance, "go")
     talk.print("running")
     return 0
@@ -172,7 +176,9 @@ def go(instance: str) -> int:
 @click.argument("count", type=click.IntRange(1, 10_000), default=1)
 @instance_option
 def step(count: int, instance: str) -> int:
-    """While paused, execute COUNT scans (1) of the fastest task, and of the others those that fall due in that time."""
+    """While paused, execute COUNT scans (default: 1) of the fastest task, and the scans of other tasks that fall due in that
+    time.
+    """
     import getpass
 
     from fieldtwin.run.processes.plc_client import step_and_wait, talk_to
@@ -184,12 +190,12 @@ def step(count: int, instance: str) -> int:
 
 
 @command.command("restart")
-@click.option("--cold", is_flag=True, help="Without what is retained.")
+@click.option("--cold", is_flag=True, help="Reset retained variables as well.")
 @yes_option
 @instance_option
 def restart(cold: bool, yes: bool, instance: str) -> int:
-    """Make the programs anew: first scan, initial values, and (unless --cold) what is retained."""
-    _sure(f"restart the PLC {'cold' if cold else 'warm'}: its outputs are made safe in between", yes)
+    """Restart the programs: first scan, initial values, and (unless --cold) retained values."""
+    _sure(f"restart the PLC {'cold' if cold else 'warm'}: its outputs are safe during the restart", yes)
     talk.print(_act(instance, "restart", cold=cold)["start"], markup=False)
     return 0
 
@@ -199,9 +205,9 @@ def restart(cold: bool, yes: bool, instance: str) -> int:
 @instance_option
 @json_option
 def why(tag: str, instance: str, as_json: bool) -> int:
-    """Which program last changed TAG (an output or local), when, and what its inputs were then.
+    """Show which program last changed TAG (an output or local), when, and its inputs at that time.
 
-    Without --json it also says what the program waits for, where it has not started.
+    Without --json it also shows the missing inputs of a program that has not started.
     """
     from fieldtwin.cli.run.plc_views import print_why
 
@@ -222,12 +228,8 @@ def _agreed(system: str, profiles: tuple[str, ...], *, trust: bool) -> System:
 
 @command.command("diagram")
 @click.argument("system")
-@click.option(
-    "--program", default="", metavar="NAME", help="Of which program; default: the only one with a state table."
-)
-@click.option(
-    "-o", "--output", type=click.Path(dir_okay=False, path_type=Path), help="Write it there; default: stdout."
-)
+@click.option("--program", default="", metavar="NAME", help="The program; default: the only one with a state table.")
+@click.option("-o", "--output", type=click.Path(dir_okay=False, path_type=Path), help="Output file; default: stdout.")
 @trust_option
 @profiles_option
 def diagram(system: str, program: str, output: Path | None, trust: bool, profiles: tuple[str, ...]) -> int:
@@ -247,13 +249,13 @@ def diagram(system: str, program: str, output: Path | None, trust: bool, profile
 
 @command.command("prove")
 @click.argument("system")
-@click.option("--program", default="", metavar="NAME", help="Of which program; default: the only one with a proof.")
+@click.option("--program", default="", metavar="NAME", help="The program; default: the only one with a proof.")
 @click.option("--max-states", type=click.IntRange(1), default=200_000, show_default=True)
 @click.option(
     "-o",
     "--output",
     type=click.Path(dir_okay=False, path_type=Path),
-    help="Write a counterexample there, as a scenario.",
+    help="Write a counterexample to this file, as a scenario.",
 )
 @trust_option
 @profiles_option
@@ -267,10 +269,11 @@ def prove(
     profiles: tuple[str, ...],
     as_json: bool,
 ) -> int:
-    """Look at every state that a program of SYSTEM can get into, against its invariants.
+    """Check all reachable states of a program of SYSTEM against its invariants.
 
-    Breadth first over states, inputs, qualities and timer phases, as the PROOF beside the program says (its module's name with
-    _proof behind). Exit 1 with a shortest counterexample, or when the bounds were reached before everything was seen.
+    The search is breadth-first over states, inputs, qualities and timer phases, as defined by the PROOF in the module next to
+    the program (the program's module name with the suffix _proof). Exit code 1 with a shortest counterexample, or if a bound
+    was reached before all states were visited.
     """
     from fieldtwin.cli.run.plc_views import print_proof
     from fieldtwin.plc.prove import prove as look

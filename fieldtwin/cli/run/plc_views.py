@@ -196,7 +196,7 @@ def print_status(status: PlcStatus) -> None:
             by = f" by {force['by']}" if force["by"] else ""
             data.print(f"  {tag} = {force['value']}{by}, {_age(force['age_ms'])} ago", style="yellow", markup=False)
     else:
-        data.print("nothing is forced")
+        data.print("no tag is forced")
 
 
 def waiting_texts(waiting: Mapping[str, WaitingStatus]) -> list[str]:
@@ -250,14 +250,14 @@ def print_why(tag: str, changes: list[dict[str, Any]], waits_for: str = "") -> N
 def print_proof(name: str, proof: Proof, result: Result, text: str) -> None:
     seen = f"{result.states} states, {result.transitions} scans, {result.depth} deep"
     if result.proved:
-        data.print(f"{name}: proved over {seen}", markup=False)
+        data.print(f"{name}: proved for {seen}", markup=False)
         for invariant in proof.invariants:
             data.print(f"  holds: {invariant}", markup=False, soft_wrap=True)
     elif result.broken:
-        data.print(f"{name}: broken after {len(result.way)} scans: {result.broken}", markup=False, soft_wrap=True)
+        data.print(f"{name}: violated after {len(result.way)} scans: {result.broken}", markup=False, soft_wrap=True)
         data.print(text, markup=False, highlight=False, soft_wrap=True, end="")
     else:
-        data.print(f"{name}: nothing broken in {seen}, but no proof: {result.reason}", markup=False, soft_wrap=True)
+        data.print(f"{name}: no violation in {seen}, but no proof: {result.reason}", markup=False, soft_wrap=True)
         if result.bounded:
             talk.print("raise --max-states")
 

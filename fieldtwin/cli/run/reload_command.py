@@ -18,15 +18,15 @@ NEEDS_RESTART = 1
 
 @click.command("reload")
 @click.argument("instance", required=False, default="")
-@click.option("--check", is_flag=True, help="Only say what is otherwise, and whether it could be taken over.")
+@click.option("--check", is_flag=True, help="Only show the changes, and whether they could be applied.")
 @json_option
 def command(instance: str, check: bool, as_json: bool) -> int:
-    """Let a running INSTANCE read its system file and profiles again; without a name, the only one that runs.
+    """Let a running INSTANCE read its system file and profiles again; the default is the only running instance.
 
-    Periods, time-outs, retries, pauses, limits, scaling, safe values and what may be written change between two polls, none of
-    which is lost or doubled. Ports, addresses, devices and programs need a restart: they are named, nothing is changed then, and
-    the exit code is 1. So is a program's file (.st, .xml, .py) that changed since the PLC read it. A file that is not right
-    changes nothing either (3).
+    Periods, timeouts, retries, pauses, limits, scaling, safe values and the set of writable tags change between two polls,
+    without a lost or repeated poll. Ports, addresses, devices and programs need a restart: the command names these changes,
+    applies none, and exits with code 1. The same applies to a program's file (.st, .xml, .py) that changed since the PLC read
+    it. An invalid file changes nothing (exit code 3).
     """
     from fieldtwin.console import show_warnings
     from fieldtwin.gateway.core.control import RemoteError
@@ -51,10 +51,10 @@ def _verdict(applied: bool, changes: int, restart: int, check: bool) -> str:
     if restart:
         return f"Nothing was changed: {restart} of {changes} changes need{'s' if restart == 1 else ''} a restart."
     if not changes:
-        return "Nothing is otherwise in the files."
+        return "The files have not changed."
     if check:
-        return f"{changes} change{'' if changes == 1 else 's'}, which can be taken over while it runs."
-    return f"{changes} change{'' if changes == 1 else 's'} taken over." if applied else "Nothing was changed."
+        return f"{changes} change{'' if changes == 1 else 's'}, which can be applied at run time."
+    return f"{changes} change{'' if changes == 1 else 's'} applied." if applied else "Nothing was changed."
 
 
 def _who() -> str:

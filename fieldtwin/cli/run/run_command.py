@@ -32,72 +32,85 @@ if TYPE_CHECKING:
     from fieldtwin.run.virtual.fault_schedule import RandomFaults
     from fieldtwin.run.virtual.run import VirtualOptions
 
-NEITHER = """run needs --plant or --prototype; neither is a default.
-  --prototype   the field side is emulated, as NAME.prototype.yaml says: nothing real is touched
-  --plant       the endpoints in the system file, on real hardware; read-only without --allow-writes"""
+NEITHER = """run needs --plant or --prototype; there is no default.
+  --prototype   emulate the field devices as defined in NAME.prototype.yaml; no real device is touched
+  --plant       use the endpoints in the system file, with real hardware; read-only without --allow-writes"""
 
 
 @click.command("run")
 @click.argument("system")
-@click.option("--prototype", is_flag=True, help="Emulate the field side, as NAME.prototype.yaml says.")
-@click.option("--plant", is_flag=True, help="Use the endpoints in the system file: real hardware.")
-@click.option("--allow-writes", is_flag=True, help="With --plant: write what the system file marks writable.")
+@click.option("--prototype", is_flag=True, help="Emulate the field devices as defined in NAME.prototype.yaml.")
+@click.option("--plant", is_flag=True, help="Use the endpoints in the system file, with real hardware.")
 @click.option(
-    "--for", "duration_s", type=Duration(), default=0.0, help="Stop after a time such as 20s; default: run on."
+    "--allow-writes", is_flag=True, help="With --plant: enable writes of the tags that the system file marks writable."
+)
+@click.option(
+    "--for",
+    "duration_s",
+    type=Duration(),
+    default=0.0,
+    help="Stop after a time such as 20s; default: run until Ctrl-C.",
 )
 @click.option("--instance", default="", help="Name of the run directory; default: the system's name.")
-@click.option("--prototype-file", type=click.Path(exists=True, dir_okay=False), help="Another prototype file.")
+@click.option("--prototype-file", type=click.Path(exists=True, dir_okay=False), help="Use this prototype file.")
 @click.option(
     "--field",
     "field_host",
     default="",
     metavar="HOST[:PORT]",
-    help="The field side runs there already (fieldtwin emulate).",
+    help="Use the field devices that `fieldtwin emulate` already runs there.",
 )
 @click.option(
     "--token",
     type=Secret(),
     default="",
     metavar="@FILE",
-    help="Token of that field side's control channel; or in FIELDTWIN_RUN_TOKEN.",
+    help="Token of that simulator's control channel; or FIELDTWIN_RUN_TOKEN.",
 )
 @click.option(
-    "--recording", "recordings", multiple=True, metavar="DEVICE=FILE", help="Play this recording for a device."
+    "--recording", "recordings", multiple=True, metavar="DEVICE=FILE", help="Replay this recording for a device."
 )
-@click.option("--speed", type=float, default=0.0, help="Play recordings this much faster.")
-@click.option("--listen", multiple=True, metavar="BUS=ENDPOINT", help="Let a bus's emulators listen elsewhere.")
+@click.option("--speed", type=float, default=0.0, help="Speed factor for recordings.")
+@click.option("--listen", multiple=True, metavar="BUS=ENDPOINT", help="Endpoint for the emulators of a bus.")
 @click.option(
-    "--can", default="", metavar="INTERFACE/CHANNEL", help="Emulated CAN buses on this interface, e.g. socketcan/vcan0."
+    "--can",
+    default="",
+    metavar="INTERFACE/CHANNEL",
+    help="Emulate CAN buses on this interface, such as socketcan/vcan0.",
 )
 @click.option(
     "--commands",
     default=None,
     metavar="1,2,0,-1",
-    help="Periods to command from the far end, spread over the run; or none.",
+    help="Sample periods that the topside controller commands, spread over the run; or none.",
 )
 @click.option(
-    "--capture", type=click.Path(dir_okay=False), help="Write what goes over the wires to this file (JSON lines)."
+    "--capture", type=click.Path(dir_okay=False), help="Write the traffic of all buses to this file (JSON lines)."
 )
-@click.option("--virtual", is_flag=True, help="With --prototype: in virtual time, in this process, as fast as it goes.")
-@click.option("--seed", type=int, default=None, help="Another seed than the prototype file's (with --virtual).")
-@click.option("--seeds", default="", metavar="1..200", help="With --virtual: a run for each of these seeds.")
-@click.option("--jobs", type=click.IntRange(1, 256), default=1, help="So many runs of --seeds at once.")
+@click.option("--virtual", is_flag=True, help="With --prototype: run in virtual time, as fast as possible.")
+@click.option("--seed", type=int, default=None, help="With --virtual: use this seed instead of the prototype file's.")
+@click.option(
+    "--seeds", default="", metavar="1..200", help="With --virtual: one run for each of these seeds, such as 1..200."
+)
+@click.option("--jobs", type=click.IntRange(1, 256), default=1, help="Number of --seeds runs at a time.")
 @click.option(
     "--ledger",
     type=click.Path(dir_okay=False),
-    help="With --seeds: add each run to this file, and leave out those in it.",
+    help="With --seeds: record each run in this file, and skip seeds that it contains.",
 )
-@click.option("--trace", type=click.Path(dir_okay=False), help="With --virtual: every event to this file (JSON lines).")
+@click.option(
+    "--trace", type=click.Path(dir_okay=False), help="With --virtual: write every event to this file (JSON lines)."
+)
 @click.option(
     "--compare",
     type=click.Path(exists=True, dir_okay=False),
-    help="With --virtual: hold the run against an older one's trace (fieldtwin trace --against); exit code 1 if it differs.",
+    help="With --virtual: compare the run with an older trace, as fieldtwin trace --against; exit code 1 if it differs.",
 )
 @click.option(
     "--faults",
     default="",
     metavar="FILE|random",
-    help="With --prototype: put these faults in (fieldtwin faults); random, with --virtual: ones that the seed chooses.",
+    help="With --prototype: inject these faults (see fieldtwin faults); random, with --virtual: the seed chooses them.",
 )
 @click.option(
     "--thread",
@@ -107,30 +120,30 @@ NEITHER = """run needs --plant or --prototype; neither is a default.
     "mqtt://HOST/GROUP/NODE, or modem: for the system's own modem.",
 )
 @click.option(
-    "--thread-store", default="", metavar="FILE|URL", help="What keeps the thread's log; default: in the run directory."
+    "--thread-store", default="", metavar="FILE|URL", help="Store of the thread's log; default: in the run directory."
 )
 @click.option(
     "--thread-every",
     "thread_every_s",
     type=Duration(),
     default=None,
-    help="A tag's new value goes into the thread at most so often; default: each one, over a modem one a second.",
+    help="Minimum time between two values of a tag in the thread; default: none, over a modem 1s.",
 )
 @click.option(
     "--metrics",
     default="",
     metavar="HOST:PORT",
-    help="Serve metrics for Prometheus, e.g. 127.0.0.1:9464; without a host on loopback (docs/service.md).",
+    help="Serve metrics for Prometheus at HOST:PORT, such as 127.0.0.1:9464; default host: loopback (docs/service.md).",
 )
 @click.option(
     "--log",
     type=click.Choice(["text", "json", "journal"]),
     default=None,
-    help="Instead of a live view, events: as text, JSON lines, or to the journal with fields.",
+    help="Log events instead of a live view: as text, as JSON lines, or to the journal.",
 )
 @fault_choice
 @trust_option
-@click.option("--cold", is_flag=True, help="Retained variables of the PLC begin with their initial values.")
+@click.option("--cold", is_flag=True, help="Start the PLC's retained variables with their initial values.")
 @profiles_option
 @json_option
 def command(
@@ -168,13 +181,14 @@ def command(
     as_json: bool,
     choice: Choice,
 ) -> int:
-    """Run SYSTEM: gateway and PLC, each in its own process.
+    """Run SYSTEM: gateway and PLC, each in a separate process.
 
-    SYSTEM is a file, the name of a shipped one such as `observatory`, or a template (fieldtwin template): a zip or a folder. With
-    --prototype also a network, such as `ocean_network`: several systems, and the water between their modems.
+    SYSTEM is a file, the name of a shipped system such as `observatory`, or a template (see fieldtwin template): a zip or a
+    folder. With --prototype it can also be a network, such as `ocean_network`: several systems, and the acoustic channel
+    between their modems.
 
-    With --prototype the field side is emulated in a process of its own, on real wires: a pty for each serial line, TCP sockets, a
-    software CAN bus (or a kernel one, with --can). The same system file runs the plant with --plant.
+    With --prototype a separate process emulates the field devices on real connections: a pty for each serial line, TCP
+    sockets, a software CAN bus (or a kernel one, with --can). With --plant the same system file runs the plant.
     """
     if prototype == plant:
         raise UsageError(NEITHER if not plant else "--plant and --prototype exclude each other")
@@ -196,14 +210,14 @@ def command(
             [option for option, said in others.items() if said],
         )  # fmt: skip
     if plant and faults:
-        raise UsageError("a plant has no faults but its own", hint="--faults goes with --prototype")
+        raise UsageError("faults cannot be injected into a plant", hint="--faults needs --prototype")
     if plant and (field_host or recordings or listen or can or speed or prototype_file or commands):
         raise UsageError(
-            "a plant is not emulated",
-            hint="--field, --recording, --speed, --listen, --can, --commands go with --prototype",
+            "these options are for emulated devices",
+            hint="--field, --recording, --speed, --listen, --can, --commands need --prototype",
         )
     if prototype and allow_writes:
-        raise UsageError("--allow-writes is for --plant", hint="a prototype's emulators may be written to anyway")
+        raise UsageError("--allow-writes needs --plant", hint="a prototype's emulators always accept writes")
     system = system_file(
         system,
         consent(trust=trust),
@@ -213,15 +227,15 @@ def command(
         profiles=[Path(p) for p in profiles],
     )
     if (thread_store or thread_every_s is not None) and not thread:
-        raise UsageError("--thread-store and --thread-every go with --thread")
+        raise UsageError("--thread-store and --thread-every need --thread")
     if virtual:
         if plant or field_host or listen or can or capture or thread or metrics or log:
             raise UsageError(
-                "--virtual is a prototype in this process, its wires in memory",
-                hint="--plant, --field, --listen, --can, --capture, --thread, --metrics, --log: real wires; --trace has frames",
+                "--virtual runs a prototype in this process, with buses in memory",
+                hint="not with --plant, --field, --listen, --can, --capture, --thread, --metrics, --log; --trace has the frames",
             )
         if duration_s <= 0:
-            raise UsageError("--virtual needs an end", expected="--for 24h")
+            raise UsageError("--virtual needs an end time", expected="--for 24h")
         return _run_virtual(
             VirtualRequest(
                 system,
@@ -243,7 +257,7 @@ def command(
             as_json,
         )
     if seeds or seed is not None or trace or compare or jobs != 1:
-        raise UsageError("--seed, --seeds, --jobs, --trace and --compare go with --virtual")
+        raise UsageError("--seed, --seeds, --jobs, --trace and --compare need --virtual")
     options = RunOptions(
         system=system,
         prototype=prototype,
@@ -278,15 +292,15 @@ def _run_network(request: NetworkRequest, plant: bool, others: list[str]) -> int
 
     if plant:
         raise UsageError(
-            "a network file is of prototypes: each of its systems is a plant of its own",
-            hint="run each where it is, with its own system file",
+            "a network file runs only as prototypes: each of its systems is a separate plant",
+            hint="run each system on its computer, with its own system file",
         )
     if others:
         raise UsageError(
-            f"{', '.join(others)}: nothing of a network",
+            f"{', '.join(others)}: not available for a network",
             expected="--for, --virtual, --seed, --seeds, --jobs, --ledger, --faults, --trace, --commands, --instance, --thread, "
             "--cold, --json",
-            hint="its systems can be run one by one",
+            hint="its systems can be run separately",
         )
     return run_network(request)
 
@@ -297,7 +311,7 @@ def _faults(path: str, system: str, profiles: tuple[str, ...]) -> tuple[dict[str
     from fieldtwin.twin.site.system import load_system
 
     if path == "random":
-        raise UsageError("random faults go with --virtual")
+        raise UsageError("random faults need --virtual")
     aimed_at = load_system(system, [Path(p) for p in profiles])
     return load_faults(Path(path), lambda spec: target(aimed_at, spec))
 
@@ -340,10 +354,10 @@ def _run_virtual(request: VirtualRequest, seeds: str, jobs: int, ledger: Path | 
     )
     if not seeds:
         if ledger is not None:
-            raise UsageError("--ledger goes with --seeds")
+            raise UsageError("--ledger needs --seeds")
         return _run_against(options, Path(request.compare), as_json) if request.compare else run_one(options, as_json)
     if request.trace or request.compare or request.seed is not None:
-        raise UsageError("--seeds makes many runs", hint="--seed, --trace and --compare belong to one")
+        raise UsageError("--seeds, which makes several runs", hint="--seed, --trace and --compare need a single run")
     return run_many(options, parse_seeds(seeds), jobs, as_json, ledger)
 
 

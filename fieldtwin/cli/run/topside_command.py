@@ -23,27 +23,33 @@ from fieldtwin.twin.site.system import System, load_system
 
 @click.command("shore")
 @click.argument("system")
-@click.option("--far", default="", metavar="ENDPOINT", help="Where the far modem is, such as tcp://modem-ashore:502.")
+@click.option(
+    "--far", default="", metavar="ENDPOINT", help="Endpoint of the topside modem, such as tcp://modem-ashore:502."
+)
 @click.option(
     "--field",
     "field_host",
     default="",
     metavar="HOST[:PORT]",
-    help="Or: ask this field side where its far modem listens.",
+    help="Alternatively: ask this field simulator for the endpoint of its topside modem.",
 )
 @click.option(
     "--token",
     type=Secret(),
     default="",
     metavar="@FILE",
-    help="Token of that field side's control channel; or in FIELDTWIN_SHORE_TOKEN.",
+    help="Token of that simulator's control channel; or FIELDTWIN_SHORE_TOKEN.",
 )
-@click.option("--device", default="", help="The transmitter; default: the system's only one.")
+@click.option("--device", default="", help="The transmitter device; default: the system's only one.")
 @click.option(
-    "--commands", default="none", metavar="1,2,0,-1", help="Periods to command, spread over the run; or none."
+    "--commands", default="none", metavar="1,2,0,-1", help="Sample periods to command, spread over the run; or none."
 )
 @click.option(
-    "--for", "duration_s", type=Duration(), default=0.0, help="Stop after a time such as 20s; default: run on."
+    "--for",
+    "duration_s",
+    type=Duration(),
+    default=0.0,
+    help="Stop after a time such as 20s; default: run until Ctrl-C.",
 )
 @profiles_option
 @json_option
@@ -58,10 +64,10 @@ def command(
     profiles: tuple[str, ...],
     as_json: bool,
 ) -> int:
-    """Send commands to SYSTEM from the far end of its transmitter, and show what comes back."""
+    """Send commands to SYSTEM from the topside end of its modem, and show the responses."""
     loaded = load_system(system, tuple(Path(p) for p in profiles))
     if bool(far) == bool(field_host):
-        raise UsageError("where is the far modem?", expected="--far ENDPOINT or --field HOST")
+        raise UsageError("the endpoint of the topside modem is missing", expected="--far ENDPOINT or --field HOST")
     periods = parse_periods(commands)
     return asyncio.run(_run(loaded, _transmitter(loaded, device), far, field_host, token, periods, duration_s, as_json))
 
@@ -88,7 +94,7 @@ async def _run(
     stop = stop_signal()
     endpoint = Endpoint.parse(far) if far else await _ask_field(device, field_host, token)
     shore = Shore(system, device, endpoint, WallClock())
-    talk.print(f"far end of {device} at {endpoint}", soft_wrap=True)
+    talk.print(f"topside end of {device} at {endpoint}", soft_wrap=True)
     serving = asyncio.create_task(shore.run(script(periods, duration_s or 20.0)))
     showing = asyncio.create_task(_show(shore)) if not as_json else None
     stopping = asyncio.create_task(stop.wait())
@@ -115,7 +121,7 @@ async def _ask_field(device: str, field_host: str, token: str) -> Endpoint:
     finally:
         await client.aclose()
     if device not in far:
-        raise UsageError(f"that field side has no far end of {device!r}", expected=", ".join(far) or "none")
+        raise UsageError(f"that field simulator has no topside end of {device!r}", expected=", ".join(far) or "none")
     return reachable(Endpoint.parse(far[device]), host)
 
 

@@ -57,9 +57,7 @@ def run_one(options: VirtualOptions, as_json: bool) -> int:
         print_summary(summary)
         trace = summary["trace"]
         data.print(f"  trace          {trace['events']} events, sha256 {trace['sha256']}", soft_wrap=True)
-        data.print(
-            f"  took           {took_s:.1f} s, {run.elapsed_s / took_s:,.0f} times as fast as time", soft_wrap=True
-        )
+        data.print(f"  took           {took_s:.1f} s, {run.elapsed_s / took_s:,.0f} times real time", soft_wrap=True)
     return 0 if summary["ok"] else 1
 
 
@@ -85,7 +83,7 @@ def run_many(
 ) -> int:
     """Run once for each seed and return the exit status: 0 if all passed.
 
-    With a ledger, seeds that it contains are not run again, and each run is recorded when it ends.
+    With a ledger, seeds that it contains are not repeated, and each run is recorded when it ends.
     """
     from fieldtwin.run.campaigns.ledger import Ledger
     from fieldtwin.run.campaigns.many_seeds import run_seeds, what_runs
@@ -134,16 +132,18 @@ def run_many(
     checked, wrong = sum(r.checked for r in results), sum(r.wrong for r in results)
     table.add_row("published", f"{checked} compared with what the devices held, {wrong} wrong")
     table.add_row("faults", faults_text([one for r in results for one in r.faults]))
-    table.add_row("took", f"{took_s:.1f} s, {options.duration_s * len(results) / took_s:,.0f} times as fast as time")
+    table.add_row("took", f"{took_s:.1f} s, {options.duration_s * len(results) / took_s:,.0f} times real time")
     if ledger is not None:
-        table.add_row("not run again", f"{len(seeds) - len(left)} seeds that the ledger has")
+        table.add_row("not repeated", f"{len(seeds) - len(left)} seeds that the ledger has")
         bad = f", {len(ledger.failed)} runs failed, {ledger.wrong} wrong values" if ledger.failed else ", no run failed"
         table.add_row("the ledger", f"{ledger.hours:g} virtual hours in {len(ledger.entries)} runs{bad}")
     data.print(table)
     for seed in before:
         data.print(f"[red]seed {seed}[/red] failed before, by the ledger: {again(seed)}", soft_wrap=True)
     if untested and not failed and not before:
-        data.print("no fault struck in any run, so nothing was tested with faults: try a longer --for", soft_wrap=True)
+        data.print(
+            "no fault took effect in any run, so nothing was tested with faults: try a longer --for", soft_wrap=True
+        )
         data.print("[bold yellow]inconclusive[/bold yellow]")
         return 1
     data.print("[bold red]not ok[/bold red]" if failed or before else "[bold green]ok[/bold green]")
@@ -153,10 +153,10 @@ def run_many(
 def faults_text(faults: Sequence[tuple[str, int, int]]) -> str:
     """Return how many faults all runs had, and how often they struck, by name."""
     if not faults:
-        return "none was put in"
+        return "none was injected"
     of = {name: [(put_in, struck) for other, put_in, struck in faults if other == name] for name, _, _ in faults}
     parts = [f"{name} {sum(n for n, _ in each)} (struck {sum(m for _, m in each)} times)" for name, each in of.items()]
-    return f"{sum(n for _, n, _ in faults)} put in: {', '.join(sorted(parts))}"
+    return f"{sum(n for _, n, _ in faults)} injected: {', '.join(sorted(parts))}"
 
 
 def _shrink(options: Options, failed: SeedResult) -> None:
@@ -169,7 +169,7 @@ def _shrink(options: Options, failed: SeedResult) -> None:
     small = shrunk(options, failed)
     if small.result.ok:
         data.print(
-            f"seed {failed.seed} does not fail again with the same faults: no scenario is written", soft_wrap=True
+            f"seed {failed.seed} does not fail again with the same faults, so no scenario is written", soft_wrap=True
         )
         return
     path = Path(f"{Path(options.system).stem}-seed{failed.seed}.scenario.yaml")
@@ -186,11 +186,13 @@ def _shrink(options: Options, failed: SeedResult) -> None:
 def shrunk_texts(seed: int, count: int, minimal: bool, passes_without: bool, otherwise: Sequence[str]) -> list[str]:
     """Return in words which faults the failure of a seed needs, and what happens without any of them."""
     if not count:
-        return [f"seed {seed} fails without any fault: the faults are not the cause"]
+        return [f"seed {seed} also fails without faults, so the faults are not the cause"]
     what = f"{count} fault{'s' if count > 1 else ''}"
     least = f"; none of {'them' if count > 1 else 'it'} can be left out" if minimal and count > 1 else ""
     without = (
-        "without faults the run passes" if passes_without else f"without faults it fails otherwise: {otherwise[0]}"
+        "without faults the run passes"
+        if passes_without
+        else f"without faults it fails in a different way: {otherwise[0]}"
     )
     return [f"seed {seed} fails with {what} of its schedule{least}; {without}"]
 

@@ -20,14 +20,14 @@ LONG = ("_URL", "_TTY", "_BAUDRATE", "_FRAME", "_HOST", "_PORT", "_INTERFACE", "
 @click.command("with", context_settings={"allow_interspersed_args": False})
 @click.argument("system")
 @click.argument("argv", nargs=-1, type=click.UNPROCESSED, metavar="-- CMD [ARG]...")
-@click.option("--prototype-file", type=click.Path(exists=True, dir_okay=False), help="Another prototype file.")
+@click.option("--prototype-file", type=click.Path(exists=True, dir_okay=False), help="Use this prototype file.")
 @click.option(
-    "--recording", "recordings", multiple=True, metavar="DEVICE=FILE", help="Play this recording for a device."
+    "--recording", "recordings", multiple=True, metavar="DEVICE=FILE", help="Replay this recording for a device."
 )
-@click.option("--speed", type=float, default=0.0, help="Play recordings this much faster.")
-@click.option("--listen", multiple=True, metavar="BUS=ENDPOINT", help="Let a bus's emulators listen elsewhere.")
-@click.option("--faults", default="", metavar="FILE", help="Put these faults in (fieldtwin faults).")
-@click.option("--instance", default="", help="Name of a run directory that stays; default: one that is removed.")
+@click.option("--speed", type=float, default=0.0, help="Speed factor for recordings.")
+@click.option("--listen", multiple=True, metavar="BUS=ENDPOINT", help="Endpoint for the emulators of a bus.")
+@click.option("--faults", default="", metavar="FILE", help="Inject these faults (see fieldtwin faults).")
+@click.option("--instance", default="", help="Name of a permanent run directory; default: a temporary one.")
 @click.option("--quiet", is_flag=True, help="Do not print the environment.")
 @trust_option
 @profiles_option
@@ -44,16 +44,18 @@ def command(
     trust: bool,
     profiles: tuple[str, ...],
 ) -> int:
-    """Run CMD against the emulated field of SYSTEM, or of a template, and end with CMD's exit status.
+    """Run CMD against the simulated field devices of SYSTEM, or of a template, and end with CMD's exit status.
 
-    No gateway and no PLC of ours: CMD is the control program, or the test suite of one. It finds the field in its environment,
-    by the names of the buses: FIELDTWIN_LINE1 is a path, HOST:PORT or a CAN channel; options come before SYSTEM.
+    fieldtwin's gateway and PLC do not run: CMD is the control program, or its test suite. CMD finds the buses by name in its
+    environment: FIELDTWIN_LINE1 is a path, HOST:PORT or a CAN channel. Options of this command come before SYSTEM.
 
     \b
-    fieldtwin with observatory -- sh -c 'mbpoll -m rtu -a 1 -b 19200 -P even -t 4 -r 1 -1 $FIELDTWIN_LINE1'
+    fieldtwin with observatory -- sh -c \\
+        'mbpoll -m rtu -a 1 -b 19200 -P even -t 4 -r 1 -1 $FIELDTWIN_LINE1'
     fieldtwin with --faults silent.yaml observatory -- pytest tests/
 
-    A signal that ends CMD is 128 and its number, as in a shell. When the field side dies under a CMD that says 0, so does this.
+    If a signal ends CMD, the exit status is 128 plus its number, as in a shell. If the field simulator ends early, the exit
+    status is not 0, even if CMD's is.
     """
     from fieldtwin.gateway.wallclock import run
     from fieldtwin.results.fault_counts import struck_of
@@ -64,7 +66,7 @@ def command(
 
     words = argv[1:] if argv[:1] == ("--",) else argv
     if not words:
-        raise UsageError("with needs a command", expected=f"fieldtwin with {system} -- CMD [ARG]...")
+        raise UsageError("`fieldtwin with` needs a command", expected=f"fieldtwin with {system} -- CMD [ARG]...")
     folders = [Path(p) for p in profiles]
     file = Path(prototype_file) if prototype_file else None
     loaded = load_system(system_file(system, consent(trust=trust), prototype_file=file, profiles=folders), folders)
@@ -87,7 +89,7 @@ def command(
     def tell(env: dict[str, str]) -> None:
         if quiet:
             return
-        talk.print(f"[bold]field side[/bold] of {escape(loaded.name)}")
+        talk.print(f"[bold]field simulator[/bold] of {escape(loaded.name)}")
         show_warnings(loaded.warnings)
         for name, value in env.items():
             if name.endswith(LONG):

@@ -18,7 +18,9 @@ MARK = {Verdict.OK: "[green]ok[/green]  ", Verdict.NOTE: "[yellow]note[/yellow]"
 @click.command("doctor")
 @json_option
 def command(as_json: bool) -> int:
-    """Check Python, shipped data, ports, CAN, real-time limits, processors, clock, files, disk; exit 1 if something is broken."""
+    """Check Python, shipped data, ports, CAN, real-time limits, processors, clock, files and disk. Exit code 1 if a check
+    fails.
+    """
     checks = examine()
     if as_json:
         json.dump(

@@ -17,21 +17,20 @@ from fieldtwin.gateway.core.errors import UsageError
 
 @click.command("draw")
 @click.argument("system")
-@click.option("--prototype", is_flag=True, help="Also what is emulated, with what, and where.")
+@click.option("--prototype", is_flag=True, help="Also show what is emulated, from which source, and at which endpoint.")
 @click.option(
     "-o",
     "--output",
     type=click.Path(dir_okay=False, allow_dash=True, path_type=Path),
-    help="An SVG there; - is stdout.",
+    help="Write an SVG to this file; - is stdout.",
 )
 @profiles_option
 @json_option
 def command(system: str, prototype: bool, output: Path | None, profiles: tuple[str, ...], as_json: bool) -> int:
-    """Draw the wires of SYSTEM, and who hangs on each: as text, or with -o as SVG, which is light or dark as its reader is.
+    """Draw the buses of SYSTEM with their devices: as text, or with -o as SVG, which follows the reader's light or dark theme.
+    For a network, such as `ocean_network`: the positions of its systems, and which of them hear each other.
 
-    Of a network, such as `ocean_network`: where its systems are, and who hears whom.
-
-    Reads the files only: nothing is opened, and no control logic is run.
+    The command only reads the files: it opens no connection and runs no control logic.
     """
     from fieldtwin.reports.drawing.svg import svg
     from fieldtwin.reports.drawing.tree import tree
@@ -42,7 +41,7 @@ def command(system: str, prototype: bool, output: Path | None, profiles: tuple[s
     from fieldtwin.twin.site.system import load_system
 
     if as_json and output is not None:
-        raise UsageError("--json and -o at once", expected="one of them")
+        raise UsageError("--json and -o exclude each other", expected="one of them")
     folders = [Path(folder) for folder in profiles]
     if (network := network_file(system, folders)) is not None:
         return _put(*_network(network, folders), output, as_json)

@@ -25,16 +25,20 @@ from fieldtwin.gateway.core.errors import UsageError
     type=click.Path(dir_okay=False, path_type=Path),
     help="The document, HTML.",
 )
-@click.option("--site", default="", help="What the place is called.  [default: the name of the folder]")
-@click.option("--by", default="", help="Who carried it out.  [default: as the files say]")
-@click.option("--for", "customer", default="", help="Who it is for; stands at the signature.")
-@click.option("--remarks", default="", help="What else is to be said.")
+@click.option("--site", default="", help="Name of the site.  [default: the name of the folder]")
+@click.option("--by", default="", help="Name of the person who carried it out.  [default: as the files say]")
+@click.option("--for", "customer", default="", help="Name of the operator, printed at the signature.")
+@click.option("--remarks", default="", help="Additional remarks.")
 @click.option(
     "--label", "labels", multiple=True, metavar="DEVICE=TEXT",
-    help="What a device is called on site; DEVICE is `unit 1`, or its number in the document. Repeatable.",
+    help="The device's name on site; DEVICE is `unit 1`, or its number in the document. Repeatable.",
 )  # fmt: skip
 @click.option(
-    "--serial", "serials", multiple=True, metavar="DEVICE=TEXT", help="A serial number from a name plate; repeatable."
+    "--serial",
+    "serials",
+    multiple=True,
+    metavar="DEVICE=TEXT",
+    help="The serial number on the device's name plate; repeatable.",
 )
 @json_option
 def command(
@@ -48,13 +52,14 @@ def command(
     serials: tuple[str, ...],
     as_json: bool,
 ) -> int:
-    """Make a site acceptance document of what was found: who, when, which serial numbers, every deviation, room to sign.
+    """Make a site acceptance document from results: persons, dates, serial numbers, every deviation, and space for signatures.
 
     \b
     fieldtwin report site/ -o acceptance.html --serial "unit 1=A1234"
     fieldtwin report unit1.json unit1-dump.jsonl node5.json
 
-    SITE is files, or folders of them: dumps, and the JSON of `check --out`, `diff` and `compare`. Print it from any browser.
+    SITE is files, or folders of files: dumps, and the JSON of `check --out`, `diff` and `compare`. Print the document from a
+    browser.
     """
     from fieldtwin.reports.site.html import NOTED, plural, write_html
     from fieldtwin.reports.site.reading import read_site

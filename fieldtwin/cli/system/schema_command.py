@@ -83,13 +83,13 @@ def command(kind: str) -> int:
 
     \b
     system      the plant: buses, devices, programs
-    prototype   what is emulated of it, with what
-    network     systems whose modems are in one water, as prototypes
+    prototype   which devices of it are emulated, and from which source
+    network     systems whose modems share an acoustic channel, as prototypes
     profile     a device: its registers or objects
-    faults      what goes wrong, for run --faults and link --faults
-    scenario    what is done and what must be seen, for test
-    waivers     failures that somebody answers for, for check and test
-    rules       what a digital twin commands by what it finds, for twin --plan
+    faults      injected faults, for run --faults and link --faults
+    scenario    steps and expected results, for test
+    waivers     accepted failures with an owner, for check and test
+    rules       a digital twin's commands for its findings, for twin --plan
     """
     schema = {"$schema": "https://json-schema.org/draft/2020-12/schema", **SCHEMAS[kind]()}
     json.dump(schema, sys.stdout, indent=2)

@@ -32,10 +32,10 @@ KINDS: dict[str, DocumentKind] = {kind: kind for kind in DOCUMENTS}
 
 @click.group("template")
 def command() -> None:
-    """A system and all that it takes, as one file: pack, check, compare, unpack.
+    """Pack a system and all its files into one file; check, compare and unpack such files.
 
-    A template has the system file, profiles, EDS files, control logic, recordings, the digital model, the version and hash of the
-    control software, and documents. `fieldtwin run T.zip --prototype` works from it alone.
+    A template has the system file, profiles, EDS files, control logic, recordings, the digital model, the version and hash of
+    the control software, and documents. `fieldtwin run T.zip --prototype` needs no other file.
     """
 
 
@@ -45,13 +45,13 @@ def command() -> None:
     "-o", "--out", required=True, type=click.Path(path_type=Path), help="The template: FILE.zip, or a new folder."
 )
 @click.option(
-    "--prototype-file", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="Another prototype file."
+    "--prototype-file", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="Use this prototype file."
 )
 @click.option(
     "--document", "documents", multiple=True, metavar="KIND=FILE", help="A document: " + ", ".join(KINDS) + "."
 )
 @click.option(
-    "--wheel", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="Put this wheel of fieldtwin in."
+    "--wheel", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="Include this wheel of fieldtwin."
 )
 @profiles_option
 @json_option
@@ -64,7 +64,7 @@ def pack_command(
     profiles: tuple[str, ...],
     as_json: bool,
 ) -> int:
-    """Pack SYSTEM and everything that it names into a template. The same files give the same bytes."""
+    """Pack SYSTEM and every file that it names into a template. Equal files give an identical template."""
     folders = tuple(Path(p) for p in profiles)
     loaded = load_system(system, folders)
     beside = prototype_path(loaded)
@@ -78,7 +78,7 @@ def pack_command(
         f"{escape(str(out))}: {len(manifest.files)} files, {total:,} bytes; template {manifest.id[:16]}", soft_wrap=True
     )
     if not manifest.prototype_file:
-        talk.print("it has no prototype file: it runs as a plant only")
+        talk.print("it has no prototype file, so it runs only as a plant")
     return 0
 
 
@@ -99,7 +99,7 @@ def _documents(values: tuple[str, ...]) -> dict[DocumentKind, tuple[Path, ...]]:
 @click.option("-o", "--out", type=click.Path(path_type=Path), help="The folder; default: the template's name, here.")
 @json_option
 def unpack_command(template: Path, out: Path | None, as_json: bool) -> int:
-    """Write TEMPLATE as a folder. Every file is compared with its hash; nothing of it is run."""
+    """Unpack TEMPLATE to a folder. Every file is compared with its hash; no code of the template runs."""
     out = out or Path(template.stem)
     with open_package(template) as package:
         unpack(package, out)
@@ -112,7 +112,7 @@ def unpack_command(template: Path, out: Path | None, as_json: bool) -> int:
     )
     if manifest.code:
         talk.print(
-            f"control logic in Python, not run: {shown(manifest.code)}. Read it before you do.",
+            f"control logic in Python, not run: {shown(manifest.code)}. Read it before you run it.",
             soft_wrap=True,
         )
     return 0
@@ -120,12 +120,12 @@ def unpack_command(template: Path, out: Path | None, as_json: bool) -> int:
 
 @command.command("check")
 @click.argument("template", type=click.Path(exists=True, path_type=Path))
-@click.option("--trust", is_flag=True, help="Import control logic in Python that the template brings, without asking.")
+@click.option("--trust", is_flag=True, help="Import the template's control logic in Python without asking.")
 @json_option
 def check_command(template: Path, trust: bool, as_json: bool) -> int:
-    """Say whether TEMPLATE is whole: every hash, every file that its system names, and that a prototype could start.
+    """Check that TEMPLATE is complete: every hash, every file that its system names, and that a prototype can start.
 
-    Control logic in Python is imported after a yes only; without one the rest is checked.
+    Control logic in Python is imported only after a confirmation; without one, the rest is checked.
     """
     with open_package(template) as package, tempfile.TemporaryDirectory() as place:
         if package.path.is_dir():
@@ -145,26 +145,26 @@ def check_command(template: Path, trust: bool, as_json: bool) -> int:
         _print_json({**_described(manifest), "ok": True, "control_logic_checked": may_run, "same_software_here": same})
         return 0
     _print_files(manifest)
-    talk.print("every hash is right, and nothing that the system names is missing")
+    talk.print("every hash is correct, and no file of the system is missing")
     if not may_run:
-        talk.print("its control logic was not looked at")
+        talk.print("its control logic was not checked")
     if not same:
         there = f"{manifest.software.version}, modules {manifest.software.modules_sha256[:12]}"
         here_is = f"{__version__}, modules {modules_hash()[:12]}"
-        talk.print(f"it was packed by other software: {there}; here is {here_is}", soft_wrap=True)
+        talk.print(f"it was packed by a different version: {there}; this is {here_is}", soft_wrap=True)
     return 0
 
 
 @command.command("diff")
 @click.argument("before", type=click.Path(exists=True, path_type=Path))
 @click.argument("after", type=click.Path(exists=True, path_type=Path))
-@click.option("--names", is_flag=True, help="Only which files differ.")
+@click.option("--names", is_flag=True, help="Show only the names of the different files.")
 @json_option
 def diff_command(before: Path, after: Path, names: bool, as_json: bool) -> int:
-    """Compare two templates: zip files, folders, or one of each. Exit code 1 when they differ.
+    """Compare two templates: zip files, folders, or one of each. Exit code 1 if they differ.
 
-    The files of a folder are compared as they are now, edited or not. A zip is compared as it was packed.
-    A damaged zip is refused.
+    The files of a folder are compared in their present, possibly edited, state; those of a zip as they were packed. A damaged
+    zip is rejected.
     """
     with open_package(before, edited=True) as a, open_package(after, edited=True) as b:
         old, new = a.contents(), b.contents()

@@ -71,7 +71,7 @@ def _show_seed(result: ScenarioResult, show: Callable[[ScenarioResult], None]) -
     struck = [f"{one.name} on {one.on} ({one.struck} times)" for one in result.faults if one.struck]
     idle = sum(not one.struck for one in result.faults)
     told = [*struck[:FAULTS_SHOWN], *([f"{len(struck) - FAULTS_SHOWN} more"] if len(struck) > FAULTS_SHOWN else [])]
-    told += [f"{idle} never struck"] if idle else []
+    told += [f"{idle} never took effect"] if idle else []
     text = "; ".join(told) or "no fault"
     data.print(f"[green]passed[/green]  seed {result.seed}  [dim]{escape(text)}[/dim]", soft_wrap=True, highlight=False)
 
@@ -89,7 +89,9 @@ def _shrink(campaign: Campaign, failed: ScenarioResult, told: bool) -> list[Scen
     talk.print(f"shrinking the faults of seed {failed.seed}", markup=False)
     small = shrink_seed(campaign, failed)
     if not small.result.verdict.bad:
-        talk.print(f"seed {small.seed} does not fail again with the same faults: no scenario is written", markup=False)
+        talk.print(
+            f"seed {small.seed} does not fail again with the same faults, so no scenario is written", markup=False
+        )
         return []
     path = Path(f"{campaign.path.name.removesuffix('.scenario.yaml')}-seed{small.seed}.scenario.yaml")
     write_text(path, scenario_of(campaign, small, Path()))
@@ -99,7 +101,7 @@ def _shrink(campaign: Campaign, failed: ScenarioResult, told: bool) -> list[Scen
     )
     lines.append(f"it is written to {path}")
     lines.append(
-        CONFIRMED if confirmed else f"not confirmed: this scenario ends otherwise; use {small.result.reproduce}"
+        CONFIRMED if confirmed else f"not confirmed: this scenario has a different result; use {small.result.reproduce}"
     )
     for line in lines if told else ():
         data.print(f"  {line}", soft_wrap=True, markup=False, highlight=False)

@@ -39,30 +39,30 @@ _OBJECT = re.compile(r"^([0-9A-Fa-f]{4}):([0-9A-Fa-f]{2})=((?:[0-9A-Fa-f]{2})+)$
 
 @click.group("check")
 def command() -> None:
-    """Test a device from outside, or a master with devices that misbehave.
+    """Run conformance tests on a device, or on a client or master with devices that misbehave.
 
-    Exit code 0 when cases passed and no case that --fail-on counts has failed, else 1. SKIPPED and INCONCLUSIVE neither
-    pass nor fail.
+    Exit code 0 if test cases passed and none that --fail-on counts has failed, else 1. SKIPPED and INCONCLUSIVE neither pass
+    nor fail.
     """
 
 
 def _shared(function: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options of every conformance test."""
     options = [
-        click.option("--only", metavar="IDS", help="Play only these cases or rows, separated by commas: MB-013,MB-015a."),
+        click.option("--only", metavar="IDS", help="Run only these test cases or rows, separated by commas: MB-013,MB-015a."),
         click.option(
             "--at-most",
             type=click.Choice(DANGERS),
             default="disrupt",
             show_default=True,
-            help="Skip cases of a higher danger.",
+            help="Skip test cases with a higher impact level.",
         ),
         click.option("--for", "for_s", type=Duration(), default="0", help="Begin no case after this time.  [default: no limit]"),
         click.option("--wait", "wait_s", type=Duration(), default="30s", show_default=True,
-                     help="How long to wait for the master's first request."),
+                     help="Time to wait for the first request."),
         click.option(
             "--patience", "patience_s", type=Duration(), default="10s", show_default=True,
-            help="How long the master may take to recover; more than its longest pause.",
+            help="Time for the client or master to recover; longer than its longest pause.",
         ),
         click.option("--waivers", "waivers_path", type=click.Path(path_type=Path),
                      help="YAML file of accepted failures: id, reason, expires."),
@@ -71,8 +71,8 @@ def _shared(function: Callable[..., Any]) -> Callable[..., Any]:
         junit_flavour_option,
         click.option("--html", type=FILE, help="Write a report with every frame."),
         click.option("-o", "--out", type=FILE, help="Write the JSON to a file."),
-        click.option("--log", "log_path", type=FILE, help="Append all frames that are sent and received, as JSON lines."),
-        click.option("--list", "list_only", is_flag=True, help="Show the cases with their basis, and end."),
+        click.option("--log", "log_path", type=FILE, help="Append all sent and received frames, as JSON lines."),
+        click.option("--list", "list_only", is_flag=True, help="List the test cases with their basis, and exit."),
         json_option,
     ]  # fmt: skip
     return _with(options, function)
@@ -83,7 +83,7 @@ def _seen(what: str, timeout: str) -> Callable[[Callable[..., Any]], Callable[..
     options = [
         click.option(
             "--probe", default="", metavar="WHERE",
-            help="Where the master publishes the value: tcp://HOST:PORT/holding:100[+COUNT][@UNIT], output (numbers "
+            help="Where the client or master publishes the value: tcp://HOST:PORT/holding:100[+COUNT][@UNIT], output (numbers "
             "that the program prints), or output:TEXT (what it prints after TEXT).",
         ),
         click.option(
@@ -91,10 +91,10 @@ def _seen(what: str, timeout: str) -> Callable[[Callable[..., Any]], Callable[..
         ),
         click.option(
             "--values", default="1111,2222,3333", show_default=True, metavar="A,B,BAD",
-            help=f"What {what} hold: two good ones and a poison.",
+            help=f"Values of {what}: two valid ones, and one that must never be published.",
         ),
         click.option("--none", "none", multiple=True, metavar="VALUE",
-                     help="What the probe shows where there is no value; repeatable."),
+                     help="The probe's text or number for a missing value; repeatable."),
     ]  # fmt: skip
     return lambda function: _with(options, function)
 
@@ -110,17 +110,17 @@ def _with(options: Sequence[Callable[..., Any]], function: Callable[..., Any]) -
 @click.option(
     "--listen",
     metavar="ENDPOINT",
-    help="tcp://HOST:PORT, rtu+tcp://HOST:PORT, pty:PATH, rtu:PORT or ascii:PORT; port 0 takes a free one.",
+    help="tcp://HOST:PORT, rtu+tcp://HOST:PORT, pty:PATH, rtu:PORT or ascii:PORT; port 0 selects a free port.",
 )
 @_seen("registers", "response timeout")
 @click.option(
     "--hold",
     multiple=True,
     metavar="TABLE:ADDRESS=VALUE",
-    help="A register or bit that always holds this value; repeatable.",
+    help="A register or bit with a constant value; repeatable.",
 )
-@click.option("--echo", is_flag=True, help="The master is set up for a line that echoes its requests.")
-@click.option("--ascii", "in_ascii", is_flag=True, help="On pty:PATH: the master speaks Modbus ASCII.")
+@click.option("--echo", is_flag=True, help="The client is set up for a line that echoes its requests.")
+@click.option("--ascii", "in_ascii", is_flag=True, help="On pty:PATH: the client uses Modbus ASCII.")
 @_shared
 @click.argument("argv", nargs=-1, type=click.UNPROCESSED, metavar="[-- PROGRAM [ARG]...]")
 def modbus_master(
@@ -148,18 +148,18 @@ def modbus_master(
     as_json: bool,
     argv: tuple[str, ...],
 ) -> int:
-    """Test a Modbus client (master) with a device that misbehaves, one case after the other.
+    """Test a Modbus client (master) with a server that misbehaves, one test case after another.
 
     \b
     fieldtwin check modbus-master --listen tcp://127.0.0.1:5020 \\
         --probe tcp://plc:502/holding:100
     fieldtwin check modbus-master --listen pty:/tmp/line --timeout 1s \\
-        --probe output -- python my_master.py
+        --probe output -- python my_client.py
 
-    The master keeps its own polling. A program after -- finds the endpoint in FIELDTWIN_ENDPOINT, FIELDTWIN_HOST and
+    The client keeps its normal polling. A program after -- finds the endpoint in FIELDTWIN_ENDPOINT, FIELDTWIN_HOST and
     FIELDTWIN_PORT, or FIELDTWIN_TTY.
 
-    Exit code 0 when cases passed and no case that --fail-on counts has failed, else 1.
+    Exit code 0 if test cases passed and none that --fail-on counts has failed, else 1.
     """
     from fieldtwin.conformance.clients.modbus.cases import CASES
     from fieldtwin.conformance.clients.run import Plan
@@ -192,12 +192,14 @@ def modbus_master(
 
 
 @command.command("canopen-master")
-@click.option(
-    "--listen", metavar="ENDPOINT", help="can:fieldtwin/HOST:PORT, which is made, or can:socketcan/INTERFACE."
-)
+@click.option("--listen", metavar="ENDPOINT", help="can:fieldtwin/HOST:PORT (created), or can:socketcan/INTERFACE.")
 @click.option("--bitrate", type=click.IntRange(10_000, 1_000_000), default=125_000, show_default=True, help="bit/s")
 @click.option(
-    "--node", "nodes", multiple=True, type=click.IntRange(1, 127), help="A node that boots by itself; repeatable."
+    "--node",
+    "nodes",
+    multiple=True,
+    type=click.IntRange(1, 127),
+    help="A node that boots without a command; repeatable.",
 )
 @click.option("--heartbeat", "heartbeat_s", type=Duration(), default="1s", show_default=True, help="0: none.")
 @click.option("--size", type=click.Choice(["2", "4"]), default="4", show_default=True, help="Bytes of an object.")
@@ -237,7 +239,7 @@ def canopen_master(
     as_json: bool,
     argv: tuple[str, ...],
 ) -> int:
-    """Test a CANopen master with nodes that misbehave, one case after the other.
+    """Test a CANopen master with nodes that misbehave, one test case after another.
 
     \b
     fieldtwin check canopen-master --listen can:fieldtwin/127.0.0.1:29536 \\
@@ -248,7 +250,7 @@ def canopen_master(
     Every node ID answers SDO requests. A program after -- finds the bus in FIELDTWIN_ENDPOINT, FIELDTWIN_INTERFACE and
     FIELDTWIN_CHANNEL, which are python-can's names.
 
-    Exit code 0 when cases passed and no case that --fail-on counts has failed, else 1.
+    Exit code 0 if test cases passed and none that --fail-on counts has failed, else 1.
     """
     from fieldtwin.conformance.clients.canopen.cases import CASES
     from fieldtwin.conformance.clients.run import Plan

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from fieldtwin.results.subject import Subject
 
 DANGERS = ("observe", "read", "write", "disrupt")
-_WRITES = "writes, wrong ones too; what is given by --write gets back what was there"
+_WRITES = "writes, also invalid ones; the values of --write are restored"
 MEANS = {
     "modbus": {
         "write": _WRITES,
@@ -46,24 +46,24 @@ def shared(function: F) -> F:
     """Add the options of every device check."""
     options = [
         click.option(
-            "--allow", type=click.Choice(DANGERS), help="The most dangerous cases to play.  [default: read; write with --write]"
+            "--allow", type=click.Choice(DANGERS), help="Highest impact level to run.  [default: read; write with --write]"
         ),
         click.option("--yes", is_flag=True, help="Do not ask before cases that write or disrupt."),
-        click.option("--i-know", is_flag=True, help="Also what reaches every device on the line, or restarts this one."),
-        click.option("--dry-run", is_flag=True, help="Show what would be sent, and send nothing."),
-        click.option("--only", metavar="IDS", help="These cases or rows only, with commas: MB-036,MB-045a."),
+        click.option("--i-know", is_flag=True, help="Also run cases that reach every device on the line, or restart this one."),
+        click.option("--dry-run", is_flag=True, help="Show the frames that would be sent; send nothing."),
+        click.option("--only", metavar="IDS", help="Run only these test cases or rows, separated by commas: MB-036,MB-045a."),
         click.option("--rate", type=click.FloatRange(0.1, 10_000), default=20.0, show_default=True,
-                     help="Requests a second, at most."),
-        click.option("--for", "for_s", type=Duration(), default="0", help="Begin no case after this time."),
-        click.option("--waivers", "waivers_path", type=click.Path(path_type=Path), help="YAML: id, reason, expires."),
+                     help="Maximum requests per second."),
+        click.option("--for", "for_s", type=Duration(), default="0", help="Begin no test case after this time."),
+        click.option("--waivers", "waivers_path", type=click.Path(path_type=Path), help="YAML: accepted failures."),
         fail_on_option,
-        click.option("--by", help="Who checks; stands in the reports.  [default: the name you are logged in by]"),
+        click.option("--by", help="Name of the tester, for the reports.  [default: your login name]"),
         click.option("--html", type=FILE, help="Write a report with every byte."),
         click.option("--junit", type=FILE, help="Write the verdicts as JUnit XML."),
         junit_flavour_option,
         click.option("-o", "--out", type=FILE, help="Write the JSON to a file, for `fieldtwin report`."),
-        click.option("--log", "log_path", type=FILE, help="Append all that is sent and heard, as JSON lines."),
-        click.option("--list", "list_only", is_flag=True, help="Show the cases and end."),
+        click.option("--log", "log_path", type=FILE, help="Append all sent and received frames, as JSON lines."),
+        click.option("--list", "list_only", is_flag=True, help="List the test cases and exit."),
         json_option,
     ]  # fmt: skip
     for option in reversed(options):
@@ -91,7 +91,7 @@ class Check:
         self.waivers = load_waivers(path, known) if path else Waivers()
         allow = self.options["allow"] or ("write" if writes else "read")
         if writes and Danger(allow).rank < Danger.WRITE.rank:
-            raise UsageError("--write with cases that only read", expected="--allow write or disrupt", got=allow)
+            raise UsageError("--write needs test cases that write", expected="--allow write or disrupt", got=allow)
         if self.options["i_know"]:
             has = has | {"i-know"}
         return Plan(only_of(self.options["only"], cases), Danger(allow), frozenset(has), self.options["for_s"])
@@ -109,9 +109,13 @@ class Check:
         for danger, means in MEANS[self.protocol].items():
             ids = [c.id for c in risky if c.danger.value == danger]
             if ids:
-                talk.print(f"{len(ids)} cases of danger {danger}: {means}.\n  {', '.join(ids)}", markup=False)
+                talk.print(
+                    f"{len(ids)} test cases with impact level {danger}: {means}.\n  {', '.join(ids)}", markup=False
+                )
         if not sys.stdin.isatty():
-            raise NotAllowed("cases that do more than reading are confirmed", expected="--yes, or a terminal to ask on")
+            raise NotAllowed(
+                "test cases that do more than read need a confirmation", expected="--yes, or a terminal to ask on"
+            )
         click.confirm("Play them?", abort=True, err=True)
 
     def done(self, subject: Subject, checked: Checked) -> int:
@@ -139,7 +143,7 @@ class Check:
             json.dump(document, sys.stdout, indent=2)
             sys.stdout.write("\n")
         else:
-            print_results(results, "what is asked", all_wires=bool(self.options["only"]))
+            print_results(results, "request", all_wires=bool(self.options["only"]))
             print_not_counted(results, fail_on)
         return INTERRUPTED if self.interrupted else exit_code(results, fail_on)
 
@@ -156,12 +160,12 @@ class Check:
         with ExitStack() as stack:
             path = self.options["log_path"]
             log = stack.enter_context(WireLog(path, self.words)) if path is not None else None
-            progress = stack.enter_context(Progress(most, "looking how it answers"))
+            progress = stack.enter_context(Progress(most, "examining its answers"))
 
             def go_on() -> str:
                 if self.interrupted:
                     return "interrupted"
-                return "the log of what is sent is full" if log is not None and log.full else ""
+                return "the log of sent frames is full" if log is not None and log.full else ""
 
             async def main() -> Checked:
                 taps = (log,) if log is not None else ()
@@ -171,7 +175,7 @@ class Check:
                     if self.interrupted:
                         task.cancel()
                     self.interrupted = True
-                    talk.print("ends behind this case; Ctrl-C again: at once", markup=False)
+                    talk.print("ends after this test case; press Ctrl-C again to end at once", markup=False)
 
                 with suppress(NotImplementedError):  # not on Unix
                     asyncio.get_running_loop().add_signal_handler(signal.SIGINT, stop)
@@ -200,7 +204,7 @@ class Check:
 
         played = sum(bool(result.spoken) for result in on_paper.results)
         talk.print(
-            f"{played} cases, about {max(1, round(on_paper.took_s))} s where it answers at once; Ctrl-C stops",
+            f"{played} cases, about {max(1, round(on_paper.took_s))} s if the device answers at once; Ctrl-C stops",
             markup=False,
         )
 

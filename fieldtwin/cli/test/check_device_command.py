@@ -21,18 +21,20 @@ _OBJECT = re.compile(r"^([0-9A-Fa-f]{4})h?(?::([0-9A-Fa-f]{1,2}))?$")
 
 @click.command("modbus")
 @click.argument("endpoint", required=False)
-@click.option("--unit", type=click.IntRange(0, 255), default=1, show_default=True, help="The unit id.")
+@click.option("--unit", type=click.IntRange(0, 255), default=1, show_default=True, help="Unit ID of the device.")
 @click.option(
     "--read", "reads", multiple=True, metavar="TABLE:ADDRESS",
-    help="A cell that can be read, such as holding:100 or holding:0x163, if none is near 0, 1, 100, 1000, 40000; repeatable.",
+    help="A readable register or bit, such as holding:100 or holding:0x163, if none is near 0, 1, 100, 1000, 40000; repeatable.",
 )  # fmt: skip
 @click.option(
     "--write", "writes", multiple=True, metavar="TABLE:ADDRESS[+COUNT]",
     help="A cell that may be written, holding or coil, also in hexadecimal; what was there is put back. Repeatable.",
 )  # fmt: skip
-@click.option("--timeout", "timeout_s", type=Duration(), default="1s", show_default=True, help="For each reply.")
-@click.option("--echo", is_flag=True, help="The adapter hears what it sends.")
-@click.option("--share-bus", is_flag=True, help="Also on a line on which somebody else talks.")
+@click.option(
+    "--timeout", "timeout_s", type=Duration(), default="1s", show_default=True, help="Timeout for each reply."
+)
+@click.option("--echo", is_flag=True, help="The adapter echoes the sent bytes.")
+@click.option("--share-bus", is_flag=True, help="Also run on a line that carries other traffic.")
 @shared
 def modbus(
     endpoint: str | None,
@@ -44,14 +46,14 @@ def modbus(
     share_bus: bool,
     **options: Any,
 ) -> int:
-    """Judge a Modbus device from outside: the rows of the catalogue that a master can ask for.
+    """Test a Modbus device: all test cases of the list that a client can run.
 
     \b
     fieldtwin check modbus tcp://192.0.2.7:502 --unit 1 --html unit1.html
     fieldtwin check modbus 'rtu:/dev/ttyUSB0?baudrate=9600&frame=8N1' --unit 17
     fieldtwin check modbus tcp://192.0.2.7:502 --write holding:100 --dry-run
 
-    Reads only, unless told otherwise. Exit code 0 when cases passed and no case that --fail-on counts has failed, else 1.
+    By default it sends only reads. Exit code 0 if test cases passed and none that --fail-on counts has failed, else 1.
     """
     from fieldtwin.conformance.devices.dry_run import modbus_on_paper
     from fieldtwin.conformance.devices.modbus.cases import CASES
@@ -86,22 +88,26 @@ def modbus(
 
 @click.command("canopen")
 @click.argument("endpoint", required=False)
-@click.option("--node", type=click.IntRange(1, 127), help="The node id.")
+@click.option("--node", type=click.IntRange(1, 127), help="Node ID of the device.")
 @click.option(
     "--eds",
     type=click.Path(exists=True, dir_okay=False, path_type=Path),
-    help="Its data sheet, EDS or DCF: for limits and access.",
+    help="Its data sheet (EDS or DCF), for limits and access rights.",
 )
-@click.option("--bitrate", type=click.IntRange(10_000, 1_000_000), help="bit/s, where the bus does not know it.")
+@click.option(
+    "--bitrate", type=click.IntRange(10_000, 1_000_000), help="Bit rate in bit/s, if the bus does not define it."
+)
 @click.option(
     "--write", "writes", multiple=True, metavar="INDEX:SUB",
     help="An object that may be written, such as 2000:00 or 1017:00; what was there is put back. Repeatable.",
 )  # fmt: skip
-@click.option("--timeout", "timeout_s", type=Duration(), default="500ms", show_default=True, help="For each SDO reply.")
 @click.option(
-    "--boot", "boot_s", type=Duration(), default="10s", show_default=True, help="For a boot-up after a reset."
+    "--timeout", "timeout_s", type=Duration(), default="500ms", show_default=True, help="Timeout for each SDO reply."
 )
-@click.option("--share-bus", is_flag=True, help="Also a node that another master speaks SDO with.")
+@click.option(
+    "--boot", "boot_s", type=Duration(), default="10s", show_default=True, help="Timeout for the boot-up after a reset."
+)
+@click.option("--share-bus", is_flag=True, help="Also run on a node that another master uses over SDO.")
 @shared
 def canopen(
     endpoint: str | None,
@@ -114,13 +120,13 @@ def canopen(
     share_bus: bool,
     **options: Any,
 ) -> int:
-    """Judge a CANopen node from outside: the rows of the catalogue that a master can ask for.
+    """Test a CANopen node: all test cases of the list that a master can run.
 
     \b
     fieldtwin check canopen can:socketcan/can0 --node 5 --eds inclinometer.eds
     fieldtwin check canopen can:fieldtwin/127.0.0.1:29536 --node 5 --write 1017:00
 
-    Uploads only, unless told otherwise. Exit code 0 when cases passed and no case that --fail-on counts has failed, else 1.
+    By default it sends only uploads. Exit code 0 if test cases passed and none that --fail-on counts has failed, else 1.
     """
     from fieldtwin.conformance.devices.canopen.cases import CASES
     from fieldtwin.conformance.devices.canopen.session import CanopenOptions, check_canopen
@@ -131,7 +137,7 @@ def canopen(
     if not endpoint or node is None:
         raise UsageError("no node to check", expected="an endpoint such as can:socketcan/can0, and --node")
     if not Endpoint.parse(endpoint).is_can:
-        raise UsageError("CANopen is spoken on a CAN bus", expected="such as can:socketcan/can0", got=endpoint)
+        raise UsageError("CANopen needs a CAN bus", expected="such as can:socketcan/can0", got=endpoint)
     may_write = tuple(_object(text) for text in writes)
     check = Check("canopen", endpoint, node, options)
     has = ({"object"} if may_write else set()) | ({"eds"} if eds is not None else set())

@@ -44,7 +44,7 @@ DANGER = {"observe": "dim", "read": "cyan", "write": "yellow", "disrupt": "magen
 class Progress:
     """A progress bar on a terminal; elsewhere failures are printed as they occur."""
 
-    def __init__(self, most: int, at_first: str = "learning how it polls") -> None:
+    def __init__(self, most: int, at_first: str = "learning the polling pattern") -> None:
         self._bar = Bar(
             TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed:.0f} cases"), console=talk,
             transient=True, disable=not talk.is_terminal,
@@ -98,7 +98,7 @@ def print_results(results: Sequence[CaseResult], does: str = "the device", *, al
     parts = [f"[{styles[word]}]{counts[word]} {word}[/]" for word in order if counts[word]]
     data.print(", ".join(parts) or "no case was chosen")
     if elsewhere:
-        talk.print(f"{len(elsewhere)} more cases are for other wires", markup=False)
+        talk.print(f"{len(elsewhere)} more test cases are for other kinds of bus", markup=False)
 
 
 def _print_each(results: Sequence[CaseResult], does: str) -> None:
@@ -114,7 +114,7 @@ def _print_each(results: Sequence[CaseResult], does: str) -> None:
         table.add_column("case", no_wrap=True)
         table.add_column("danger", no_wrap=True)
         table.add_column(does, ratio=2)
-        table.add_column("what was found", ratio=3)
+        table.add_column("result", ratio=3)
         for r in results:
             style, danger = style_of(r), r.case.danger.value
             found = r.reason or r.verdict.value
@@ -169,7 +169,12 @@ def print_paper(checked: Checked, *, as_json: bool) -> None:
     played = [r for r in checked.results if r.spoken]
     if as_json:
         cases = [
-            {"id": "before", "title": "how it answers, and who it is", "danger": "read", "sent": _sent(checked.before)}
+            {
+                "id": "before",
+                "title": "its answers and its identification",
+                "danger": "read",
+                "sent": _sent(checked.before),
+            }
         ]
         cases += [
             {"id": r.case.id, "title": r.case.title, "danger": r.case.danger.value, "sent": _sent(r.spoken)}
@@ -178,15 +183,15 @@ def print_paper(checked: Checked, *, as_json: bool) -> None:
         json.dump({"kind": "fieldtwin check dry run", "cases": cases}, sys.stdout, indent=2)
         sys.stdout.write("\n")
         return
-    data.print("before: how it answers, and who it is", markup=False)
+    data.print("before: its answers and its identification", markup=False)
     _print_sent(_sent(checked.before))
     for r in played:
         danger = r.case.danger.value
         data.print(f"{r.case.id} [{DANGER[danger]}]{danger}[/] {escape(r.case.title)}", soft_wrap=True)
         _print_sent(_sent(r.spoken))
     talk.print(
-        f"{len(played)} cases. The usual read stands before each as well. As a device answers that does all it must; "
-        "another leads to other frames in places.", markup=False, soft_wrap=True,
+        f"{len(played)} cases. A normal read precedes each case as well. The frames are those for a conforming device; "
+        "other devices can lead to different frames.", markup=False, soft_wrap=True,
     )  # fmt: skip
 
 

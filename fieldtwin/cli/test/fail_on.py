@@ -15,8 +15,8 @@ FAIL_ON = {"standard": 1, "robustness": 2, "field": 3}
 """The number of bases, in the order of `Basis`, that decide the exit code."""
 fail_on_option = click.option(
     "--fail-on", type=click.Choice(tuple(FAIL_ON)), default="standard", show_default=True,
-    help="Which failed cases give exit code 1: those that the standard requires, also those of robustness, or also known "
-         "field problems.",
+    help="Failed cases that cause exit code 1: those required by the standard, also robustness, or also known field "
+         "problems.",
 )  # fmt: skip
 
 

@@ -53,17 +53,19 @@ class _WithCommand(click.Command):
     type=click.Choice(["virtual", "local", "compose", "real"]),
     default="virtual",
     show_default=True,
-    help="Virtual time; processes on this host; containers; a plant.",
+    help="Where to run: virtual time, processes on this host, containers, a plant.",
 )
 @click.option(
     "--allow",
     type=click.Choice([danger.value for danger in Danger]),
     default=Danger.READ.value,
     show_default=True,
-    help="With --target real: what steps may do at most.",
+    help="With --target real: highest impact level of steps.",
 )
-@click.option("--instance", default="", help="With compose, real: what runs on this host under that name.")
-@click.option("--field", "field_host", default="", metavar="HOST[:PORT]", help="With compose: the field side.")
+@click.option("--instance", default="", help="With compose, real: name of the running instance on this host.")
+@click.option(
+    "--field", "field_host", default="", metavar="HOST[:PORT]", help="With compose: address of the field simulator."
+)
 @click.option(
     "--with",
     "with_command",
@@ -75,35 +77,41 @@ class _WithCommand(click.Command):
     type=Secret(),
     default="",
     metavar="@FILE",
-    help="Token of that field side's control channel; or in FIELDTWIN_TEST_TOKEN.",
+    help="Token of that simulator's control channel; or FIELDTWIN_TEST_TOKEN.",
 )
-@click.option("--far", default="", metavar="ENDPOINT", help="With real: where the far modem is, for `send`.")
+@click.option("--far", default="", metavar="ENDPOINT", help="With real: endpoint of the topside modem, for `send`.")
 @click.option(
     "--capture",
     type=click.Path(exists=True, dir_okay=False),
-    help="With --instance: the file that its wires are captured to.",
+    help="With --instance: the file with its captured traffic.",
 )
 @click.option(
     "--can",
     default="",
     metavar="INTERFACE/CHANNEL",
-    help="With local: emulated CAN buses on this interface, e.g. socketcan/vcan0.",
+    help="With local: emulate CAN buses on this interface, such as socketcan/vcan0.",
 )
-@click.option("--waivers", type=click.Path(exists=True, dir_okay=False), help="Failures that somebody answers for.")
+@click.option(
+    "--waivers",
+    type=click.Path(exists=True, dir_okay=False),
+    help="YAML file of accepted failures: name, reason, expires.",
+)
 @click.option(
     "--retry-inconclusive",
     "retries",
     type=click.IntRange(0, 100),
     default=0,
     metavar="N",
-    help="Off virtual time: run a scenario that is inconclusive again, at most N times.",
+    help="Not in virtual time: repeat an inconclusive scenario at most N times.",
 )
-@click.option("--seed", type=int, default=None, help="Another seed than the scenario's.")
-@click.option("--junit", type=click.Path(dir_okay=False), help="JUnit XML to this file.")
+@click.option("--seed", type=int, default=None, help="Use this seed instead of the scenario's.")
+@click.option("--junit", type=click.Path(dir_okay=False), help="Write JUnit XML to this file.")
 @junit_flavour_option
-@click.option("--html", type=click.Path(dir_okay=False), help="One page with verdicts and diagrams to this file.")
 @click.option(
-    "--trace", type=click.Path(dir_okay=False), help="Every event of a single scenario to this file (JSON lines)."
+    "--html", type=click.Path(dir_okay=False), help="Write an HTML page with verdicts and diagrams to this file."
+)
+@click.option(
+    "--trace", type=click.Path(dir_okay=False), help="Write every event of a single scenario to this file (JSON lines)."
 )
 @campaign_options
 @trust_option
@@ -132,16 +140,23 @@ def command(
     as_json: bool,
     campaign: CampaignRequest,
 ) -> int:
-    """Run the scenarios in FILES (*.scenario.yaml; of a folder all that are in it; without FILES those of this folder).
+    """Run the scenarios in FILES (*.scenario.yaml; for a folder, all in it; default: those of the working directory).
 
-    The exit code is 0 when all passed and 1 otherwise: a scenario that was skipped or stayed inconclusive has not passed.
+    The exit code is 0 if all scenarios passed, and 1 otherwise: a scenario that was skipped or is inconclusive has not
+    passed.
 
-    
-    --target local       gateway, PLC and emulators as processes, on ptys and sockets of this host
-    --target compose     what runs already, judged beside it: docker compose exec controller fieldtwin test ...
-    --target real        the plant: no faults, nothing set, read-only without --allow write
-    --with -- CMD        your own control program against the simulated devices, started anew for each scenario
-    --seeds 1..200 --faults random    a campaign: what always holds is judged while random faults strike
+    \b
+    --target local    gateway, PLC and emulators as processes, on ptys and
+                      sockets of this host
+    --target compose  a running system, tested from inside its network:
+                      docker compose exec controller fieldtwin test ...
+    --target real     the plant: no faults, no set values, read-only without
+                      --allow write
+    --with -- CMD     your control program against the simulated devices,
+                      restarted for each scenario
+    --seeds 1..200 --faults random
+                      a campaign: rules that must always hold are checked under
+                      random faults
     """
     from fieldtwin.conformance.core.waivers import Waivers, load_waivers
     from fieldtwin.results.model import Report, key_of
@@ -153,11 +168,11 @@ def command(
     target, controller = _controller(target, with_command)
     paths = _found(files)
     if trace and len(paths) != 1:
-        raise UsageError("--trace belongs to one scenario", got=f"{len(paths)} of them")
+        raise UsageError("--trace needs a single scenario", got=f"{len(paths)} of them")
     _check(target, allow, instance, far, capture, can)
     if retries and target == "real" and Danger(allow).rank > Danger.READ.rank:
         raise UsageError(
-            "--retry-inconclusive would repeat what a scenario writes to a plant",
+            "--retry-inconclusive would repeat a scenario's writes to a plant",
             expected="--allow read, or no retries",
         )
     _check_campaign(campaign, target, (seed, trace, retries))
@@ -241,12 +256,14 @@ def _check_campaign(campaign: CampaignRequest, target: str, of_one_run: tuple[ob
     campaign.check()
     if campaign.seeds and target != "virtual":
         raise UsageError(
-            "--seeds needs virtual time: elsewhere a seed does not give the same run again",
+            "--seeds needs virtual time: otherwise a seed does not reproduce a run",
             expected="--target virtual, without --with",
             got=f"--target {target}",
         )
     if campaign.seeds and any(of_one_run):
-        raise UsageError("--seeds makes many runs", hint="--seed, --trace and --retry-inconclusive belong to one")
+        raise UsageError(
+            "--seeds, which makes several runs", hint="--seed, --trace and --retry-inconclusive need a single run"
+        )
 
 
 def _controller(target: str, with_command: bool) -> tuple[str, tuple[str, ...]]:
@@ -261,29 +278,31 @@ def _controller(target: str, with_command: bool) -> tuple[str, tuple[str, ...]]:
         target = "local"
     if target == "virtual":
         raise UsageError(
-            "--with cannot run in virtual time: your program waits on the clock of this host",
+            "--with cannot run in virtual time: your program uses the clock of this host",
             expected="--target local, which is the default with --with",
         )
     if target != "local":
         raise UsageError(
-            f"--with starts the simulated devices and your program itself, and --target {target} judges what runs already",
+            f"--with starts the simulated devices and your program itself, and --target {target} tests a running system",
             expected="--target local, which is the default with --with",
         )
     if shutil.which(words[0]) is None:
-        raise UsageError(f"cannot start {words[0]!r}: no such program", hint="is it on the PATH, and executable?")
+        raise UsageError(
+            f"cannot start {words[0]!r}: no such program", hint="check that it is on the PATH and executable"
+        )
     return target, words
 
 
 def _check(target: str, allow: str, instance: str, far: str, capture: str | None, can: str) -> None:
     if can and target != "local":
-        raise UsageError("--can goes with --target local", got=f"--target {target}")
+        raise UsageError("--can needs --target local", got=f"--target {target}")
     if target != "real" and (far or allow != Danger.READ.value):
-        raise UsageError("--far and --allow go with --target real", got=f"--target {target}")
+        raise UsageError("--far and --allow need --target real", got=f"--target {target}")
     if target in ("virtual", "local") and instance:
-        raise UsageError("--instance names what runs already", expected="--target compose or real")
+        raise UsageError("--instance names a running instance", expected="--target compose or real")
     if capture and target != "compose" and not instance:
         raise UsageError(
-            "--capture is of what runs already", expected="--target compose, or --target real --instance NAME"
+            "--capture needs a running instance", expected="--target compose, or --target real --instance NAME"
         )
 
 

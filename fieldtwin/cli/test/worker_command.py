@@ -10,11 +10,11 @@ from fieldtwin.cli.template_question import trust_option
 @click.command("test-host")
 @trust_option
 def command(trust: bool) -> int:
-    """Emulated devices for somebody's tests, made and ended over standard input and output.
+    """Emulate devices for tests in any language, controlled over standard input and output.
 
-    Requests are lines of JSON, and so are answers: {"v": 1, "id": 1, "verb": "device", "args": {"device": "ctd-reference"}}.
-    The pytest plugin of fieldtwin starts it; docs/testing.md has the verbs. It ends when its input does. Nobody is
-    there to be asked: without --trust nothing of a stranger's template is run.
+    Requests and answers are lines of JSON: {"v": 1, "id": 1, "verb": "device", "args": {"device": "ctd-reference"}}. The
+    pytest plugin of fieldtwin starts this command; docs/testing.md lists the verbs. It ends when its input ends. It cannot
+    ask for confirmation, so without --trust it runs no code of a template.
     """
     from fieldtwin.gateway.wallclock import run
     from fieldtwin.testing.worker.host import Host

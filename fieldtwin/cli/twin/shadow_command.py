@@ -47,7 +47,7 @@ class ShadowTalk:
     def trouble(self, where: str, text: str) -> None:
         """Print the problems of thread or store once, and their end."""
         if not self._quiet:
-            self.line(f"[bold yellow]{where:10}[/]", text or "all is well again")
+            self.line(f"[bold yellow]{where:10}[/]", text or "recovered")
 
     def line(self, word: str, text: str) -> None:
         """Print a line with the present time; `word` is its label."""
@@ -66,13 +66,15 @@ def _clock(when: datetime) -> str:
     "place",
     required=True,
     metavar="URL",
-    help="Where the plant's thread is: what `fieldtwin run --thread` printed, or mqtt://HOST/GROUP/NODE.",
+    help="Address of the plant's thread: as `fieldtwin run --thread` prints it, or mqtt://HOST/GROUP/NODE.",
 )
+@click.option("--store", default="", metavar="FILE|URL", help="Store of the knowledge; default: in the run directory.")
 @click.option(
-    "--store", default="", metavar="FILE|URL", help="What keeps the knowledge; default: in the run directory."
-)
-@click.option(
-    "--for", "duration_s", type=Duration(), default=0.0, help="Stop after a time such as 20s; default: run on."
+    "--for",
+    "duration_s",
+    type=Duration(),
+    default=0.0,
+    help="Stop after a time such as 20s; default: run until Ctrl-C.",
 )
 @click.option("--instance", default="", help="Name of the run directory; default: the system's name and -shadow.")
 @profiles_option
@@ -80,11 +82,11 @@ def _clock(when: datetime) -> str:
 def command(
     system: str, place: str, store: str, duration_s: float, instance: str, profiles: tuple[str, ...], as_json: bool
 ) -> int:
-    """Shadow SYSTEM: receive what its plant sees, keep the digital model up with it, and say where the two differ.
+    """Follow SYSTEM as its digital shadow: receive the plant's data, update the digital model, and report differences.
 
-    Reports a state that is not the model's, values outside their limits, bad and stale ones, and how often and how late
-    the twins agree. A shadow sends no commands: it has nothing to send them with. Exit code 1 when the states differed.
-    SYSTEM may be a template.
+    It reports a state that differs from the model's, values outside their limits, bad and stale values, and how often and
+    with which delay plant and model agree. A shadow sends no commands. Exit code 1 if the states differed. SYSTEM may be a
+    template.
     """
     loaded = load_system(system_file(system, lambda template: True, plant=True), tuple(Path(p) for p in profiles))
     with Instance(instance or f"{loaded.name}-shadow") as here:
@@ -115,7 +117,7 @@ async def _run(
 def why_nothing(seen: dict[str, Any], place: str) -> str:
     """Return why the shadow received nothing from its plant at `place`, without repeating the place."""
     thread = seen["thread"]
-    why = str(thread.get("trouble") or thread.get("silent") or "no word of its log came")
+    why = str(thread.get("trouble") or thread.get("silent") or "no entry of its log was received")
     return why.removeprefix(f"{place}: ")
 
 
@@ -123,7 +125,7 @@ def told_of(variables: dict[str, Any], undeclared: int) -> str:
     """Return how many of the model's variables were received, and how many of them can be trusted."""
     heard = [variable for variable in variables.values() if variable["t_ms"] is not None]
     good = sum(variable["quality"] == "good" for variable in heard)
-    more = f"; {undeclared} values of others, which it does not declare" if undeclared else ""
+    more = f"; {undeclared} values of tags that it does not declare" if undeclared else ""
     return f"{len(variables)}, {len(heard)} of them heard of, {good} good{more}"
 
 
@@ -140,7 +142,7 @@ def print_shadow(seen: dict[str, Any]) -> None:
         ("model", f"{seen['state']}, period {seen['period_s']} s"),
         ("variables", told_of(seen["variables"], seen["undeclared"])),
         ("from", f"{', '.join(seen['origins'])}, {kind}"),
-        ("statuses", f"{seen['statuses']}, {seen['agreed']} of them as the model"),
+        ("statuses", f"{seen['statuses']}, {seen['agreed']} of them agree with the model"),
         (
             "twinning",
             f"{f'{rate:.1f} reports a second' if rate else 'too few reports'}, {seen['backfilled']} backfilled",

@@ -33,7 +33,7 @@ from fieldtwin.twin.site.system import System, load_system
 @click.command("twin")
 @click.argument("system")
 @click.option(
-    "--from", "place", required=True, metavar="URL", help="Where the plant's thread is, as of `fieldtwin shadow`."
+    "--from", "place", required=True, metavar="URL", help="Address of the plant's thread, as for `fieldtwin shadow`."
 )
 @click.option("--plan", "planner", default="", metavar="FILE", help='Rules (YAML), or "python: module:Class".')
 @click.option("--command", "periods", multiple=True, type=int, metavar="SECONDS", help="A period to plan at the start.")
@@ -43,23 +43,38 @@ from fieldtwin.twin.site.system import System, load_system
     type=Duration(),
     default=0.0,
     metavar="TIME",
-    help="Ask a prototype what comes of a command so far ahead, such as 30min, before it is sent.",
+    help="Simulate each command for this time, such as 30min, before it is sent.",
 )
-@click.option("--require", multiple=True, metavar="EXPRESSION", help="With --what-if: what must hold all the time.")
-@click.option("--finally", "finally_", multiple=True, metavar="EXPRESSION", help="With --what-if: and at the end.")
 @click.option(
-    "--what-if-timeout", "timeout_s", type=Duration(), default="60s", show_default=True, help="No answer then is a no."
+    "--require", multiple=True, metavar="EXPRESSION", help="With --what-if: an expression that must always hold."
+)
+@click.option(
+    "--finally",
+    "finally_",
+    multiple=True,
+    metavar="EXPRESSION",
+    help="With --what-if: an expression that must hold at the end.",
+)
+@click.option(
+    "--what-if-timeout",
+    "timeout_s",
+    type=Duration(),
+    default="60s",
+    show_default=True,
+    help="Time for the simulation; without a result the command is refused.",
 )
 @click.option(
     "--prototype-file",
     type=click.Path(exists=True, dir_okay=False, path_type=Path),
-    help="Of the prototype that is asked; default: beside the system file.",
+    help="Prototype file of the simulation; default: next to the system file.",
 )
+@click.option("--store", default="", metavar="FILE|URL", help="Store of the knowledge; default: in the run directory.")
 @click.option(
-    "--store", default="", metavar="FILE|URL", help="What keeps the knowledge; default: in the run directory."
-)
-@click.option(
-    "--for", "duration_s", type=Duration(), default=0.0, help="Stop after a time such as 20s; default: run on."
+    "--for",
+    "duration_s",
+    type=Duration(),
+    default=0.0,
+    help="Stop after a time such as 20s; default: run until Ctrl-C.",
 )
 @click.option("--instance", default="", help="Name of the run directory; default: the system's name and -twin.")
 @trust_option
@@ -82,11 +97,12 @@ def command(
     profiles: tuple[str, ...],
     as_json: bool,
 ) -> int:
-    """Twin SYSTEM: as `fieldtwin shadow`, and command the plant by rules over what is found.
+    """Run the digital twin of SYSTEM: like `fieldtwin shadow`, and command the plant by rules for its findings.
 
-    Each command is held against the digital model and the limits in the system file first; with --what-if, or where the rules say
-    so, against a prototype that begins with what the twin knows and does as commanded. Only what they accept is sent.
-    The plant obeys while its own switch says `remote`, inside the limits and the rate in its own file, and no number twice.
+    Each command is first checked against the digital model and the limits in the system file; with --what-if, or if the rules
+    require it, also in a simulation that starts from the twin's knowledge. Only accepted commands are sent. The plant
+    executes a command only while its own switch is set to `remote`, within the limits and the rate of its own file, and never
+    the same command number twice.
     """
     folders = tuple(Path(p) for p in profiles)
     runs_code = bool(horizon_s or planner)  # for prototypes and planners in Python from a template
@@ -118,7 +134,7 @@ def command(
         sys.stdout.write("\n")
     else:
         print_shadow(seen)
-        asked = f", {seen['asked']} asked of a prototype" if questions else ""
+        asked = f", {seen['asked']} simulated" if questions else ""
         there = f", {seen['refused_by_plant']} refused by the plant" if seen["refused_by_plant"] else ""
         counts = f"{seen['planned']} planned{asked}, {seen['sent']} sent, {seen['refused']} refused{there}"
         talk.print(f"  commands   {counts}", soft_wrap=True)
@@ -149,7 +165,7 @@ def _question(horizon_s: float, require: tuple[str, ...], finally_: tuple[str, .
         return None
     if not horizon_s or not (require or finally_):
         raise UsageError(
-            "half a question", expected="--what-if TIME, and what must hold: --require or --finally EXPRESSION"
+            "--what-if is incomplete", expected="--what-if TIME, and what must hold: --require or --finally EXPRESSION"
         )
     return Question(horizon_s, require, finally_)
 

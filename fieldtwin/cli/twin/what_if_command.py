@@ -22,23 +22,37 @@ from fieldtwin.run.what_if.state import KnownState
 
 @click.command("what-if")
 @click.argument("system", required=False)
-@click.option("--from", "source", default="", help="What is known: a state file, a knowledge store, or instance:NAME.")
-@click.option("--origin", default="", help="Whose knowledge, where a store has that of several.")
 @click.option(
-    "--command", "commands", multiple=True, help="A period that the far side commands: PERIOD_S or PERIOD_S@TIME."
+    "--from", "source", default="", help="The present state: a state file, a knowledge store, or instance:NAME."
 )
-@click.option("--faults", "fault_file", type=click.Path(path_type=Path), help="Faults, as `run --faults` takes them.")
-@click.option("--require", multiple=True, help="An expression that must hold all the time.")
+@click.option("--origin", default="", help="Origin of the knowledge, if the store has several.")
+@click.option(
+    "--command",
+    "commands",
+    multiple=True,
+    help="A period that the topside controller commands: PERIOD_S or PERIOD_S@TIME.",
+)
+@click.option("--faults", "fault_file", type=click.Path(path_type=Path), help="Fault file, as for `run --faults`.")
+@click.option("--require", multiple=True, help="An expression that must always hold.")
 @click.option("--finally", "finally_", multiple=True, help="An expression that must hold at the end.")
-@click.option("--plans", "plan_file", type=click.Path(path_type=Path), help="Several plans, in a file.")
-@click.option("--horizon", "horizon_s", type=Duration(), default="1h", show_default=True, help="How far ahead.")
+@click.option("--plans", "plan_file", type=click.Path(path_type=Path), help="A file with several plans.")
 @click.option(
-    "--settle", "settle_s", type=Duration(), default="5s", show_default=True, help="From when on requirements count."
+    "--horizon", "horizon_s", type=Duration(), default="1h", show_default=True, help="Length of the simulated time."
 )
-@click.option("--jobs", type=click.IntRange(1, 64), default=2, show_default=True, help="Processes at once.")
-@click.option("--seed", type=int, help="Instead of the prototype file's.")
-@click.option("--prototype-file", type=click.Path(path_type=Path), help="Instead of the one beside the system file.")
-@click.option("--save-state", type=click.Path(path_type=Path), help="Write what is known to a file, and end.")
+@click.option(
+    "--settle",
+    "settle_s",
+    type=Duration(),
+    default="5s",
+    show_default=True,
+    help="Time from which on the requirements are checked.",
+)
+@click.option("--jobs", type=click.IntRange(1, 64), default=2, show_default=True, help="Number of processes.")
+@click.option("--seed", type=int, help="Seed; default: the prototype file's.")
+@click.option(
+    "--prototype-file", type=click.Path(path_type=Path), help="Prototype file; default: next to the system file."
+)
+@click.option("--save-state", type=click.Path(path_type=Path), help="Write the present state to a file, and exit.")
 @trust_option
 @profiles_option
 @json_option
@@ -61,9 +75,9 @@ def command(
     profiles: tuple[str, ...],
     as_json: bool,
 ) -> int:
-    """Fork the prototype of SYSTEM in virtual time from what is known, and see what comes of a plan.
+    """Simulate SYSTEM in virtual time from its present state, and show the effect of a plan.
 
-    The plant is not touched. Exit status: 0 when a plan meets all that is required, 1 when none does.
+    The plant is not affected. Exit code: 0 if a plan meets all requirements, 1 if no plan does.
     """
     from fieldtwin.run.what_if.fork import Fork
     from fieldtwin.run.what_if.many import answers

@@ -33,7 +33,7 @@ def show(console: Console, outcomes: Sequence[Outcome], units: Mapping[str, str]
             console.print(f"  {program}  {told}{' …' if len(seen) > 8 else ''}", markup=False, soft_wrap=True)
         if outcome.not_taken:
             console.print(
-                f"  begun without what is known of: {', '.join(outcome.not_taken)}", markup=False, soft_wrap=True
+                f"  started without the present state of: {', '.join(outcome.not_taken)}", markup=False, soft_wrap=True
             )
         console.print(_table(outcome, units))
 

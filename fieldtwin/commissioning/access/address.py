@@ -65,7 +65,7 @@ class RawForm:
 def of_behaviour(name: str, profile: DeviceProfile | None) -> list[str]:
     """Return the writes that a profile has under `name`, as ``TAG=VALUE``, in its order. Raises `UsageError`."""
     if profile is None:
-        raise UsageError(f"the behaviour {name!r}: of which device?", expected="--profile NAME")
+        raise UsageError(f"the behaviour {name!r} needs a profile", expected="--profile NAME")
     if name not in profile.form.behaviours:
         known = ", ".join(profile.form.behaviours) or "none"
         raise UsageError(f"{profile.name} has no behaviour {name!r}", expected=known)
@@ -120,7 +120,7 @@ def _tags(
     names = list(profile.tags) if profile is not None else []
     raw = "holding:100 or 40101" if protocol == "modbus" else "6041h:00"
     raise UsageError(
-        f"nothing is called {item!r}",
+        f"there is no value or function {item!r}",
         expected=f"{'a tag of the profile, or ' if names else ''}an address such as {raw}",
         hint=did_you_mean(item, names),
     )
@@ -151,7 +151,7 @@ def _registers(item: str, form: RawForm) -> list[Tag]:
         bits = first.table in ("coil", "discrete")
         kind = form.type or ("bool" if bits else "uint16")
         if kind in ("int8", "uint8") or (bits and kind != "bool"):
-            raise ValueError(f"a {kind} does not stand in the table {first.table}")
+            raise ValueError(f"a {kind} does not fit the table {first.table}")
         step = REGISTERS_OF.get(kind, form.registers)
         whole = resolve_address(item, "printed", step * form.count)
     except ValueError as e:

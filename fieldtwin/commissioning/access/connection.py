@@ -99,9 +99,7 @@ async def frames_at(
     """Yield the frame connection of a CAN bus, for listening only. Raises as `canopen_at`."""
     endpoint = Endpoint.parse(url)
     if not endpoint.is_can:
-        raise UsageError(
-            "CANopen is spoken on a CAN bus", expected="can:socketcan/can0 or can:fieldtwin/HOST:PORT", got=url
-        )
+        raise UsageError("CANopen needs a CAN bus", expected="can:socketcan/can0 or can:fieldtwin/HOST:PORT", got=url)
     connection = await _observed(connector, taps, clock or WallClock()).open_can(endpoint, bitrate)
     try:
         yield connection

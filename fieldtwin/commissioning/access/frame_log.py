@@ -37,7 +37,7 @@ class WireLog(Tap):
         try:
             self._file: TextIO = path.open("a", encoding="ascii", buffering=1, newline="\n")
         except OSError as e:
-            raise FileInvalid(f"cannot write the log of what is sent: {e.strerror or e}", path=str(path)) from e
+            raise FileInvalid(f"cannot write the log of sent frames: {e.strerror or e}", path=str(path)) from e
         started = datetime.fromtimestamp(clock.utc_ns() / NS_PER_S, UTC).isoformat(timespec="milliseconds")
         self._write({"started": started, "t_ns": clock.monotonic_ns(), "command": words})
 

@@ -17,10 +17,10 @@ FORMATS = (".png", ".svg", ".pdf")
 def check_plot(path: Path) -> None:
     """Raise `UsageError` if no picture can be made at the end, before an hour of watching."""
     if path.suffix.lower() not in FORMATS:
-        raise UsageError("no picture of that kind", expected=", ".join(FORMATS), got=path.name)
+        raise UsageError("unsupported image format", expected=", ".join(FORMATS), got=path.name)
     if not _there():
         raise UsageError(
-            "--plot needs matplotlib", hint="pip install 'fieldtwin[plot]', or --json and a plotter of your own"
+            "--plot needs matplotlib", hint="pip install 'fieldtwin[plot]', or --json and your own plotting program"
         )
 
 
@@ -57,5 +57,5 @@ def plot(path: Path, title: str, tags: Sequence[Tag], histories: Mapping[str, Hi
     try:
         figure.savefig(path, dpi=120)
     except OSError as e:
-        raise FileInvalid(f"cannot write the picture: {e.strerror or e}", path=str(path)) from e
+        raise FileInvalid(f"cannot write the plot: {e.strerror or e}", path=str(path)) from e
     return len(shown)

@@ -50,16 +50,17 @@ def plan_write(tag: Tag, text: str, *, i_know: bool = False, restore: bool = Fal
     a nonvolatile value that is to be restored at once (two writes where one wears).
     """
     if not tag.writable:
-        raise NotAllowed(f"{tag.name} is read-only", hint="what may be written says the profile's `access`")
+        raise NotAllowed(f"{tag.name} is read-only", hint="the profile's `access` defines what may be written")
     if tag.danger and not i_know:
         raise NotAllowed(f"{tag.name}: writing it {_does(tag.danger)}", expected="--i-know")
     if tag.nonvolatile and restore and not i_know:
         raise NotAllowed(
-            f"{tag.name} is kept in memory that wears out: putting it back is a second write", expected="no --restore"
+            f"{tag.name} is kept in memory with limited write cycles: restoring it is a second write",
+            expected="no --restore",
         )
     value = parse_value(tag, text)
     if tag.type == AUTO and not isinstance(value, bytes):
-        raise UsageError(f"{tag.name}: of which type?", expected="--type, --eds FILE, or hex:BYTES")
+        raise UsageError(f"{tag.name}: the type is not known", expected="--type, --eds FILE, or hex:BYTES")
     data = encoded(tag, value)
     if tag.at is not None and isinstance(value, bytes):
         width = 1 if tag.at.table == "coil" else 2 * tag.at.count
@@ -67,7 +68,7 @@ def plan_write(tag: Tag, text: str, *, i_know: bool = False, restore: bool = Fal
             raise NotAllowed(f"{tag.name}: the bytes do not fit", expected=f"{width} bytes", got=str(len(data)))
     warnings: tuple[str, ...] = ()
     if tag.nonvolatile:
-        warnings = ("kept in memory that wears out: written once, and only if it differs",)
+        warnings = ("kept in memory with limited write cycles: written once, and only if it differs",)
     if tag.danger:
         warnings += (f"it {_does(tag.danger)}",)
     return Write(tag, value, data, warnings)
@@ -78,9 +79,7 @@ def plan_writes(pairs: list[tuple[Tag, str]], *, i_know: bool = False, restore: 
     seen: set[str] = set()
     for tag, _ in pairs:
         if tag.name in seen and tag.nonvolatile:
-            raise NotAllowed(
-                f"{tag.name} is kept in memory that wears out and stands twice", expected="one value for it"
-            )
+            raise NotAllowed(f"{tag.name} has limited write cycles and is given twice", expected="one value for it")
         seen.add(tag.name)
     return [plan_write(tag, text, i_know=i_know, restore=restore) for tag, text in pairs]
 
@@ -94,7 +93,7 @@ def parse_value(tag: Tag, text: str) -> Scalar:
         try:
             return bytes.fromhex(text[4:])
         except ValueError as e:
-            raise UsageError(f"{tag.name}: no bytes in hex", got=text) from e
+            raise UsageError(f"{tag.name}: not bytes in hex", got=text) from e
     if tag.type == "string":
         return text
     lower = text.lower()
@@ -121,7 +120,7 @@ def parse_value(tag: Tag, text: str) -> Scalar:
 def check_broadcast(point: Point, *, i_know: bool) -> None:
     """Raise `NotAllowed` for unit 0 of a line without `i_know`: every unit would execute the write."""
     if isinstance(point, ModbusPoint) and point.is_broadcast and not i_know:
-        raise NotAllowed("unit 0 is every unit of the line, and none of them answers", expected="--i-know")
+        raise NotAllowed("unit 0 is a broadcast to all units of the line, and no unit answers it", expected="--i-know")
 
 
 async def before(point: Point, write: Write) -> Answer | None:
@@ -134,9 +133,9 @@ async def before(point: Point, write: Write) -> Answer | None:
     answer = (await point.read([write.tag]))[write.tag.name]
     if answer.problem:
         raise CheckFailed(
-            f"{write.tag.name}: what it holds cannot be read, so nothing is written: {answer.problem}",
+            f"{write.tag.name}: its present value cannot be read, so nothing is written: {answer.problem}",
             where=point.where,
-            hint="say so with --blind",
+            hint="--blind writes all the same",
         )
     return answer
 
@@ -163,7 +162,7 @@ async def restore(point: Point, done: Written) -> Written:
     """
     tag = done.write.tag
     if done.before is None:
-        raise NotAllowed(f"{tag.name} cannot be put back: what it held was not read")
+        raise NotAllowed(f"{tag.name} cannot be restored: its old value was not read")
     answer = (await point.read([tag]))[tag.name]
     if not answer.problem and _equal(tag, done.before, answer.value.raw):
         return Written(done.write, done.before, done.before, same=True, restored=True)
@@ -174,10 +173,12 @@ async def restore(point: Point, done: Written) -> Written:
 async def _verify(point: Point, write: Write, data: bytes) -> bytes:
     answer = (await point.read([write.tag]))[write.tag.name]
     if answer.problem:
-        raise VerifyFailed(f"{write.tag.name}: written, and cannot be read back: {answer.problem}", where=point.where)
+        raise VerifyFailed(
+            f"{write.tag.name}: written, but it cannot be read back: {answer.problem}", where=point.where
+        )
     if not _equal(write.tag, data, answer.value.raw):
         raise VerifyFailed(
-            f"{write.tag.name}: acknowledged, and not held",
+            f"{write.tag.name}: the device acknowledged the write, but holds a different value",
             expected=data.hex(" "),
             got=answer.value.raw.hex(" "),
             where=point.where,

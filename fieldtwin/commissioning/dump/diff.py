@@ -108,7 +108,7 @@ def diff_dumps(
     if not leave.settings:
         alone += _diff_unnamed(out, left, right, named, leave)
     if alone:
-        out.notes.append(f"{alone} values are in one dump only: the other did not ask for them or got no valid reply")
+        out.notes.append(f"{alone} values are only in one dump: the other one did not read them or got no valid reply")
     _diff_access(out, left, right)
     return out
 
@@ -168,7 +168,7 @@ def diff_dictionary(dump: Dump, dictionary: ObjectDictionary) -> Differences:
     unknown = [c for c in last.cells if c not in dictionary.entries]
     if unknown:
         first = ", ".join(f"{i:04X}h:{s:02X}" for i, s in sorted(unknown)[:8])
-        out.notes.append(f"{len(unknown)} objects that the EDS does not know: {first}")
+        out.notes.append(f"{len(unknown)} objects that are not in the EDS: {first}")
     return out
 
 

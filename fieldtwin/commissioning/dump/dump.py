@@ -262,9 +262,7 @@ class Dumper:
 
     async def _ask(self, question: Callable[[], Any]) -> Asked:
         if self._log is not None and self._log.full:
-            raise FileInvalid(
-                "the log of what is sent is full", path=str(self._log.path), hint="move it, then --resume"
-            )
+            raise FileInvalid("the log of sent frames is full", path=str(self._log.path), hint="move it, then --resume")
         asked: Asked = await question()
         self.result.requests += asked.requests
         return asked
@@ -295,7 +293,7 @@ class Dumper:
         line = self._recorded.popleft()
         if line.get(what) != name:
             raise FileInvalid(
-                "the dump that is gone on with asked otherwise", path=str(self._writer.path), expected=str(name),
+                "the dump to continue was made with different options", path=str(self._writer.path), expected=str(name),
                 got=str(line)[:60], hint="start another file",
             )  # fmt: skip
         self.result.replayed += 1
@@ -308,7 +306,7 @@ def check_resumable(job: Job, earlier: Dump) -> None:
     different = [key for key, value in now.items() if earlier.header.get(key) != value]
     if different:
         raise FileInvalid(
-            "this is the dump of another job",
+            "this is the dump of a different device or range",
             path=earlier.path,
             expected=", ".join(f"{key} {now[key]!r}" for key in different),
             got=", ".join(repr(earlier.header.get(key)) for key in different),

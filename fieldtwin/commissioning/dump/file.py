@@ -172,7 +172,7 @@ def load_dump(path: Path, *, keep_lines: bool = False) -> Dump:
             raise FileInvalid("more values than can be held", path=str(path), line=number, expected=f"{MOST_CELLS}")
         dump.whole_bytes = end
     if dump is None:
-        raise FileInvalid("an empty file is no dump", path=str(path))
+        raise FileInvalid("an empty file is not a dump", path=str(path))
     if dump.protocol == "modbus":
         for table in TABLES:
             if table in dump.maps or table in dump.coverage:
@@ -240,7 +240,7 @@ def _take(dump: Dump, line: dict[str, Any]) -> int:
     elif "ended" in line:
         dump.ended = True
     elif "resumed" not in line:
-        raise ValueError("what line is this?")
+        raise ValueError("unknown kind of line")
     return 0
 
 
@@ -317,7 +317,7 @@ class DumpWriter:
                 os.truncate(path, resume_at)
                 self._file = path.open("ab", buffering=0)
         except FileExistsError as e:
-            raise FileInvalid("there is such a file already", path=str(path), hint="--resume goes on with it") from e
+            raise FileInvalid("the file already exists", path=str(path), hint="--resume goes on with it") from e
         except OSError as e:
             raise FileInvalid(f"cannot write the dump: {e.strerror or e}", path=str(path)) from e
 

@@ -66,7 +66,7 @@ class _Patience:
         if self.lost and not self._heard:
             self.stopped = f"no reply {MOST_SILENT} times in a row"
         elif self._budget_us is not None and self._spent_us > self._budget_us:
-            self.stopped = f"the time budget of {self._budget_us / 1e6:g} s for questions without a result is used up"
+            self.stopped = f"the time budget of {self._budget_us / 1e6:g} s for requests without a result is used up"
 
 
 class ObjectSweep(_Patience):

@@ -55,7 +55,7 @@ class ProfileSweep:
                 self.stopped = f"no reply {MOST_SILENT} times in a row"
             elif self._budget_us is not None and spent_us > self._budget_us:
                 self.stopped = (
-                    f"the time budget of {self._budget_us / 1e6:g} s for questions without a result is used up"
+                    f"the time budget of {self._budget_us / 1e6:g} s for requests without a result is used up"
                 )
         for table, found in self.maps.items():
             found.stopped = self.stopped if any(r.range.table == table for r in todo) else ""

@@ -150,9 +150,9 @@ async def dump(
     """
     clock = clock or WallClock()
     if job.target.address == 0 and Endpoint.parse(job.target.url).scheme in ("rtu", "ascii", "rtu+tcp"):
-        raise UsageError("unit 0 of a line is a broadcast: nobody answers", expected="--unit from 1 on")
+        raise UsageError("unit 0 of a line is a broadcast: no unit answers", expected="--unit from 1 on")
     if out.exists() and not resume:
-        raise FileInvalid("there is such a file already", path=str(out), hint="--resume goes on with it")
+        raise FileInvalid("the file already exists", path=str(out), hint="--resume goes on with it")
     earlier = load_dump(out, keep_lines=True) if resume and out.exists() and out.stat().st_size else None
     if earlier is not None:
         check_resumable(job, earlier)

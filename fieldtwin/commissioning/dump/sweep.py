@@ -356,7 +356,7 @@ class Sweep:
             self.spent_us += outcome.us + self._spacing_us
         if self._budget_us is not None and self.spent_us > self._budget_us and not self.found.stopped:
             self.found.stopped = (
-                f"the time budget of {self._budget_us / 1e6:g} s for questions without a result is used up"
+                f"the time budget of {self._budget_us / 1e6:g} s for requests without a result is used up"
             )
 
     @staticmethod

@@ -38,8 +38,8 @@ class CanIdentity:
     @property
     def summary(self) -> str:
         if self.conflict:
-            return f"{self.conflict}; what was read may be of either"
-        return summary(self.candidates) if self.answers else f"node {self.node} answers no SDO"
+            return f"{self.conflict}; the values read may belong to either node"
+        return summary(self.candidates) if self.answers else f"node {self.node} does not answer SDO requests"
 
     @property
     def certain(self) -> str | None:

@@ -164,7 +164,7 @@ def judge_modbus(profile: DeviceProfile, clues: ModbusClues, readings: Mapping[s
     elif total:
         sureness = Sureness.POSSIBLE
     else:
-        return Candidate(profile.name, Sureness.RULED_OUT, (), ("nothing that was read speaks for it",))
+        return Candidate(profile.name, Sureness.RULED_OUT, (), ("no value that was read supports it",))
     return Candidate(profile.name, sureness, tuple(reasons), tuple(doubts), total)
 
 
@@ -178,7 +178,7 @@ def _own_words(
     stated = profile.form.identification
     if {0, 1} <= stated.keys():
         if clues.objects is None:
-            doubts.append("it does not tell the identity (2Bh/0Eh) that the profile states")
+            doubts.append("it does not report the identity (2Bh/0Eh) that the profile states")
         elif all(clues.objects.get(n, "").strip() == stated[n].strip() for n in (0, 1)):
             certain = bool(stated[0].strip() and stated[1].strip())
             reasons.append(f"vendor {stated[0]!r} and product code {stated[1]!r} as stated (2Bh/0Eh)")
@@ -189,15 +189,15 @@ def _own_words(
         if same and len(known) >= TELLING_BYTES:
             reasons.append("its server id (11h) is the profile's")
         elif not same:
-            doubts.append("its server id (11h) is another")
+            doubts.append("its server id (11h) is different")
     model = _SUNSPEC_PROFILE.match(profile.name)
     if model is not None and clues.sunspec is not None:
         where = _model_holds(profile, clues.sunspec, int(model[1]))
         if where:
             certain = True
-            reasons.append(f"SunSpec header at {clues.sunspec.base}, {where}: the standard's map, whoever made it")
+            reasons.append(f"SunSpec header at {clues.sunspec.base}, {where}: the standard map, for any maker")
         else:
-            doubts.append(f"its SunSpec model {model[1]} stands at other addresses than the profile's")
+            doubts.append(f"its SunSpec model {model[1]} has different addresses from the profile's")
     elif model is not None:
         doubts.append("its SunSpec header cannot be read")
     return reasons, doubts, certain
@@ -241,7 +241,7 @@ def _keys(profile: DeviceProfile, readings: Mapping[str, Reading]) -> tuple[list
             if len(text) >= 2 and text.isascii() and text.isprintable():
                 good.append(f"{entry.tag} reads {text!r}")
             else:
-                wrong.append(f"{entry.tag} is no text: {value!r}")
+                wrong.append(f"{entry.tag} is not a text: {value!r}")
     return good, wrong
 
 
@@ -303,7 +303,7 @@ def judge_canopen(profile: DeviceProfile, eds: ObjectDictionary | None, clues: C
             reasons.append(f"device type {kind:08X}h")
         elif kind & 0xFFFF == told.device_type & 0xFFFF and kind & 0xFFFF:
             reasons.append(
-                f"the same device profile (CiA {kind & 0xFFFF}), another type of it: {told.device_type:08X}h"
+                f"the same device profile (CiA {kind & 0xFFFF}), but a different type of it: {told.device_type:08X}h"
             )
         else:
             against.append(f"its device type is {told.device_type:08X}h, not {kind:08X}h")
@@ -317,9 +317,9 @@ def judge_canopen(profile: DeviceProfile, eds: ObjectDictionary | None, clues: C
         reasons.append(f"vendor {told.vendor:X}h and product {told.product:X}h as in its data sheet (1018h)")
         if told.vendor:
             return Candidate(profile.name, Sureness.CERTAIN, tuple(reasons), (), 3)
-        return Candidate(profile.name, Sureness.LIKELY, tuple(reasons), ("vendor id 0 is nobody's",), 2)
+        return Candidate(profile.name, Sureness.LIKELY, tuple(reasons), ("vendor ID 0 is not assigned",), 2)
     exact = kind is not None and kind == told.device_type and bool(kind & 0xFFFF)
     if exact and not any("device type" in a for a in against):
-        doubt = ("another maker's device of the same kind: standard objects fit, the maker's own may not",)
+        doubt = ("a different maker's device of the same kind: the standard objects fit, the maker's objects may not",)
         return Candidate(profile.name, Sureness.POSSIBLE, tuple(reasons), (*against, *doubt), 1)
-    return Candidate(profile.name, Sureness.RULED_OUT, tuple(reasons), tuple(against) or ("nothing speaks for it",))
+    return Candidate(profile.name, Sureness.RULED_OUT, tuple(reasons), tuple(against) or ("no value supports it",))

@@ -280,24 +280,24 @@ def _cap(tile: _Tile, words: Sequence[Sequence[int]], values: Sequence[float | s
     if tile.type.startswith("int") and monotone and min(numbers) < 0 <= max(numbers):
         return "a counter that overflowed looks the same"
     if tile.type.startswith("float") and monotone:
-        return "it only went one way"
+        return "it changed in only one direction"
     still = [len(set(w)) == 1 for w in words[tile.start : tile.end]]
     if tile.order in ("CDAB", "DCBA"):
         still.reverse()
     half = tile.size // 2
     if tile.size > 1 and all(still[:half]) and tile.type != "float32":
-        return "its upper half never moved"
+        return "its upper half never changed"
     if tile.size > 1 and all(still[half:]):
-        return "its lower half never moved"
+        return "its lower half never changed"
     if tile.size == 2 and "int" in tile.type and _zeros_beside(tile, words):
-        return "two registers beside it were always 0 and may be its upper half"
+        return "two adjacent registers were always 0 and may be its upper half"
     beside = [words[i] for i in (tile.start - 1, tile.end) if 0 <= i < len(words)]
     if tile.size == 1 and all(still) and any(len(set(w)) > 1 for w in beside):
-        return "it may be the upper half of a register beside it that moves"
+        return "it may be the upper half of an adjacent register that changes"
     if tile.size == 1 and any(len(set(w)) == 1 for w in beside):
-        return "a register beside it never moved and may be its upper half"
+        return "an adjacent register never changed and may be its upper half"
     if tile.size == 1 and any(len(set(w)) > 1 for w in beside) and (monotone or _is_regular(steps)):
-        return "it goes evenly, as half of a float that does, and a register beside it moves too"
+        return "it changes evenly, like half of a float, and an adjacent register changes too"
     return ""
 
 

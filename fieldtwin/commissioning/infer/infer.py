@@ -63,7 +63,7 @@ def series_of(dumps: Sequence[Dump]) -> Series:
     """
     for dump in dumps:
         if dump.protocol != "modbus":
-            raise FileInvalid("a CANopen node's EDS says its types: there is nothing to infer", path=dump.path)
+            raise FileInvalid("a CANopen node's EDS defines its types, so there is nothing to infer", path=dump.path)
         if dump.header.get("address") != dumps[0].header.get("address"):
             raise FileInvalid("dumps of two units", path=dump.path, expected=f"unit {dumps[0].header.get('address')}")
     passes = sorted((p for d in dumps for p in d.passes if p.cells), key=lambda p: p.utc_ns)
@@ -175,9 +175,9 @@ def _supported(readings: Sequence[Reading]) -> list[Reading]:
         if r.type == "float32" and floats[r.order] < FLOCK:
             return "a single float looks like a large whole number that wavers"
         if r.registers > 1 and orders[r.order] < FLOCK:
-            return "few values here keep to that order"
+            return "few other values use that order"
         if r.registers == 1 and r.order == "BADC" and swapped < FLOCK:
-            return "nothing else here has its bytes swapped"
+            return "no other value has its bytes swapped"
         return ""
 
     return [replace(r, capped=r.capped or doubt(r)) for r in readings]

@@ -53,7 +53,7 @@ def marked(reading: Reading, times_s: Sequence[float]) -> Reading:
         marks.append("bits")
         notes.append(f"a status word: bits {', '.join(map(str, bits))} changed")
     elif all(s >= 0 for s in steps) and up:
-        notes.append("only went up: perhaps a counter")
+        notes.append("only increased: perhaps a counter")
     return replace(reading, marks=tuple(marks), notes=tuple(notes + _likeness(reading, numbers, whole=whole)))
 
 

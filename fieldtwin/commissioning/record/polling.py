@@ -65,7 +65,7 @@ class ProfileRound:
         there = dict.fromkeys(t.poll for t in profile.tags.values() if t.readable)
         wanted = list(groups) or list(there)
         if unknown := [g for g in wanted if g not in there]:
-            raise UsageError(f"no group {unknown[0]!r} in {profile.name}", expected=", ".join(there))
+            raise UsageError(f"no poll group {unknown[0]!r} in {profile.name}", expected=", ".join(there))
         self._plans = [GroupPlan(profile, group, learnt) for group in wanted]
 
     @property

@@ -68,7 +68,7 @@ class LineSniffer:
     ) -> None:  # fmt: skip
         framing = framing_of(port)
         if not port.is_serial or framing not in ("rtu", "ascii"):
-            raise UsageError("one adapter listens to a serial line", expected="such as rtu:/dev/ttyUSB0", got=str(port))
+            raise UsageError("--sniff needs a serial line", expected="such as rtu:/dev/ttyUSB0", got=str(port))
         self._port, self._sink, self._say = port, sink, say
         self._directions = Directions(framing)
         self._connector, self._clock = connector or OsConnector(), clock or WallClock()

@@ -35,7 +35,7 @@ class LineTap:
         connector: Connector | None = None, clock: Clock | None = None,
     ) -> None:  # fmt: skip
         if near.is_can or far.is_can or far.scheme == "pty":
-            raise UsageError("a line is tapped between bytes", expected="serial ports or TCP", got=f"{near}, {far}")
+            raise UsageError("only a byte stream can be tapped", expected="serial ports or TCP", got=f"{near}, {far}")
         self._near, self._far, self._sink, self._say = near, far, sink, say
         self._connector = connector or OsConnector()
         self._clock = clock or WallClock()
@@ -88,7 +88,7 @@ class LineTap:
         try:
             far = await self._connector.open_bytes(self._far)
         except Unreachable as e:
-            self._say(f"{client.peer} was turned away: {e}")
+            self._say(f"{client.peer} was rejected: {e}")
             return
         self._say(f"{client.peer} came")
         try:

@@ -108,7 +108,7 @@ class CanScanner:
     ) -> None:
         self._endpoint = Endpoint.parse(url)
         if not self._endpoint.is_can:
-            raise UsageError("CANopen is spoken on a CAN bus", expected="can:INTERFACE/CHANNEL", got=url)
+            raise UsageError("CANopen needs a CAN bus", expected="can:INTERFACE/CHANNEL", got=url)
         self._options = options or CanScanOptions()
         self._tell, self._stop = on_progress, stop
         self._connector, self._clock = connector, clock or WallClock()
@@ -146,7 +146,7 @@ class CanScanner:
             await self._try_rates()
         else:
             raise UsageError(
-                f"{self._endpoint}: this adapter cannot listen without taking part, and would have to guess the bit rate",
+                f"{self._endpoint}: this adapter has no listen-only mode, and the bit rate is unknown",
                 expected="--bitrate",
             )
         if options.bitrate and facts.bitrate and facts.bitrate != options.bitrate:
@@ -169,7 +169,7 @@ class CanScanner:
                 await self._hear(self._silent_endpoint(), rate, self._options.listen_s)
                 return
         result.notes.append(
-            "silent at every bit rate: nobody sends, or the cable is not connected; say --bitrate to ask"
+            "no frame at any bit rate: no node sends, or the cable is not connected; use --bitrate to send requests"
         )
 
     async def _hear(self, endpoint: Endpoint, bitrate: int, listen_s: float, phase: str = "listening") -> None:
@@ -207,12 +207,12 @@ class CanScanner:
         if facts.needs_bitrate and not result.bitrate:
             return False
         if heard.errors and not heard.frames:
-            result.notes.append(
-                "error frames and not one good frame: the bit rate is wrong, or the bus is not terminated"
-            )
+            result.notes.append("error frames and no valid frame: the bit rate is wrong, or the bus is not terminated")
             return False
         if heard.frames and not self._options.share_bus:
-            result.notes.append("this bus carries traffic: nothing was sent. --share-bus asks the nodes, one at a time")
+            result.notes.append(
+                "this bus carries traffic, so nothing was sent; --share-bus asks the nodes one at a time"
+            )
             return False
         return True
 
@@ -242,7 +242,7 @@ class CanScanner:
         """Return whether another master, silent during the listening, has begun to send."""
         if self._options.share_bus or not self._ear.heard.has_master:
             return False
-        note = "another master began to talk: stopped asking. --share-bus goes on, one node at a time"
+        note = "another master started to send, so the scan stopped; --share-bus continues, one node at a time"
         if note not in self.result.notes:
             self.result.notes.append(note)
         return True
@@ -278,7 +278,7 @@ class CanScanner:
     async def _look_for_unconfigured(self, master: CanopenMaster, done_s: float, total_s: float) -> None:
         result = self.result
         if self._ear.heard.lss_requests:
-            result.notes.append("another LSS master is at work: no fastscan")
+            result.notes.append("another LSS master is active, so there is no fastscan")
             return
         with _lss(master, self._clock) as lss:
             result.asked += 1

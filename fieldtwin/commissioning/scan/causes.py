@@ -102,7 +102,7 @@ def serial_causes(e: SerialEvidence) -> list[Cause]:
         lost = e.errors.overrun + e.errors.buffer_overrun
         found.append(
             Cause(
-                "this computer reads too slowly", 75, f"{lost} characters were lost in the port", "close what else runs"
+                "this computer reads too slowly", 75, f"{lost} characters were lost in the port", "close other programs"
             )
         )
     if e.probe is not None:
@@ -137,16 +137,16 @@ def _of_silence(e: SerialEvidence) -> list[Cause]:
                 "the line is held low",
                 60,
                 f"{breaks} breaks",
-                "look for a short, a missing bias, a driver that never lets go",
+                "look for a short circuit, missing bias resistors, or a driver that stays enabled",
             )
         )
     elif e.probe is None:
         causes.append(
             Cause(
-                "nobody is asking",
+                "no client sends requests",
                 80,
-                "a Modbus line is silent until its master sends",
-                "that is as it should be without a master: `scan` asks, `--probe UNIT` sends one question",
+                "a Modbus line is silent until a client sends",
+                "this is normal without a client: use `scan`, or `--probe UNIT` to send one request",
                 harmless=True,
             )
         )
@@ -155,15 +155,15 @@ def _of_silence(e: SerialEvidence) -> list[Cause]:
     if inputs and not any(control[name] for name in inputs):
         causes.append(
             Cause("nothing is connected", 35, f"{', '.join(inputs)} are all off (an RS485 adapter may leave them so)",
-                  "is the device on, the cable whole, the port the right one?")
+                  "check the device's power, the cable, and the choice of port")
         )  # fmt: skip
     else:
         causes.append(
-            Cause("nothing is connected", 30, "no byte and no error", "is the cable in, the port the right one?")
+            Cause("nothing is connected", 30, "no byte and no error", "check the cable and the choice of port")
         )
     if e.errors is None and not breaks:
         causes.append(
-            Cause("A and B swapped", 15, "this port counts no errors that would show it", "swap A and B once")
+            Cause("A and B swapped", 15, "this port has no error counters that would show it", "swap A and B once")
         )
     return causes
 
@@ -177,7 +177,7 @@ def _of_garbage(e: SerialEvidence) -> list[Cause]:
             Cause(
                 name,
                 100,
-                f"at {name_of(other)} there are {e.verdict.heard.frames} whole frames",
+                f"at {name_of(other)} there are {e.verdict.heard.frames} valid frames",
                 f"use {name_of(other)}",
             )
         ]
@@ -188,19 +188,19 @@ def _of_garbage(e: SerialEvidence) -> list[Cause]:
     text = sum(n for value, n in heard.values.items() if 0x20 <= value < 0x7F or value in (0x0A, 0x0D)) / total
     if text > 0.9 and total >= ENOUGH_TEXT and heard.framing == "rtu":
         colons = heard.values.get(0x3A, 0)
-        what = "Modbus ASCII, perhaps" if colons and heard.values.get(0x0D) else "no Modbus RTU"
+        what = "Modbus ASCII, perhaps" if colons and heard.values.get(0x0D) else "not Modbus RTU"
         causes.append(Cause("another protocol", 90, f"{text:.0%} of it is readable text: {what}", "try ascii:PORT"))
     if heard.frames and heard.share > MANY:
         if heard.glitches >= max(2, heard.frames // 4):
             causes.append(
-                Cause("direction control", 85, f"{heard.glitches} stray bytes beside {heard.frames} good frames",
+                Cause("direction control", 85, f"{heard.glitches} stray bytes besides {heard.frames} good frames",
                       "the transceiver is switched too early or too late: rs485=1, or an adapter that switches by itself")
             )  # fmt: skip
-        damaged = f"{heard.bad_frames} damaged beside {heard.frames} good frames"
+        damaged = f"{heard.bad_frames} damaged besides {heard.frames} good frames"
         causes.append(
-            Cause("termination or noise", 70, damaged, "120 ohms at both ends and nowhere else, bias, shield")
+            Cause("termination or noise", 70, damaged, "check 120 ohms at both ends only, bias resistors, shield")
         )
-        causes.append(Cause("two units answer at once", 40, damaged, "do two devices have the same unit id?"))
+        causes.append(Cause("two units answer at once", 40, damaged, "check whether two devices have the same unit ID"))
     elif parity > MANY and framing < parity:
         causes.append(
             Cause("the parity or the stop bits", 95, f"{parity:.0%} of the bytes have a wrong parity", "8E1, 8O1, 8N1")
@@ -210,8 +210,8 @@ def _of_garbage(e: SerialEvidence) -> list[Cause]:
         causes.append(
             Cause("the baud rate", 85 if framing > MANY or faster else 60,
                   f"{framing:.0%} framing errors" if framing > MANY else
-                  "long bits: the sender is slower than this port" if faster else "bytes, and not one whole frame",
-                  "`scan --listen` tries the others and sends nothing")
+                  "long bits: the sender is slower than this port" if faster else "bytes, but no valid frame",
+                  "`scan --listen` tries other settings without sending")
         )  # fmt: skip
         breaks = errors.breaks if errors is not None else 0
         causes.append(
@@ -223,10 +223,10 @@ def _of_garbage(e: SerialEvidence) -> list[Cause]:
             )
         )
         causes.append(
-            Cause("termination or noise", 30, "no whole frame", "is there a sender at all, or only an open line?")
+            Cause("termination or noise", 30, "no whole frame", "check whether a device sends, or the line is open")
         )
         if text <= 0.9:
-            causes.append(Cause("another protocol", 25, "no whole frame", "what should speak here?"))
+            causes.append(Cause("another protocol", 25, "no whole frame", "check which protocol is expected"))
     return causes
 
 
@@ -236,25 +236,30 @@ def _of_talk(heard: Heard) -> list[Cause]:
     answered = sum(u.replies + u.exceptions for u in heard.units.values())
     if asked and not answered:
         causes.append(
-            Cause("only the master is heard", 80, f"{asked} requests and no reply",
-                  "the devices are off, or have other settings; on RS232 a tap hears one direction")
+            Cause("only the client is received", 80, f"{asked} requests and no reply",
+                  "the devices are off, or have different settings; on RS232 an adapter receives one direction")
         )  # fmt: skip
     elif answered and not asked:
         causes.append(
             Cause(
-                "only devices are heard", 80, f"{answered} replies and no request", "a tap on RS232 hears one direction"
+                "only devices are received",
+                80,
+                f"{answered} replies and no request",
+                "on RS232 an adapter receives one direction",
             )
         )
     elif heard.silent:
         units = ", ".join(map(str, heard.silent[:10]))
         causes.append(
             Cause(
-                "units that do not answer", 60, f"asked and silent: {units}", "are they on, and is that their unit id?"
+                "units that do not answer", 60, f"no reply from units {units}", "check their power and their unit IDs"
             )
         )
     if heard.repeated > asked // 2 and heard.repeated > 2:
         causes.append(
-            Cause("an echo", 40, f"{heard.repeated} requests came twice", "the sender's adapter hears itself")
+            Cause(
+                "an echo", 40, f"{heard.repeated} requests came twice", "the sender's adapter receives its own frames"
+            )
         )
     return causes
 
@@ -265,9 +270,19 @@ def _of_probe(probe: Probe, e: SerialEvidence) -> list[Cause]:
     unit = f"unit {probe.unit}"
     if probe.answer == "damaged":
         return [
-            Cause("termination or noise", 80, f"{unit} answered, damaged", "120 ohms at both ends, bias, shield"),
+            Cause(
+                "termination or noise",
+                80,
+                f"{unit} answered, damaged",
+                "check 120 ohms at both ends, bias resistors, shield",
+            ),
             Cause("the parity or the stop bits", 75, f"{unit} answered, damaged", "8E1, 8O1, 8N1"),
-            Cause("two units answer at once", 60, f"{unit} answered, damaged", "do two devices have this unit id?"),
+            Cause(
+                "two units answer at once",
+                60,
+                f"{unit} answered, damaged",
+                "check whether two devices have this unit ID",
+            ),
             Cause(
                 "direction control", 50, f"{unit} answered, damaged", "rs485=1, or an adapter that switches by itself"
             ),
@@ -277,22 +292,24 @@ def _of_probe(probe: Probe, e: SerialEvidence) -> list[Cause]:
             Cause(
                 "termination or noise",
                 88,
-                "our own question came back damaged",
-                "a short, or another sender on the line",
+                "our own request came back damaged",
+                "a short circuit, or another sender on the line",
             ),
-            Cause("another master", 80, "our own question came back damaged", "listen for longer: `line --listen 60s`"),
+            Cause("another master", 80, "our own request came back damaged", "listen for longer: `line --listen 60s`"),
         ]
     wrong = [
-        Cause("another unit id", 85, f"{unit} does not answer", "`scan` asks all"),
+        Cause("a different unit ID", 85, f"{unit} does not answer", "`scan` tries all"),
         Cause("the baud rate", 75, f"{unit} does not answer", "`scan` tries the likely settings"),
     ]
     if probe.echo == "whole":
         return [
             *wrong,
             Cause(
-                "A and B swapped", 60, "we hear ourselves and nobody else: this end works", "swap A and B at the device"
+                "A and B swapped", 60, "only our own echo is received, so this end works", "swap A and B at the device"
             ),
-            Cause("the device is off", 55, "we hear ourselves and nobody else", "is it on? is the ground connected?"),
+            Cause(
+                "the device is off", 55, "only our own echo is received", "check its power and the ground connection"
+            ),
         ]
     return [
         *wrong,
@@ -300,10 +317,10 @@ def _of_probe(probe: Probe, e: SerialEvidence) -> list[Cause]:
         Cause(
             "direction control",
             65,
-            "nothing shows that our question left",
+            "there is no sign that the request was sent",
             "rs485=1, or an adapter that switches by itself",
         ),
-        Cause("nothing is connected", 60, f"no echo, no answer from {unit}", "is the cable in, the device on?"),
+        Cause("nothing is connected", 60, f"no echo, no answer from {unit}", "check the cable and the device's power"),
     ]
 
 
@@ -320,33 +337,37 @@ def can_causes(facts: CanFacts, heard: BusHeard, load: float) -> list[Cause]:
                   "bit rate and wiring first, then `ip link set IFACE down` and `up`")
         )  # fmt: skip
     if facts.tx_errors >= 96:
-        why = f"{facts.tx_errors} transmit errors: nobody acknowledges"
-        found.append(Cause("alone on the bus", 85, why, "is another node on, at the same bit rate?"))
+        why = f"{facts.tx_errors} transmit errors: no node acknowledges"
+        found.append(Cause("alone on the bus", 85, why, "check that another node is on, with the same bit rate"))
     if heard.errors and not heard.frames:
-        why = f"{heard.errors} error frames and no good one"
+        why = f"{heard.errors} error frames and no valid one"
         found.append(Cause("the bit rate", 90, why, "compare with the other nodes"))
         found.append(Cause("CAN-H and CAN-L swapped", 70, why, "swap them"))
         found.append(Cause("termination or noise", 60, why, "60 ohms between CAN-H and CAN-L when everything is off"))
     elif heard.errors or (facts.rx_errors >= 96 and heard.frames):
-        why = f"{heard.errors} error frames beside {heard.frames} good ones"
+        why = f"{heard.errors} error frames besides {heard.frames} good ones"
         found.append(
             Cause(
                 "termination or noise", 80, why, "60 ohms between CAN-H and CAN-L when everything is off; short stubs"
             )
         )
-        found.append(Cause("a node at another bit rate", 60, why, "take nodes off one by one"))
+        found.append(Cause("a node at another bit rate", 60, why, "disconnect nodes one by one"))
     elif not heard.frames:
         why = "no frame and no error" + (f", {errors} errors counted" if errors else "")
         found.append(
-            Cause("nobody is sending", 80, why, "nodes without a heartbeat are silent: `scan` asks them", harmless=True)
+            Cause(
+                "no node sends", 80, why, "nodes without a heartbeat are silent: use `scan` to ask them", harmless=True
+            )
         )
-        found.append(Cause("nothing is connected", 45, why, "is the cable in, the interface the right one?"))
+        found.append(Cause("nothing is connected", 45, why, "check the cable and the choice of interface"))
     if load > 0.8:
         found.append(Cause("the bus is full", 75, f"load {load:.0%}", "longer PDO inhibit times, a higher bit rate"))
     doubled = [n for n, node in heard.nodes.items() if node.boot_ups > 2]
     if doubled:
-        why = f"node {', '.join(map(str, doubled))} boots again and again"
-        found.append(Cause("a node restarts", 70, why, "its supply, its watchdog, a master that resets it"))
+        why = f"node {', '.join(map(str, doubled))} boots repeatedly"
+        found.append(
+            Cause("a node restarts", 70, why, "check its supply, its watchdog, and whether a master resets it")
+        )
     return ranked(found)
 
 
@@ -358,23 +379,23 @@ def tcp_causes(problem: str, heard: bytes, hung_up: bool, port: int) -> list[Cau
     text = problem.lower()
     table: list[tuple[Callable[[], bool], list[Cause]]] = [
         (lambda: "refused" in text, [
-            Cause("nothing listens there", 90, f"the host refuses port {port}", "is it 502, 802, 4001? is the service on?"),
-            Cause("a firewall", 40, "some refuse as a host does", "ask whoever runs it"),
+            Cause("no program listens there", 90, f"the host refuses port {port}", "check the port and the service"),
+            Cause("a firewall", 40, "some firewalls refuse like a host", "ask its administrator"),
         ]),
         (lambda: "timed out" in text or "no answer" in text, [
-            Cause("the host is off, or a firewall drops", 90, problem, "ping it; is the address right?"),
+            Cause("the host is off, or a firewall drops packets", 90, problem, "ping it, and check the address"),
         ]),
         (lambda: "route" in text or "unreachable" in text, [
-            Cause("no way to that network", 90, problem, "address, netmask and gateway of this computer"),
+            Cause("no route to that network", 90, problem, "address, netmask and gateway of this computer"),
         ]),
         (lambda: "name" in text or "known" in text, [Cause("the name is not known", 90, problem, "use the address")]),
         (lambda: bool(problem), [Cause("the connection fails", 60, problem, "")]),
         (lambda: hung_up, [
-            Cause("no room for another client", 80, "it accepts and hangs up at once", "close other masters: many take 1 to 5"),
-            Cause("an allow list", 60, "it accepts and hangs up at once", "add this computer's address"),
+            Cause("no room for another client", 80, "it closes the connection at once", "close other clients: many allow 1 to 5"),
+            Cause("an allow list", 60, "it closes the connection at once", "add this computer to the list"),
         ]),
         (lambda: bool(heard), [
-            Cause("another protocol", 90, f"it speaks unasked: {heard[:16].hex(' ')}", "a Modbus server waits to be asked"),
+            Cause("another protocol", 90, f"it sends unrequested data: {heard[:16].hex(' ')}", "a Modbus server only replies"),
         ]),
     ]  # fmt: skip
     for holds, causes in table:

@@ -122,9 +122,7 @@ class _Looker:
         control, ignored, counts = await self._port_facts(settings)
         if look.probe_unit is not None and not self._stop():
             if first.heard.bytes and not look.share_bus:
-                raise NotAllowed(
-                    "somebody talks on this line", hint="--share-bus sends the question between its exchanges"
-                )
+                raise NotAllowed("this line carries traffic", hint="--share-bus sends the probe between its exchanges")
             report.probe = await self._probe(settings, look.probe_unit, quiet=bool(first.heard.bytes))
             report.sent = True
         report.facts = _serial_facts(scan, settings, control, ignored, counts, report.probe)
@@ -173,7 +171,7 @@ class _Looker:
     async def at_bus(self) -> LineReport:
         look = self._look
         if look.probe_unit is not None:
-            raise NotAllowed("a bus is probed by scan", hint="`fieldtwin scan` asks its nodes")
+            raise NotAllowed("--probe is for serial lines", hint="`fieldtwin scan` asks its nodes")
         scanner = CanScanner(
             str(self._endpoint),
             CanScanOptions(bitrate=look.bitrate, listen_s=look.listen_s, listen_only=True),
@@ -200,7 +198,7 @@ class _Looker:
         if heard.nodes:
             rows.append(("nodes heard", ", ".join(map(str, sorted(heard.nodes)))))
         if heard.sdo_masters:
-            rows.append(("another master", f"speaks SDO with {', '.join(map(str, sorted(heard.sdo_masters)))}"))
+            rows.append(("another master", f"uses SDO with {', '.join(map(str, sorted(heard.sdo_masters)))}"))
         rows += [("note", note) for note in scan.notes]
         report.facts, report.causes = rows, can_causes(facts, heard, load)
         return report
@@ -224,7 +222,9 @@ class _Looker:
                 heard, hung_up = await self._wait(connection)
             finally:
                 await connection.aclose()
-            report.facts.append(("stays open", "no: it hangs up" if hung_up else f"for {self._look.listen_s:g} s"))
+            report.facts.append(
+                ("stays open", "no: it closes the connection" if hung_up else f"for {self._look.listen_s:g} s")
+            )
             report.facts.append(("speaks unasked", f"{len(heard)} bytes" if heard else "no"))
         if problem:
             report.facts.append(("connects", f"no: {problem}"))
@@ -288,7 +288,7 @@ def _serial_facts(
     else:
         rows.append(("heard", "nothing"))
     if errors is None:
-        rows.append(("errors counted", "this port counts none" if not counts else "none"))
+        rows.append(("errors counted", "this port has no error counters" if not counts else "none"))
     else:
         rows.append(
             ("errors counted", f"framing {errors.frame}, parity {errors.parity}, breaks {errors.breaks}, "
@@ -309,5 +309,5 @@ def _serial_facts(
         rows.append(("echo", {"none": "none", "whole": "yes: use --echo", "damaged": "damaged"}[probe.echo]))
         rows.append(("answer", probe.answer))
     else:
-        rows.append(("echo", "not tested: --probe UNIT sends one question"))
+        rows.append(("echo", "not tested: --probe UNIT sends one request"))
     return rows

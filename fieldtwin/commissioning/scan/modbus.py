@@ -144,7 +144,7 @@ class ModbusScanner:
         failures = [f.answer.unit for f in self.result.units if f.answer.exception == 4]
         if len(failures) >= MANY_FAILURES:
             self.result.notes.append(
-                f"{len(failures)} units answer with exception 04h only: some servers say so of units that they do not have"
+                f"{len(failures)} units answer only with exception 04h, as some servers do for units that they do not have"
             )
 
     @property
@@ -190,7 +190,7 @@ class ModbusScanner:
         if self._quick != self._pace:
             done = []  # asked too quickly for some: they are asked again
         if self._options.quick_only:
-            self.result.notes.append("only likely settings and units were tried; without --quick all are")
+            self.result.notes.append("only likely settings and units were tried; omit --quick to try all")
             return
         found = {f.settings for f in self.result.units}
         if found:
@@ -236,14 +236,16 @@ class ModbusScanner:
         if options.listen_only or self._stop():
             return False
         if not options.share_bus:
-            result.notes.append("somebody talks on this line: nothing was sent. --share-bus asks between its exchanges")
+            result.notes.append(
+                "this line carries traffic, so nothing was sent; --share-bus sends between its exchanges"
+            )
             return False
         if result.verdict is None:
-            result.notes.append("what is heard makes no sense at any setting: nothing was sent into it")
+            result.notes.append("the received bytes are not valid with any settings, so nothing was sent")
             return False
         if not result.verdict.sure and said not in result.verdict.fits:
             result.notes.append(
-                "the settings are not proved, and a wrong guess would disturb the others: say baudrate and frame"
+                "the settings are not certain, and wrong ones would disturb other devices: set baudrate and frame"
             )
             return False
         return True
@@ -308,7 +310,7 @@ class ModbusScanner:
         finally:
             self._keep(sweep, settings)
         for unit in lost:
-            self.result.notes.append(f"unit {unit} answered once, and not when it was asked again")
+            self.result.notes.append(f"unit {unit} answered once, but not when it was asked again")
         self.result.units = [
             replace(f, doubtful=True) if f.settings == settings and f.answer.unit in lost else f
             for f in self.result.units
@@ -331,7 +333,7 @@ class ModbusScanner:
                         if endpoint.is_serial:
                             raise
                         unit, breaks = sweep.skip(), 0
-                        self.result.notes.append(f"the far end hangs up whenever unit {unit} is asked")
+                        self.result.notes.append(f"the server closes the connection whenever unit {unit} is asked")
 
     async def _ask(self, sweep: UnitSweep, connection: ByteConnection, tell: Callable[[], None]) -> None:
         clock = self._clock
@@ -347,7 +349,7 @@ class ModbusScanner:
             if sweep.other_requests and not self._options.share_bus:
                 self._met_master = True  # silent while we listened: we stop as if it had been heard then
                 self.result.notes.append(
-                    "another master began to talk: stopped asking. --share-bus goes on between its exchanges"
+                    "another client started to send, so the scan stopped; --share-bus continues between its exchanges"
                 )
                 return
 
@@ -367,7 +369,9 @@ class ModbusScanner:
         result.damaged = gathered(result.damaged, sweep.damaged, settings)
         result.behind_gateway |= sweep.behind_gateway
         if sweep.never_silent:
-            result.notes.append("the line is never silent: another master, or a unit that babbles")
+            result.notes.append(
+                "the line is never silent: another client on the line, or a unit that sends continuously"
+            )
         if settings is not None:
             alike = likeness([f.answer for f in result.units if f.settings == settings], sweep.asked)
             result.alike = alike or result.alike
@@ -388,7 +392,7 @@ class ModbusScanner:
         if self.result.alike is None and len(answers) == len(first) and not self._ended:
             self.result.alike = await self._ask_once_more(answers, first)
         if self.result.alike is not None and self.result.alike.one_device and not self._options.every_setting:
-            self.result.notes.append(f"{len(first)} unit ids asked, all answered alike: the others were not asked")
+            self.result.notes.append(f"{len(first)} unit IDs asked, all with the same answer: the rest was not asked")
             return
         if not self._ended:
             await self._steps(rest, "every unit")

@@ -22,16 +22,16 @@ class OddReply:
         """Return a description of the reply and its possible cause on an endpoint of this kind."""
         if not self.pdu:
             if self.settings is not None:
-                return "damaged each time: two devices with one unit id, or a bad line"
-            return "no Modbus frame: another protocol or framing at this port, or a faulty server"
-        said = f"a reply that does not fit the question ({self.pdu[:16].hex(' ').upper()})"
+                return "damaged each time: two devices with the same unit ID, or a bad line"
+            return "not a Modbus frame: another protocol or framing at this port, or a faulty server"
+        said = f"a reply that does not match the request ({self.pdu[:16].hex(' ').upper()})"
         if self.pdu[0] & 0x80 and len(self.pdu) == 2:
             code = self.pdu[1]
             name = ModbusExceptionReply.NAMES.get(code, "vendor specific")
-            said += f": exception {code:02X}, {name}, for function {self.pdu[0] & 0x7F:02X}, which was not asked for"
+            said += f": exception {code:02X}, {name}, for function {self.pdu[0] & 0x7F:02X}, which was not requested"
         if self.settings is not None:
-            return f"{said}; two devices with one unit id, or a faulty device"
-        return f"{said}; some servers answer so for unit ids that they do not have"
+            return f"{said}; two devices with the same unit ID, or a faulty device"
+        return f"{said}; some servers answer this for unit IDs that they do not have"
 
 
 def gathered(

@@ -101,7 +101,7 @@ class UnitSweep:
     ) -> None:
         self.found: dict[int, UnitAnswer] = {}
         self.damaged: dict[int, bytes] = {}
-        """Units that twice gave a reply that does not fit the question, with its PDU; empty if it was not a whole frame."""
+        """Units that twice gave a reply that does not match the request, with its PDU; empty if it was not a whole frame."""
         self.behind_gateway: set[int] = set()
         """Units that a gateway reported as not answering."""
         self.echo = False

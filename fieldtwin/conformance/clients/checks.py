@@ -17,8 +17,8 @@ FLOOD_FACTOR = 5.0
 """Multiple of the usual rate that is a flood. A master that tries four times and polls on stays below it."""
 FLOOD_FLOOR = 30
 """Number of requests within the case that is not a flood, however low the usual rate is."""
-NEEDS_PROBE = "only its values can tell: give --probe"
-UNSEEN = "what it published was not seen: no --probe"
+NEEDS_PROBE = "only its published values show this: give --probe"
+UNSEEN = "its published values were not observed: no --probe"
 
 Rule = Callable[[Observation], Finding | None]
 
@@ -45,12 +45,12 @@ def goes_on(seen: Observation) -> Finding | None:
     """Check that the master still runs, and asks again once the device replies correctly."""
     for ended in seen.of(Ended, seen.begun_ns):
         return failed(
-            f"the master ended, exit code {ended.status}, {seen.since_s(ended.t_ns):.2f} s after the first odd answer"
+            f"the master ended, exit code {ended.status}, {seen.since_s(ended.t_ns):.2f} s after the first faulty answer"
         )
     asked = next(seen.of(Asked, seen.over_ns + 1), None)
     if asked is None:
         return failed(
-            f"no request for {(seen.until_ns - seen.over_ns) / NS_PER_S:.1f} s after the last odd answer: it is wedged"
+            f"no request for {(seen.until_ns - seen.over_ns) / NS_PER_S:.1f} s after the last faulty answer: it has stopped"
         )
     return None
 
@@ -70,7 +70,7 @@ def does_not_flood(seen: Observation) -> Finding | None:
         if count > FLOOD_FLOOR and count > FLOOD_FACTOR * seen.habit.rate_per_s * span_s:
             usual = seen.habit.rate_per_s
             return failed(
-                f"{count} {what} in {span_s:.1f} s, {usual:.1f} a second are its habit: nothing holds it back"
+                f"{count} {what} in {span_s:.1f} s, {usual:.1f} per second are normal for it: it does not slow down"
             )
     return None
 
@@ -81,7 +81,7 @@ def publishes_nothing_bad(seen: Observation) -> Finding | None:
         if shown.word is Word.POISON:
             return failed(f"published {shown.text}, the value of the bad frame, {_when(seen, shown.t_ns)}")
         if shown.word is Word.OTHER:
-            return failed(f"published {shown.text}, which no honest answer held, {_when(seen, shown.t_ns)}")
+            return failed(f"published {shown.text}, which no correct answer contained,  {_when(seen, shown.t_ns)}")
     return None
 
 
@@ -89,7 +89,7 @@ def publishes_good_again(seen: Observation) -> Finding | None:
     """Check that the device's value is published again after the device has recovered."""
     if seen.probed and not any(shown.word is seen.last for shown in seen.of(Shown, seen.over_ns)):
         waited = (seen.until_ns - seen.over_ns) / NS_PER_S
-        return failed(f"the honest value was not published within {waited:.1f} s after the last odd answer")
+        return failed(f"the correct value was not published within {waited:.1f} s after the last faulty answer")
     return None
 
 
@@ -100,7 +100,7 @@ def sees_all_values(seen: Observation) -> Finding | None:
     for shown in seen.of(Shown, seen.begun_ns):
         if shown.word is Word.UNCLEAR:
             return inconclusive(
-                f"printed {shown.text!r} {_when(seen, shown.t_ns)}, and whether that is a published value does not show: give a "
+                f"printed {shown.text!r} {_when(seen, shown.t_ns)}, which may or may not be a published value: give a "
                 "tcp:// probe, or --probe output:TEXT with the text that stands before each value"
             )
     return None
@@ -134,7 +134,9 @@ def took_odd_answer(seen: Observation) -> Finding | None:
     first = next((s for s in seen.of(Shown, seen.begun_ns) if s.word is seen.after), None)
     plain = next((t.t_ns for t in seen.of(Told, seen.over_ns + 1) if t.good), seen.until_ns)
     if first is None or first.t_ns >= plain:
-        return failed("the odd answers were not taken, although they hold the value: it came only with the plain ones")
+        return failed(
+            "the unusual answers were not accepted, although they contain the value: it was published only after the normal ones"
+        )
     return None
 
 
@@ -179,7 +181,9 @@ def answers_at_once(seen: Observation) -> Finding | None:
         return inconclusive("no request after the short frame")
     silence_s = seen.habit.silent_gap_s
     if not silence_s or silence_s <= 1.25 * seen.habit.longest_gap_s:
-        return inconclusive("it polls no sooner than its timeout: when it saw the frame does not show on the wire")
+        return inconclusive(
+            "its poll period is not shorter than its timeout, so the traffic does not show when it detected the frame"
+        )
     (at_once_s, gap_s), (later_s, later_gap_s) = gaps_s[0], gaps_s[-1]
     if gap_s < 0.9 * silence_s:
         return None
@@ -190,8 +194,8 @@ def answers_at_once(seen: Observation) -> Finding | None:
             f"{said}: it waits for silence or backs off" + ("" if seen.timeout_s else "; say --timeout")
         )
     if later_s + later_gap_s - at_once_s - gap_s < 0.25 * delay_s:
-        return failed(f"{said}, and as soon where the frame came {delay_s:.2f} s later: it waits out its timeout")
-    return inconclusive(f"{said}, and later where the frame came later: it backs off, or its timeout begins anew")
+        return failed(f"{said}, and equally soon when the frame came {delay_s:.2f} s later: it waits out its timeout")
+    return inconclusive(f"{said}, and later when the frame came later: it backs off, or its timeout begins anew")
 
 
 def _gap_after(seen: Observation, told: Told) -> Iterator[tuple[float, float]]:
@@ -216,7 +220,9 @@ def backs_off(seen: Observation) -> Finding | None:
     rate = (len(busy) - 1) / span_s
     if rate > 2 * seen.habit.rate_per_s:
         usual = seen.habit.rate_per_s
-        return failed(f"asked a busy device {rate:.1f} times a second, {usual:.1f} are its habit: it does not back off")
+        return failed(
+            f"asked a busy device {rate:.1f} times per second, {usual:.1f} are normal for it: it does not back off"
+        )
     return None
 
 
@@ -276,7 +282,7 @@ def checks_echo_of_write(seen: Observation) -> Finding | None:
             and asked.target[2:4] == first.target[2:4]
         ):
             return passed("it read back what it wrote")
-    return inconclusive("it neither wrote again nor read back: whether it noticed does not show")
+    return inconclusive("it neither wrote again nor read back, so it is not known whether it noticed")
 
 
 write_echo = all_of(goes_on, asks_cleanly, does_not_flood, checks_echo_of_write)
@@ -296,14 +302,14 @@ def asked_once(seen: Observation) -> Finding | None:
         return None
     gap_s, usual_s = (again.t_ns - first.t_ns) / NS_PER_S, seen.habit.period_s.get(first.target, 0.0)
     if not usual_s:
-        return inconclusive(f"the same came again {gap_s:.2f} s later: whether that is its period does not show")
+        return inconclusive(f"the same request came again {gap_s:.2f} s later, which may be its period")
     if gap_s < 0.7 * usual_s:
         return failed(f"sent again {gap_s:.2f} s later, {usual_s:.2f} s is its period: it waited for an answer")
     return None
 
 
 def _when(seen: Observation, t_ns: int) -> str:
-    return f"{seen.since_s(t_ns):.2f} s after the first odd answer"
+    return f"{seen.since_s(t_ns):.2f} s after the first faulty answer"
 
 
 def asks_for_less(seen: Observation) -> Finding | None:
@@ -318,7 +324,7 @@ def asks_for_less(seen: Observation) -> Finding | None:
         if a.target[:2] == first.target[:2] and int.from_bytes(a.target[4:6], "big") < asked_for
     ]
     if not parts:
-        return inconclusive(f"it went on to ask for all {asked_for}: right only for a master that merges no reads")
+        return inconclusive(f"it went on to ask for all {asked_for}: correct only for a client that merges no reads")
     return None
 
 

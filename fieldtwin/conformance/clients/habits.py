@@ -25,7 +25,7 @@ def broadcasts_wait(seen: Observation) -> Finding:
     shortest_ms = math.inf
     broadcasts = [(a, b) for a, b in itertools.pairwise(asked) if a.target[0] == 0]
     if not any(a.target[0] == 0 for a in asked):
-        return skipped("it never wrote to all units")
+        return skipped("it never sent a broadcast")
     for one, following in broadcasts:
         pause_ms = (following.t_ns - one.t_ns) / NS_PER_MS
         if pause_ms < NO_DELAY_MS:
@@ -42,7 +42,7 @@ def broadcasts_wait(seen: Observation) -> Finding:
 def no_broadcast_reads(seen: Observation) -> Finding:
     for asked in seen.of(Asked):
         if asked.target[0] == 0 and asked.target[1] in READS:
-            return failed(f"asked all units for data: {asked.target.hex(' ')}")
+            return failed(f"sent a read as a broadcast: {asked.target.hex(' ')}")
     return passed(_of(seen))
 
 

@@ -147,8 +147,8 @@ class MasterRun(Generic[C]):
         stage = self.stage
         if not await self._until(lambda: any(isinstance(e, Asked) for e in stage.recorder.since(0)), self.plan.wait_s):
             if self._ended is not None:
-                raise Unreachable(f"the program ended before it asked for anything, exit code {self._ended.status}")
-            raise Unreachable("no master asked for anything", hint=f"within {self.plan.wait_s:g} s")
+                raise Unreachable(f"the program ended before its first request, exit code {self._ended.status}")
+            raise Unreachable("no request was received", hint=f"within {self.plan.wait_s:g} s")
         since_ns = stage.now_ns()
         await self._until(lambda: stage.recorder.count(Asked, since_ns) >= 2 * STEADY, self.plan.patience_s)
         if self.probe is not None:
@@ -170,7 +170,7 @@ class MasterRun(Generic[C]):
         probe = self.probe
         if not await self._until(lambda: probe.learn(word), self.plan.patience_s):
             held = f"the device holds {self._held}"
-            raise Unreachable("the probe never showed the value that the device holds, or shows all alike", hint=held)
+            raise Unreachable("the probe never showed the device's value, or shows the same for all values", hint=held)
 
     async def _silence(self) -> float:
         """Return the time in seconds from an unanswered request to the next request; 0 if there was none."""
@@ -197,10 +197,10 @@ class MasterRun(Generic[C]):
         elif self.plan.for_s and (since_ns - self._started_ns) / NS_PER_S >= self.plan.for_s:
             self._done(case, inconclusive(f"not within {self.plan.for_s:g} s (--for)"), since_ns)
         elif not await self._well() and not await self._well_anew():
-            why = "the master did not take honest answers"
+            why = "the client or master did not accept correct answers"
             if self._ended is not None:
-                why = f"the master had ended, exit code {self._ended.status}"
-            self._done(case, inconclusive(f"all was not well before it began: {why}"), since_ns)
+                why = f"the client or master had ended, exit code {self._ended.status}"
+            self._done(case, inconclusive(f"the state before the test case was not normal: {why}"), since_ns)
         else:
             finding, events = await self._play(case)
             self._done(case, finding, since_ns, lines(events, self.stage.first_ns))
@@ -211,7 +211,7 @@ class MasterRun(Generic[C]):
         if case.needs and case.needs not in self.plan.has:
             return f"only with --{case.needs}"
         if case.about.danger.rank > self.plan.at_most.rank:
-            return f"its danger is {case.about.danger.value}, {self.plan.at_most.value} is allowed"
+            return f"its impact level is {case.about.danger.value}, {self.plan.at_most.value} is allowed"
         return ""
 
     async def _well(self) -> bool:
@@ -251,7 +251,7 @@ class MasterRun(Generic[C]):
         fits = await self._until(lambda: stage.struck > 0, min(self.plan.patience_s, 4 * self.habit.longest_gap_s + 1))
         if not fits:
             stage.end()
-            return skipped(f"the master sent no {case.wants}"), ()
+            return skipped(f"the client or master sent no {case.wants}"), ()
         done = (
             (lambda: self._seen(after, start_ns) and stage.struck >= case.least)
             if case.holds_good and self.probe

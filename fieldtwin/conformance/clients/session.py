@@ -71,10 +71,10 @@ async def judge_modbus_master(options: Options, listener: Listener) -> list[Case
     Raises `UsageError`, `Unreachable` or `EndpointBusy`. SIGTERM ends the test, and the program with it.
     """
     if options.listen.scheme not in ("tcp", "rtu+tcp", "pty", "rtu", "ascii"):
-        raise UsageError("where the master is listened for", expected=LISTENING, got=str(options.listen))
+        raise UsageError("the endpoint for the client or master", expected=LISTENING, got=str(options.listen))
     in_ascii = options.ascii or options.listen.scheme == "ascii"
     if in_ascii and options.listen.scheme in ("tcp", "rtu+tcp"):
-        raise UsageError("ASCII is for lines", expected="pty:PATH or ascii:PORT", got=str(options.listen))
+        raise UsageError("Modbus ASCII needs a serial line", expected="pty:PATH or ascii:PORT", got=str(options.listen))
     line = options.listen.is_serial or options.listen.scheme == "pty"
     scheme = "ascii" if in_ascii else "rtu" if line else options.listen.scheme
     stage = Stage(wire_for(scheme), options.words, options.held)
@@ -91,7 +91,7 @@ async def judge_canopen_master(options: Options, listener: Listener) -> list[Cas
     """Test the SDO client and NMT master on a CAN bus. A software bus is created here."""
     if not options.listen.is_can:
         expected = "can:fieldtwin/HOST:PORT or can:socketcan/INTERFACE"
-        raise UsageError("where the master is listened for", expected=expected, got=str(options.listen))
+        raise UsageError("the endpoint for the client or master", expected=expected, got=str(options.listen))
     stage = CanopenStage(
         options.words,
         size=options.size,
@@ -120,7 +120,7 @@ async def _judged(
     assert task is not None
     asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, task.cancel)
     run.stage.recorder.tell = listener.log
-    listener.say(f"listening on {options.listen}; the master's side is {theirs}")
+    listener.say(f"listening on {options.listen}; the client or master connects to {theirs}")
     if not options.command:
         return await run.run()
     program = Program(options.command, theirs, on_text, run.ended)
@@ -130,7 +130,7 @@ async def _judged(
             return await run.run()
     finally:
         if run.exit_code is not None:
-            listener.say(f"the program ended by itself, exit code {run.exit_code}; the last that it said:")
+            listener.say(f"the program ended early, exit code {run.exit_code}; its last output:")
             for line in program.said:
                 listener.say(f"  {line}")
 

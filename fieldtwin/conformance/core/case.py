@@ -48,7 +48,7 @@ class Basis(Enum):
     """
 
 
-OTHER_WIRE = "not on this wire"
+OTHER_WIRE = "not on this kind of bus"
 """The reason for skipping a case for other transports."""
 OWN = "fieldtwin"
 """The source of a case that is based neither on a clause nor on a report of another project."""

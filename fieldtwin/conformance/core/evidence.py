@@ -58,7 +58,7 @@ def line_of(event: Event) -> tuple[str, str, str]:
             return (
                 "device",
                 event.frame or event.data.hex(" "),
-                text or ("honest" if event.good else "as the case wants it"),
+                text or ("honest" if event.good else "as the test case requires"),
             )
         case Sent():
             frame = CanFrame(int.from_bytes(event.data[:2], "big"), event.data[2:])
@@ -90,7 +90,7 @@ def _abort(data: bytes) -> str:
         return ""
     code = int.from_bytes(data[4:8], "little")
     index, subindex = int.from_bytes(data[1:3], "little"), data[3]
-    of = f"{index:04X}h:{subindex:02X}" if index else "multiplexer 0: the transfer that is open"
+    of = f"{index:04X}h:{subindex:02X}" if index else "multiplexer 0: the open transfer"
     return f"SDO abort {code:08X}h {meaning(code)} ({of})"
 
 

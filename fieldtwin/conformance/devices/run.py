@@ -118,11 +118,11 @@ async def play(
         if reason := why_not(case, plan, wire.traits):
             finding = skipped(reason)
         elif plan.for_s and began_ns - started_ns > plan.for_s * NS_PER_S:
-            finding = skipped("the time is up")
+            finding = skipped("the time of --for has passed")
         elif stop := go_on():
             finding = skipped(stop)
         elif lost >= MOST_LOST:
-            finding = inconclusive("it answers nothing any more")
+            finding = inconclusive("it no longer answers")
         else:
             finding, well = await _case(wire, case, transcript)
             lost = 0 if well else lost + 1
@@ -136,7 +136,7 @@ async def _case(wire: W, case: DeviceCase[W], transcript: Transcript) -> tuple[F
     """Return the finding of a case, and whether the device answered normally before it."""
     wire.danger = Danger.READ
     if not await wire.settle():
-        return inconclusive("all was not well before it: the usual request got no answer"), False
+        return inconclusive("the state before the test case was not normal: the normal request got no answer"), False
     transcript.begin()
     wire.danger = case.danger
     try:
@@ -146,6 +146,6 @@ async def _case(wire: W, case: DeviceCase[W], transcript: Transcript) -> tuple[F
     except Unsaid as e:
         return inconclusive(str(e)), True
     except Unreachable as e:
-        return failed(f"takes no connection any more: {e.message}"), True
+        return failed(f"accepts no connection any more: {e.message}"), True
     finally:
         wire.danger = Danger.READ

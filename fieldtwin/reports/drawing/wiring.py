@@ -105,7 +105,7 @@ def _station(device: DeviceConfig, prototype: Prototype | None) -> Station:
     word = "node" if device.profile.protocol == "canopen" else "unit"
     far = ""
     if device.profile.inbox is not None:
-        far = "far end"
+        far = "topside end"
         if emulated is not None and emulated.form.far_link is not None:
             link = emulated.form.far_link
             far += f": {link.bytes_per_s:g} byte/s, {link.latency_ms} ms, {link.loss * 100:g} % lost"

@@ -104,7 +104,7 @@ def _tag(system: System | None, name: str) -> Tag | None:
 def _fault_lane(axis: Axis, bar: FaultBar) -> tuple[float, list[Markup]]:
     x1, x2 = axis.x(bar.on_ns), axis.x(bar.off_ns) if bar.off_ns is not None else WIDTH - RIGHT
     said = f"{bar.name} {bar.target}".strip()
-    off = f"to {seconds(bar.off_ns)}" if bar.off_ns is not None else "and not taken away"
+    off = f"to {seconds(bar.off_ns)}" if bar.off_ns is not None else "and not removed"
     box = el(
         "rect", el("title", f"fault {bar.id}: {said}, from {seconds(bar.on_ns)} {off}"), cls="fault",
         x=x1, y=3.0, width=max(2.0, x2 - x1), height=16.0, rx=2,

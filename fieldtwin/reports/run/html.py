@@ -60,7 +60,10 @@ def render_html(report: Report) -> str:
         failures=studied.failures,
         not_drawn=studied.not_drawn,
         coverage=[
-            (part.system.name if part.system is not None else "what has no system file", coverage_section(part, counts))
+            (
+                part.system.name if part.system is not None else "runs without a system file",
+                coverage_section(part, counts),
+            )
             for part, counts in studied.parts.values()
         ],
         listed=_listed(report),

@@ -50,7 +50,7 @@ def read_site(
                 left_out.append(str(e))
     if not pieces:
         raise UsageError(
-            "nothing to report", expected="dumps, and the JSON of check, diff or compare", got="none of them"
+            "nothing to report", expected="dumps, and the JSON of check, diff or compare", got="no file of these kinds"
         )
     devices: dict[tuple[str, str, int], Device] = {}
     for _, piece in sorted(pieces, key=lambda each: (each[1].protocol, each[1].endpoint, each[1].address)):
@@ -86,7 +86,7 @@ def read_piece(path: Path) -> Piece:
             if b'"fieldtwin_dump"' in head:
                 return dump_piece(path)
             if head.startswith(b'{"started"'):
-                raise NotTaken("a log of what was sent", path=str(path))
+                raise NotTaken("a log of sent frames", path=str(path))
             raw = head + file.read(MOST_BYTES)
     except OSError as e:
         raise FileInvalid(f"cannot be read: {e.strerror or e}", path=str(path)) from e
@@ -97,7 +97,7 @@ def read_piece(path: Path) -> Piece:
     kind = data.get("kind") if isinstance(data, dict) else None
     if kind not in READERS:
         known = ", ".join(f"the JSON of `{name}`" for name in READERS)
-        raise NotTaken("not for a document", path=str(path), expected=f"a dump, {known}", got=repr(kind)[:60])
+        raise NotTaken("not suitable for a document", path=str(path), expected=f"a dump, {known}", got=repr(kind)[:60])
     try:
         return READERS[kind](data)
     except (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError) as e:
@@ -125,11 +125,11 @@ def check_piece(data: dict[str, Any]) -> Piece:
     shown["failed"] -= noted.total()
     shown += noted
     skipped = [c for c in cases if c["verdict"] == "skipped" and not c["waived"]]
-    here = [c for c in skipped if c["reason"] != "not on this wire"]
+    here = [c for c in skipped if c["reason"] != "not on this kind of bus"]
     shown["skipped"] -= len(skipped) - len(here)
     bad = any(d.weight == "deviation" for d in deviations)
     facts = [
-        ("played", f"cases up to danger {about['at_most']}"),
+        ("played", f"test cases up to impact level {about['at_most']}"),
         ("wrote to", ", ".join(map(str, about["wrote"])) or "nothing"),
         ("reply timeout", f"{about['timeout_s']} s"),
         ("took", f"{about['took_s']} s"),
@@ -194,7 +194,7 @@ def compare_piece(data: dict[str, Any]) -> Piece:
     ]
     unjudged = int(data.get("not_compared", 0))
     if unjudged:
-        where = "the recording has no values at the position at which the dialogue continued it"
+        where = "the recording has no values at the position where the dialogue continued"
         deviations.append(
             Deviation("open", "not everything was compared", "all exchanges", f"{unjudged} not compared", source=where)
         )
@@ -202,16 +202,14 @@ def compare_piece(data: dict[str, Any]) -> Piece:
     facts = [
         ("against", str(about["against"])),
         ("compared", f"{data['compared']} exchanges, {data['left_out']} left out, {unjudged} not compared"),
-        ("values", f"{alike} alike, {100 * data['least']:g} % asked for"),
+        ("values", f"{alike} alike, {100 * data['least']:g} % required"),
         ("timing", "not judged" if timing is None else f"{100 * timing:.1f} %"),
     ]
     latency = [(r["service"], r["count"], _ms(r["recorded_s"]), _ms(r["other_s"])) for r in data["latency"]]
     tables = (_table("Latency: median, 90 %, 99 %", ("function", "exchanges", "recorded", "this one"), latency),)
     summary = f"{data['compared']} exchanges, {alike} alike"
     if data["met"]:  # a difference within the allowed share is not a deviation
-        deviations = [
-            replace(d, weight="waived", found=f"{d.found}; within the share that was asked for") for d in deviations
-        ]
+        deviations = [replace(d, weight="waived", found=f"{d.found}; within the required share") for d in deviations]
     verdict = "met" if data["met"] else "inconclusive" if data.get("inconclusive") else "not met"
     return _headed("comparison", about, verdict, summary, facts, deviations, tables)
 

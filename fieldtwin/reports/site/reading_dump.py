@@ -25,25 +25,25 @@ def dump_piece(path: Path) -> Piece:
     deviations = (
         []
         if dump.ended
-        else [Deviation("open", "the dump did not end", "a whole dump", "it was broken off", path.name)]
+        else [Deviation("open", "the dump did not end", "a whole dump", "it was interrupted", path.name)]
     )
     unknown, asked_for = dump.unknown
     if unknown:
         where = [text for found in dump.maps.values() for text in found.get("unknown", [])]
         got = f"{unknown} of {asked_for} unknown: no reply, no valid reply, or not asked"
         got += f" ({_spans(where)})" if where else ""
-        deviations.append(Deviation("open", "not everything was found out", "an answer everywhere", got, path.name))
+        deviations.append(Deviation("open", "some results are missing", "an answer everywhere", got, path.name))
     facts = [
-        ("ranges", ", ".join(map(str, header["ranges"])) or "all that the profile or EDS names"),
+        ("ranges", ", ".join(map(str, header["ranges"])) or "all tags of the profile or EDS"),
         ("profile", str(header.get("profile") or "none")),
         ("times through", str(len(dump.passes))),
         ("values", str(cells)),
     ]
     if dump.not_asked:
-        facts.append(("not asked", f"{dump.not_asked} of {asked_for} addresses; those beside them were"))
+        facts.append(("not asked", f"{dump.not_asked} of {asked_for} addresses; their neighbours were"))
     return Piece(
         "dump", dump.protocol, int(header.get("address", 0)), str(header.get("endpoint", "")), str(header.get("started", "")),
-        str(header.get("by", "")), _verdict(dump), f"{cells} values in {len(dump.passes)} times through",
+        str(header.get("by", "")), _verdict(dump), f"{cells} values in {len(dump.passes)} passes",
         identity(dump), tuple(facts), tuple(deviations), _tables(dump), str(header.get("command", "")),
     )  # fmt: skip
 
@@ -103,9 +103,9 @@ def _tables(dump: Dump) -> tuple[Table, ...]:
     latency = tuple((name, *_latency(found)) for name, found in sorted(dump.latency.items()))
     heads = ("readable", "refused", "no reply", "invalid reply", "not asked")
     return (
-        Table("What can be read", ("table", *heads, "longest read"), maps),
+        Table("Readable ranges", ("table", *heads, "longest read"), maps),
         *(Table("Objects", heads, (tuple(row),)) for row in objects),
-        Table("How fast it answers", ("function", "requests", "median", "95 %", "slowest"), latency),
+        Table("Response times", ("function", "requests", "median", "95 %", "slowest"), latency),
     )
 
 

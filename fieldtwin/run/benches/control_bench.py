@@ -312,7 +312,7 @@ class ControlBench(Started):
 
     def late_ms(self) -> float:
         if self._plc is None:
-            raise UsageError("nobody can tell how late the scans of somebody else's controller are", where="plc.late")
+            raise UsageError("the scan times of a third-party controller are not known", where="plc.late")
         return self._late_ms
 
     def host_late_s(self, since_s: float) -> float:
@@ -323,7 +323,7 @@ class ControlBench(Started):
 
     async def send(self, period_s: int) -> None:
         if self._shore is None:
-            raise UsageError("nobody can command this system", expected="a transmitter with a far end")
+            raise UsageError("this system cannot be commanded", expected="a transmitter with a topside end")
         self._shore.send(period_s)
 
     async def set_value(self, device: str, tag: str, value: float | str | bool | None) -> None:

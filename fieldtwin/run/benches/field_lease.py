@@ -70,7 +70,7 @@ class FieldLease:
             try:
                 answer = await self._client.call("lease", id=self.id, for_s=LEASE_S, renew=True)
                 if answer["life"] != self._life:
-                    self.lost = LeaseLost("the simulated field devices were made anew by someone else meanwhile")
+                    self.lost = LeaseLost("the simulated field devices were restarted by another program meanwhile")
             except RemoteError as e:
                 self.lost = LeaseLost(str(e))
             except FieldtwinError as e:

@@ -47,7 +47,7 @@ class InvariantWatch:
 
     def end(self, why: str) -> None:
         """Stop checking, because of `why`."""
-        self._ended = f"; not judged from {self._now_s:.3f} s on: {why}"
+        self._ended = f"; not checked from {self._now_s:.3f} s on: {why}"
 
     def _look(self, now_s: float, knowledge: Knowledge, bench: Bench) -> None:
         self._now_s = now_s
@@ -62,7 +62,7 @@ class InvariantWatch:
                 late_s = bench.host_late_s(now_s - said.bound_s - RECENT_S)
                 unknown = said.nobody_knows or (said.bound_s > 0 and late_s > LATE_SHARE * said.bound_s)
                 verdict = Verdict.INCONCLUSIVE if unknown else Verdict.FAILED
-                late = f"; but this host was {late_s * 1000:.0f} ms late by itself" if unknown else ""
+                late = f"; but this host itself was {late_s * 1000:.0f} ms late" if unknown else ""
                 self._broken[rule.number] = verdict, f"broken at {now_s:.3f} s: {said.got}{late}"
 
     def results(self) -> list[dict[str, Any]]:

@@ -132,7 +132,7 @@ class NetworkBench:
 
     async def send(self, period_s: int) -> None:
         if self.shore is None:
-            raise UsageError("nobody can command this network", expected="`ship:` in its file")
+            raise UsageError("this network cannot be commanded", expected="`ship:` in its file")
         self.shore.send(period_s)
 
     async def set_value(self, device: str, tag: str, value: float | str | bool | None) -> None:
@@ -161,7 +161,7 @@ class NetworkBench:
     async def clear(self, id: str) -> None:
         where = self._where.pop(id, None)
         if where is None:
-            raise UsageError(f"no fault {id!r} is in", expected=", ".join(self._where) or "one; there is none")
+            raise UsageError(f"no fault {id!r} is active", expected=", ".join(self._where) or "one; there is none")
         if where == WATER:
             self.faults.clear(id)
             self.trace.note(self.now_ns(), Kind.FAULT, id, {"name": "", "on": False, "target": ""})

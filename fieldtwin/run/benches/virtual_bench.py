@@ -239,7 +239,7 @@ class VirtualBench(Started):
 
     async def send(self, period_s: int) -> None:
         if self.shore is None:
-            raise UsageError("nobody can command this system", expected="a transmitter with a far end")
+            raise UsageError("this system cannot be commanded", expected="a transmitter with a topside end")
         self.shore.send(period_s)
 
     async def set_value(self, device: str, tag: str, value: float | str | bool | None) -> None:

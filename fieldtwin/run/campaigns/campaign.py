@@ -55,7 +55,7 @@ class Campaign:
         form = scenario.form
         if not (form.always or form.never or form.within or form.judge or scenario.invariants):
             raise UsageError(
-                "random faults can break nothing of this scenario: its steps are not judged under them",
+                "random faults cannot fail this scenario: its steps are not checked under random faults",
                 where=str(self.path),
                 expected="always, never, within or judge in the scenario, or invariants in the system file",
             )
@@ -169,7 +169,7 @@ def _rule_checks(results: Sequence[ScenarioResult]) -> list[CheckResult]:
         verdict = Verdict.FAILED if broken else Verdict.PASSED
         if not judged and "invariant" not in number:
             verdict = Verdict.INCONCLUSIVE
-        got = f"judged with {judged} of {len(results)} seeds, broken with {broken}"
+        got = f"checked with {judged} of {len(results)} seeds, broken with {broken}"
         checks.append(CheckResult(number, first.text, verdict, got=got, where=first.where, names=first.names))
     return checks
 
@@ -179,9 +179,9 @@ def _faults_check(results: Sequence[ScenarioResult]) -> CheckResult:
     names = sorted({fault.name for result in results for fault in result.faults})
     struck = {n: [fault.struck for result in results for fault in result.faults if fault.name == n] for n in names}
     parts = [f"{name} {len(each)} (struck {sum(each)} times)" for name, each in struck.items()]
-    got = f"{sum(map(len, struck.values()))} put in: {', '.join(parts)}" if parts else "none was put in"
+    got = f"{sum(map(len, struck.values()))} injected: {', '.join(parts)}" if parts else "none was injected"
     verdict = Verdict.PASSED if any(map(sum, struck.values())) else Verdict.INCONCLUSIVE
-    return CheckResult("faults", "random faults strike", verdict, got=got)
+    return CheckResult("faults", "random faults are injected", verdict, got=got)
 
 
 def broken_by(result: ScenarioResult) -> list[str]:

@@ -10,7 +10,7 @@ from fieldtwin.run.campaigns.shrink import same_failure
 from fieldtwin.run.targets.virtual_scenario import run_virtual
 from fieldtwin.scenarios.language.form import load_scenario
 
-CONFIRMED = "confirmed: this scenario fails as the run did"
+CONFIRMED = "confirmed: this scenario fails like the run"
 
 
 def confirm_run(path: Path, found: SeedResult, profiles: tuple[Path, ...]) -> str:
@@ -28,4 +28,4 @@ def ended(result: ScenarioResult) -> str:
     """Return in words how a scenario ended that should have failed in a certain way."""
     if result.verdict is Verdict.PASSED:
         return "this scenario passes"
-    return f"this scenario ends otherwise ({result.verdict.value}: {result.reason})"
+    return f"this scenario has a different result ({result.verdict.value}: {result.reason})"

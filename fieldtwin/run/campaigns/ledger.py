@@ -46,7 +46,7 @@ class Ledger:
             try:
                 self.entries.append(msgspec.json.decode(line, type=Entry))
             except msgspec.DecodeError as e:
-                raise FileInvalid(f"no line of a ledger: {e}", path=str(path), line=number) from e
+                raise FileInvalid(f"not a line of a ledger: {e}", path=str(path), line=number) from e
         if rest:
             os.truncate(path, len(data) - len(rest))
 

@@ -17,7 +17,7 @@ def only_bus(wires: Sequence[Endpoint]) -> Endpoint:
     """Return the one bus among the endpoints; raises `UsageError` for anything else."""
     if len(wires) != 1 or not wires[0].is_can:
         raise UsageError(
-            "a CANopen node stands on one bus",
+            "a CANopen node needs a CAN bus",
             expected="--on can:fieldtwin/127.0.0.1:29536 or can:socketcan/vcan0",
             got=" ".join(map(str, wires)),
         )
@@ -48,4 +48,4 @@ async def stand_on_bus(
     closing.append(connection)
     host, port = made.bound.address
     look = f"python -m can.viewer -i fieldtwin -c {host}:{port}"
-    return connection, f"{made.bound}, a bus made here at {made.bitrate} bit/s (look at it: {look})"
+    return connection, f"{made.bound}, a new bus with {made.bitrate} bit/s (watch it: {look})"

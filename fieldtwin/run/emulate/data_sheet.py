@@ -79,11 +79,11 @@ async def run_log(path: Path, endpoints: tuple[str, ...], node_id: int | None, b
     there = nodes_of(frames())
     if node_id is None and len(there) != 1:
         if not there:
-            raise UsageError(f"{path.name} holds nothing of any node")
-        raise UsageError(f"{path.name}: which node?", expected=f"--node, one of {', '.join(map(str, there))}")
+            raise UsageError(f"{path.name} contains no node")
+        raise UsageError(f"{path.name}: the node is not given", expected=f"--node, one of {', '.join(map(str, there))}")
     node_id = node_id or there[0]
     text = LogSheet(frames(), node_id).eds(path.stem)
-    talk.print(f"node {node_id} has what {path.name} has of it; of names and meanings nothing is known", soft_wrap=True)
+    talk.print(f"node {node_id} has what {path.name} has of it; names and meanings are not known", soft_wrap=True)
     with TemporaryDirectory(prefix="fieldtwin-") as folder:
         sheet = Path(folder) / f"{path.stem}.eds"
         sheet.write_text(text, encoding="utf-8")
@@ -112,4 +112,4 @@ def _node(dictionary: Dictionary, node_id: int, log: Path | None, options: NodeO
 
 
 def _named(node: CanopenNode) -> str:
-    return "node without an id" if node.node_id == UNCONFIGURED else f"node {node.node_id}"
+    return "node without a node ID" if node.node_id == UNCONFIGURED else f"node {node.node_id}"

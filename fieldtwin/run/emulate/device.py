@@ -163,7 +163,7 @@ class DeviceHost:
         Without either, the device is built from its profile alone.
         """
         if recording is None and self._recording_of(profile) is None:
-            talk.print(f"{profile.name}: nothing recorded; every register of its profile begins with 0", soft_wrap=True)
+            talk.print(f"{profile.name}: no recording; every register of its profile begins with 0", soft_wrap=True)
             return self._stated(profile, {})
         path = find_recording(str(recording or f"{Path(profile.path).stem}.jsonl"))
         replay, recorded = load_replay(profile, path)
@@ -206,7 +206,10 @@ class DeviceHost:
             raise UsageError("the recording holds no exchange", where=str(path))
         talk.print(f"plays {shown(oldest_part(path))}", soft_wrap=True)
         if replay.context.dropped:
-            talk.print(f"  it is too long: the oldest {replay.context.dropped} exchanges are left out", soft_wrap=True)
+            talk.print(
+                f"  the recording is too long: the oldest {replay.context.dropped} exchanges are left out",
+                soft_wrap=True,
+            )
         if unit_id is None:
             return {number: ReplayUnit(replay, number, f"{path.name}:{number}") for number in replay.units}
         recorded = replay.units[0] if len(replay.units) == 1 else unit_id
@@ -228,7 +231,7 @@ class DeviceHost:
     def _player(self, profile: DeviceProfile, recording: Path | None) -> SignalPlayer:
         name = recording or self._recording_of(profile)
         if name is None:
-            raise UsageError(f"{profile.name} needs a recording to play", hint="--recording FILE")
+            raise UsageError(f"{profile.name} needs a recording", hint="--recording FILE")
         path = find_recording(str(name))
         track = SignalTrack.load(path)
         talk.print(f"{profile.name} plays {shown(path)}", soft_wrap=True)

@@ -49,7 +49,7 @@ async def run_field(options: FieldOptions) -> int:
 
 
 def _say(side: FieldSide, process: FieldProcess, options: FieldOptions) -> None:
-    talk.print(f"[bold]field side[/bold] of {side.system.name}")
+    talk.print(f"[bold]field simulator[/bold] of {side.system.name}")
     for bus, endpoint in side.listening.items():
         devices = ", ".join(d.name for d in side.system.devices_on(bus))
         talk.print(f"  {bus}: {endpoint}  ({devices})", soft_wrap=True)
@@ -58,7 +58,7 @@ def _say(side: FieldSide, process: FieldProcess, options: FieldOptions) -> None:
         for remark in emulated.remarks:
             talk.print(f"  {name}: {remark}", soft_wrap=True, markup=False)
     for device, endpoint in side.far.items():
-        talk.print(f"  far end of {device}: {endpoint}", soft_wrap=True)
+        talk.print(f"  topside end of {device}: {endpoint}", soft_wrap=True)
     host = options.control.rpartition(":")[0]
     where = (
         "" if host in ("", "127.0.0.1", "localhost") and process.control_port == 7420 else f":{process.control_port}"

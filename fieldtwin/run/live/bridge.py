@@ -109,7 +109,7 @@ async def run_bridge(options: BridgeOptions, say: Callable[[str], None]) -> dict
             bus = ModbusBus(config, [], connector, clock, TagTable(clock), lambda driver: None)
             bridge = Bridge(bridge_config(options), {TARGET: bus}, connector, clock, audit)
             if options.allow_writes:
-                say(f"writes go on record in {instance.path('audit.jsonl')}")
+                say(f"writes are recorded in {instance.path('audit.jsonl')}")
             async with Nursery() as nursery:
                 nursery.start(bus.run(), "target")
                 nursery.start(bridge.run(), "bridge")

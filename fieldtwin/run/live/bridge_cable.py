@@ -44,7 +44,7 @@ class BridgeCable:
         """Carry bytes both ways until cancelled, or closed."""
         async with Nursery() as nursery:
             nursery.start(self._carry(self._outside, self._inside), "towards the gateway")
-            nursery.start(self._carry(self._inside, self._outside), "towards the master")
+            nursery.start(self._carry(self._inside, self._outside), "towards the client")
             await nursery.wait()
 
     async def _carry(self, source: ByteConnection, target: ByteConnection) -> None:

@@ -52,6 +52,6 @@ class RunOptions:
         check_place(self.thread_store)
         if has_password(self.thread):
             raise UsageError(
-                "a password in a URL can be read by everybody", got=without_password(self.thread),
+                "every user of this computer can read a password in a URL", got=without_password(self.thread),
                 hint="FIELDTWIN_MQTT_PASSWORD in the environment, or FIELDTWIN_MQTT_PASSWORD_FILE",
             )  # fmt: skip

@@ -86,7 +86,7 @@ class Oracle:
         if raw not in self._held[tag]:
             self.wrong_count += 1
             if len(self.wrong) < EXAMPLES:
-                self.wrong.append(f"{tag} was published as {value!r} ({raw}); the device never held that")
+                self.wrong.append(f"{tag} was published as {value!r} ({raw}); the device never had this value")
 
     def describe(self) -> dict[str, Any]:
         return {

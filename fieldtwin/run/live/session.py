@@ -138,7 +138,7 @@ class RunSession(Started):
             )
         if lent and o.commands:
             raise UsageError(
-                f"the far end of {lent!r} is the digital twin's", expected="--commands none",
+                f"the topside end of {lent!r} belongs to the digital twin", expected="--commands none",
                 hint="`fieldtwin twin ... --command 1` commands over the thread",
             )  # fmt: skip
         return lent
@@ -375,7 +375,7 @@ class RunSession(Started):
                 await invariants.run(bench, INVARIANTS_S)
         except FieldtwinError as e:  # the monitoring of the processes reports the one that ended
             invariants.end(str(e))
-            self.note_error(f"the invariants were not judged to the end: {e}")
+            self.note_error(f"the invariants were not checked to the end: {e}")
 
     async def _settle(self) -> None:
         """Wait at the end for a command in progress, for `SETTLE_S` seconds at most."""
@@ -433,7 +433,7 @@ class RunSession(Started):
         if (thread := await self._get(self._clients.get("thread"), "thread")) is not None:
             self.thread_status = thread
             if thread["dropped"]:
-                self.note_error(f"the thread's log lost events: {thread['store_trouble'] or 'they came too fast'}")
+                self.note_error(f"the thread's log lost events: {thread['store_trouble'] or 'they arrived too fast'}")
 
     async def _refresh_field(self) -> None:
         """Refresh the field simulator's status; after `start: fresh` its journals and counters begin again."""
@@ -474,7 +474,7 @@ class RunSession(Started):
         gap_s = (self.clock.monotonic_ns() - self._looked_ns) / NS_PER_S
         if self._looked_ns and gap_s > STILL_S:
             self._still_ns = self.clock.monotonic_ns()
-            self.note_error(f"run: the run's own process stood still for {gap_s:.1f} s")
+            self.note_error(f"run: this process was not scheduled for {gap_s:.1f} s")
         return self.clock.monotonic_ns() - self._still_ns < (STILL_S + ANSWERS_WITHIN_S) * NS_PER_S
 
     def _maybe_lost(self, client: ControlClient, error: FieldtwinError) -> None:
@@ -495,7 +495,7 @@ class RunSession(Started):
     async def reload(self, by: str) -> Reloaded:
         """Make the gateway read its files again (`fieldtwin.run.processes.reloading`); no poll is lost."""
         if "gateway" not in self._clients:
-            raise Unreachable("the gateway is gone")
+            raise Unreachable("the gateway has ended")
         # own connection: statuses are queried meanwhile
         own = await ControlClient.connect_unix(self.instance.path("gateway.sock"))
         try:

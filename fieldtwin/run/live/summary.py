@@ -68,8 +68,8 @@ class RunFacts:
     """Tags of which a scenario expects that their outputs are refused."""
 
 
-GATEWAY_GONE = "the gateway did not answer at the end: what it published and what its outputs hold is not known"
-NOT_CALM = "whether devices and outputs were good at the end, because faults were put in"
+GATEWAY_GONE = "the gateway did not answer at the end: its published values and outputs are not known"
+NOT_CALM = "whether devices and outputs were good at the end, because faults were injected"
 """The message of a run that had faults until its end, or until shortly before."""
 
 
@@ -266,7 +266,7 @@ def _output_checks(gateway: Mapping[str, Any]) -> list[str]:
     """Return the outputs that an online device does not hold at the end, although they may be written."""
     devices = gateway.get("devices", {})
     return [
-        f"{o['tag']}: {o['wanted']:g} was commanded by {o['by']}, and the device does not hold it"
+        f"{o['tag']}: {o['wanted']:g} was commanded by {o['by']}, but the device has a different value"
         for o in gateway.get("outputs", [])
         if o["wanted"] is not None
         and o["held"] != o["wanted"]
@@ -290,7 +290,7 @@ def _refusal_checks(refusals: Mapping[str, Any], expected: Collection[str], *, d
     if len(told) > MOST_REFUSED:
         told[MOST_REFUSED:] = [f"{len(told) - MOST_REFUSED} more outputs were refused"]
     if not found and not expected and any(refusals.get("faults", {}).get(fault) for fault in faults):
-        told = ["outputs of programs were refused, so many that the first are no longer kept: see the audit log"]
+        told = ["so many outputs of programs were refused that the first are no longer listed: see the audit log"]
     return told
 
 
@@ -303,7 +303,9 @@ def _plc_checks(plc: PlcStatus | None) -> list[str]:
     ]
     if plc.stops.count:
         times = "once" if plc.stops.count == 1 else f"{plc.stops.count} times"
-        failed.append(f"PLC: stopped by itself {times}, and began again after that; the last time: {plc.stops.last}")
+        failed.append(
+            f"PLC: stopped without a request {times}, and restarted after that; the last time: {plc.stops.last}"
+        )
     error = plc.error
     told = failed and (plc.state == "waiting" or plc.stop_reason == StopReason.NOT_STARTED.value)
     return [f"PLC: {error}", *failed] if error and not told else failed
@@ -325,9 +327,9 @@ def _published_checks(run: RunFacts) -> list[str]:
     """Check that the devices held the published values, and that the gateway took no message that was not sent."""
     published, messages = run.published, list(run.wrong_messages)
     if published["wrong"]:
-        told = f"{published['wrong']} published values were never held by their device"
+        told = f"{published['wrong']} published values never occurred in their device"
         return [told, *published["examples"], *messages]
-    return messages if published["checked"] else ["no value was published as good", *messages]
+    return messages if published["checked"] else ["no value was published with good quality", *messages]
 
 
 def _state_checks(run: RunFacts) -> list[str]:
@@ -339,5 +341,5 @@ def _state_checks(run: RunFacts) -> list[str]:
     for program in run.states.relays:
         seen = list(run.states.sequences.get(program, ()))
         if seen and seen != expected:
-            failed.append(f"{program}: the commands ask for {' '.join(expected)}, seen were {' '.join(seen)}")
+            failed.append(f"{program}: the commands require {' '.join(expected)}, observed {' '.join(seen)}")
     return failed

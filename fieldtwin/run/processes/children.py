@@ -75,13 +75,15 @@ class Child:
                 client = await ControlClient.connect_unix(self.socket)
             except Unreachable:
                 if asyncio.get_running_loop().time() > deadline:
-                    raise ReplyTimeout(f"the {self.name} process did not get ready", hint=f"log: {self.log}") from None
+                    raise ReplyTimeout(
+                        f"the {self.name} process did not become ready", hint=f"log: {self.log}"
+                    ) from None
                 await asyncio.sleep(POLL_S)
                 continue
             try:
                 answer = await client.call("ready")
                 if not answer.get("ready"):
-                    raise Bug(f"the {self.name} process answered, and is not ready", got=str(answer))
+                    raise Bug(f"the {self.name} process answered, but is not ready", got=str(answer))
             except BaseException:
                 await client.aclose()
                 raise

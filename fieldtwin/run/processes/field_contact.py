@@ -58,7 +58,7 @@ async def connect_control(host_port: str, token: str) -> tuple[ControlClient, st
     if not colon:
         host, port = host_port, str(DEFAULT_CONTROL_PORT)
     if not port.isdigit():
-        raise UsageError("the field side's address", expected="HOST or HOST:PORT", got=host_port)
+        raise UsageError("the field simulator's address", expected="HOST or HOST:PORT", got=host_port)
     return await ControlClient.connect_tcp(host, int(port), token), host
 
 
@@ -104,7 +104,7 @@ def check_same(system: System, status: FieldStatus) -> None:
     """Raise `FileInvalid` if the status of a field simulator has a different version of the system file."""
     if status.system_hash != system.hash:
         raise FileInvalid(
-            f"the field side runs another version of {system.name!r}",
+            f"the field simulator runs a different version of {system.name!r}",
             path=str(system.path),
             expected=f"the same file (hash {system.hash})",
             got=f"{status.system!r} (hash {status.system_hash})",
@@ -119,9 +119,9 @@ def reachable(listening: Endpoint, host: str) -> Endpoint:
     if listening.scheme == "pty":
         if host not in LOCAL_HOSTS:
             raise UsageError(
-                "a virtual serial port does not cross hosts",
+                "a virtual serial port cannot be used from another host",
                 where=str(listening),
-                hint="let that bus listen on tcp:// in the prototype file",
+                hint="use a tcp:// endpoint for that bus in the prototype file",
             )
         return listening
     if listening.is_can and listening.interface != "fieldtwin":
@@ -131,7 +131,7 @@ def reachable(listening: Endpoint, host: str) -> Endpoint:
         return listening.with_address(host, port)
     if bound in LOCAL_HOSTS and host not in LOCAL_HOSTS:
         raise UsageError(
-            f"the field side listens on its own loopback only: {listening}",
-            hint="let that bus listen on 0.0.0.0 in the prototype file",
+            f"the field simulator listens only on its own loopback: {listening}",
+            hint="use an endpoint on 0.0.0.0 for that bus in the prototype file",
         )
     return listening

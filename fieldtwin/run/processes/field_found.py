@@ -35,7 +35,7 @@ async def find_field(system: System, run_dir: Path, environ: Mapping[str, str] =
         found = [path for path in _sockets(run_dir.parent) if await _is_of(path, system)]
         if len(found) > 1:
             raise UsageError(
-                f"several field sides of {system.name!r} run on this host",
+                f"several field simulators of {system.name!r} run on this host",
                 expected="--instance with one of " + ", ".join(path.parent.name for path in found),
             )
         if found:

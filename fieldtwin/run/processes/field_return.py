@@ -62,7 +62,7 @@ class FieldReturn:
         """Return the current problem, in words that do not change while it lasts, or an empty string."""
         if not self._gone.is_set():
             return self.moved
-        return self._reason or f"the field side at {self._where} was lost: nobody knows what its devices held"
+        return self._reason or f"the field simulator at {self._where} was lost: the values of its devices are not known"
 
     def lost(self) -> None:
         """Record that a call was not answered, or that its connection is lost."""
@@ -80,7 +80,7 @@ class FieldReturn:
                 await asyncio.sleep(backoff.next_s())
             away_s = asyncio.get_running_loop().time() - self._gone_s
             self._away_s += away_s
-            self.news = f"the field side at {self._where} is back after {away_s:.1f} s"
+            self.news = f"the field simulator at {self._where} is back after {away_s:.1f} s"
 
     async def _try(self) -> bool:
         client: ControlClient | None = None
@@ -98,7 +98,7 @@ class FieldReturn:
             self._gone.clear()
         except (FieldtwinError, TimeoutError) as e:
             if isinstance(e, FileInvalid | OtherVersion):
-                self._reason = f"the field side at {self._where} came back otherwise: {e}"
+                self._reason = f"the field simulator at {self._where} came back with differences: {e}"
             return False
         finally:
             if client is not None:
@@ -107,13 +107,13 @@ class FieldReturn:
 
     def _check(self, status: FieldStatus) -> None:
         check_same(self._system, status)
-        was = {**self._contact.listening, **{f"far end of {d}": url for d, url in self._contact.far_said.items()}}
-        now = {**status.listening, **{f"far end of {d}": url for d, url in status.far.items()}}
+        was = {**self._contact.listening, **{f"topside end of {d}": url for d, url in self._contact.far_said.items()}}
+        now = {**status.listening, **{f"topside end of {d}": url for d, url in status.far.items()}}
         elsewhere = [
             f"{name} at {now.get(name, 'nothing')}, not {url}" for name, url in was.items() if now.get(name) != url
         ]
         self.moved = (
-            f"the field side at {self._where} came back and listens elsewhere: {'; '.join(elsewhere)}. "
+            f"the field simulator at {self._where} came back with different endpoints: {'; '.join(elsewhere)}. "
             "Give its buses fixed ports, in the prototype file or with --listen"
             if elsewhere
             else ""

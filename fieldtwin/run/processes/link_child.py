@@ -31,7 +31,7 @@ class LinkChild:
                 text = self._log.read_text(encoding="utf-8", errors="replace").strip()
                 raise Unreachable(f"the link ended: {text.splitlines()[-1] if text else 'no reason given'}")
             if asyncio.get_running_loop().time() > deadline:
-                raise ReplyTimeout("the link made no port", where=str(self._link))
+                raise ReplyTimeout("the link created no port", where=str(self._link))
             await asyncio.sleep(0.02)
 
     async def end(self) -> None:

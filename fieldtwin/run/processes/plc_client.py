@@ -53,7 +53,7 @@ def choose(instance: str) -> Path:
     path = runtime_root() / instance / "plc.sock"
     if not path.exists():
         found = running_instances()
-        running = f"one of {', '.join(found)}" if found else "one that is running"
+        running = f"one of {', '.join(found)}" if found else "the name of a running instance"
         raise Unreachable(f"no instance {instance!r} is running here", expected=running)
     return path
 

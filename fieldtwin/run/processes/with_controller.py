@@ -59,7 +59,7 @@ class WithController(Started):
         program = shutil.which(self._argv[0])
         if program is None:
             raise UsageError(
-                f"cannot start {self._argv[0]!r}: no such program", hint="is it on the PATH, and executable?"
+                f"cannot start {self._argv[0]!r}: no such program", hint="check that it is on the PATH and executable"
             )
         self._stack.enter_context(self.instance)
         home = self.instance.dir
@@ -100,9 +100,9 @@ class WithController(Started):
             return None
         how = f"by signal {-code}" if code < 0 else f"with exit status {code}"
         return ControllerEnded(
-            f"the controller ended by itself {how}",
+            f"the controller ended early {how}",
             where=self._argv[0],
-            expected="a program that runs until it is ended",
+            expected="a program that runs until it is stopped",
         )
 
     async def _end_program(self) -> None:

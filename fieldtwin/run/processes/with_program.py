@@ -112,7 +112,9 @@ async def run_with(
     """
     program = shutil.which(argv[0])
     if program is None:
-        raise UsageError(f"cannot start {argv[0]!r}: no such program", hint="is it on the PATH, and executable?")
+        raise UsageError(
+            f"cannot start {argv[0]!r}: no such program", hint="check that it is on the PATH and executable"
+        )
     resolve(config)  # report errors in the files before anything starts
     system = load_system(config.system, [Path(p) for p in config.profiles])
     name = instance or f"with-{os.getpid()}"

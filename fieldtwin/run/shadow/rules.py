@@ -2,7 +2,7 @@
 
 ```yaml
 limits: {ctd.pressure: [0, 500]}                        # what `outside` means, where the profile has no range or another one
-what_if: {horizon: 30min, require: ["quality(ctd.pressure) == 'good'"]}    # asked of a prototype before each command
+what_if: {horizon: 30min, require: ["quality(ctd.pressure) == 'good'"]}    # simulated before each command
 rules:
   - {when: outside, of: ctd.pressure, period_s: 1}      # an event: sample every second
   - {when: inside, of: ctd.pressure, period_s: 60}
@@ -43,20 +43,22 @@ class QuestionForm(Strict):
 
     model_config = ConfigDict(validate_by_name=False)
 
-    horizon: str = Field(description="how far ahead, such as 30min")
-    settle: str = Field(default="5s", description="from when on `require` counts")
-    require: list[Expression] = Field(default=[], max_length=100, description="what must hold all the time")
-    finally_: list[Expression] = Field(default=[], alias="finally", max_length=100, description="and at the end")
+    horizon: str = Field(description="simulated time, such as 30min")
+    settle: str = Field(default="5s", description="time from which on `require` is checked")
+    require: list[Expression] = Field(default=[], max_length=100, description="expressions that must always hold")
+    finally_: list[Expression] = Field(
+        default=[], alias="finally", max_length=100, description="expressions that must hold at the end"
+    )
 
 
 class RuleForm(Strict):
     """The command for a finding."""
 
     when: Finding
-    of: str = Field(default="", description="a tag or a program; empty: whatever it is found of")
+    of: str = Field(default="", description="a tag or a program; empty: every tag and program")
     period_s: int = Field(ge=-32768, le=32767)
     what_if: QuestionForm | Literal[False] | None = Field(
-        default=None, description="a question of its own; false: nobody is asked"
+        default=None, description="the simulation for this rule; false: none"
     )
 
 
@@ -64,9 +66,11 @@ class RulesForm(Strict):
     """A planner as rules; the first that fits decides."""
 
     limits: dict[TagName, Range] = Field(
-        default={}, description="tag -> least and most, instead of the range in its profile"
+        default={}, description="tag -> [lowest, highest], instead of the range in its profile"
     )
-    what_if: QuestionForm | None = Field(default=None, description="asked before each command that does not say more")
+    what_if: QuestionForm | None = Field(
+        default=None, description="the simulation before each command without a separate `what_if`"
+    )
     rules: list[RuleForm] = Field(min_length=1, max_length=1000)
 
 
@@ -102,7 +106,7 @@ def load_planner(source: str, system: System) -> Plans:
             raise file.error(("rules", i, "of"), f"{system.name} has no {rule.of!r}", expected="a tag or a program")
         if rule.when in ("outside", "inside") and rule.of and rule.of not in limits:
             raise file.error(
-                ("rules", i, "of"), f"{rule.of} has no limits that it could be {rule.when} of",
+                ("rules", i, "of"), f"{rule.of} has no limits for the condition {rule.when}",
                 expected=f"`limits: {{{rule.of}: [LEAST, MOST]}}` in this file, or `range` in its profile",
             )  # fmt: skip
         ask: Question | bool = rule.what_if is None
@@ -121,7 +125,7 @@ def questions_of(planner: Planner) -> list[Question]:
 
 def _question(file: YamlFile, loc: tuple[Key, ...], form: QuestionForm) -> Question:
     if not form.require and not form.finally_:
-        raise file.error(loc, "nothing is required", expected="`require` or `finally`, a list of expressions")
+        raise file.error(loc, "no requirement is given", expected="`require` or `finally`, a list of expressions")
     times = {}
     for key, text in (("horizon", form.horizon), ("settle", form.settle)):
         try:
@@ -143,7 +147,7 @@ class PythonPlanner:
         try:
             self._made: Any = getattr(importlib.import_module(module), kind)()
         except Exception as e:  # a user's module can raise any exception; it is translated only here
-            raise FileInvalid(f"the planner {source!r} cannot be made: {type(e).__name__}: {e}") from e
+            raise FileInvalid(f"the planner {source!r} cannot be created: {type(e).__name__}: {e}") from e
         if not callable(getattr(self._made, "plan", None)):
             raise FileInvalid("not a planner", expected="a class with plan(data, model)", got=source)
         try:

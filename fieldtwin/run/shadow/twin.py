@@ -122,8 +122,8 @@ class Twinning(Shadowing):
     def _give_up(self) -> None:
         if self._by_hand:
             self._plan_by_hand()
-            self.shadow.execute.give_up("the twin ended before it had heard of the plant")
-        self.shadow.execute.give_up("the twin ended before a prototype had answered")
+            self.shadow.execute.give_up("the twin ended before it received a status of the plant")
+        self.shadow.execute.give_up("the twin ended before the simulation had a result")
 
     def _kept(self, event: Event) -> None:
         if event.kind == Kind.REFUSAL:

@@ -20,7 +20,7 @@ from fieldtwin.twin.network.faults import placed_all
 from fieldtwin.twin.prototype.file import Prototype
 
 MOST_TOLD = 5
-TITLE = "what a run in virtual time is judged by"
+TITLE = "the checks of a run in virtual time"
 
 
 class _Judged(VirtualRun):

@@ -91,7 +91,7 @@ def _attempt(scenario: Scenario, target: Target, trace_file: Path | None) -> Sce
     if scenario.network is not None and target.name != "local":
         refused = f"a network is a prototype, and the target {target.name} is none: each of its systems is a plant"
     elif scenario.network is not None and target.can:
-        refused = "--can is of one system, and this is a network"
+        refused = "--can needs a single system, and this is a network"
     elif scenario.network is not None and target.controller:
         refused = "a network has a controller in each of its systems, and --with starts one program"
     elif target.controller:
@@ -238,7 +238,9 @@ def _with_what_was_in(result: ScenarioResult, bench: ControlBench) -> ScenarioRe
     before = bench.lease.before if bench.lease is not None else ""
     if not before or result.verdict in (Verdict.PASSED, Verdict.SKIPPED):
         return result
-    return replace(result, reason=f"{result.reason}; before this scenario began, these were in already: {before}")
+    return replace(
+        result, reason=f"{result.reason}; before this scenario began, these faults were already active: {before}"
+    )
 
 
 def _session(scenario: Scenario, target: Target) -> RunSession:

@@ -78,13 +78,13 @@ class AgeOracle:
             if not self._was_held(tag, raw, source_ns, now_ns):
                 age_s = (now_ns - source_ns) / NS_PER_S
                 self._refuse(
-                    f"{tag} was published as {value!r} ({raw.hex()}), {age_s:.3f} s old: the device held no such thing"
+                    f"{tag} was published as {value!r} ({raw.hex()}), {age_s:.3f} s old: the device never had this value"
                 )
         for now_ns, tag, raw, value, source_ns in self._still_good:
             if tag.partition(".")[0] in emulated and not self._was_held(tag, raw, source_ns, now_ns):
                 limit_s = (now_ns - source_ns) / NS_PER_S
                 self._refuse(
-                    f"{tag} was still good as {value!r} ({raw.hex()}): the device held no such value in the last {limit_s:.3f} s"
+                    f"{tag} was still good as {value!r} ({raw.hex()}): the device had no such value in the last {limit_s:.3f} s"
                 )
         self._still_good.clear()
         if self._waiting:

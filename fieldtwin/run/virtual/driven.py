@@ -96,7 +96,9 @@ class DrivenRun(ABC):
         elif error is not None:
             raise error
         for context in loop.unhandled[:MAX_ERRORS]:
-            self.errors.append(f"nobody caught: {context.get('message')} {context.get('exception') or ''}".strip())
+            self.errors.append(
+                f"unhandled exception: {context.get('message')} {context.get('exception') or ''}".strip()
+            )
 
     async def _through(self, bench: Timed, loop: VirtualLoop, judge: Callable[[], None]) -> None:
         """Advance to the end of the run's time, piece by piece."""

@@ -60,7 +60,7 @@ class RandomFaults:
             )
         for name in self.kinds:
             if fault_class(name).name in NOT_BY_CHANCE:
-                raise UsageError(f"{name!r} cannot be chosen by chance", hint="put it into the scenario as a step")
+                raise UsageError(f"{name!r} cannot be chosen at random", hint="put it into the scenario as a step")
         members = {"": system} if network is None else {f"{m.name}.": m.system for m in network.members.values()}
         of = {prefix: self.under(prefix) for prefix in members}
         known = [prefix + aim for prefix, one in members.items() for aim in _aims_of(one)]
@@ -76,7 +76,7 @@ class RandomFaults:
         choices = [choice for prefix, one in members.items() for choice in _choices(one, of[prefix])]
         if not any(names for _, _, names in choices) and WATER not in self.aims:
             raise UsageError(
-                "no such fault fits what is aimed at",
+                "none of these faults fits the targets",
                 got=f"{', '.join(self.kinds)} at {', '.join(self.aims) or 'every device'}",
             )
 

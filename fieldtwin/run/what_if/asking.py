@@ -82,7 +82,7 @@ class Asking:
 
     def ask(self, command: COMMAND, question: Question) -> None:
         if self._asked is not None:
-            raise Bug("a question while another one is asked")
+            raise Bug("a simulation was requested while another one runs")
         self._asked, self._answer = (command, question), None
         self._wake.set()
 
@@ -121,12 +121,12 @@ class Asking:
         while self.known.unknown and self._clock.monotonic_ns() < enough_ns:
             await self._clock.sleep_until_ns(self._clock.monotonic_ns() + LOOK_MS * NS_PER_MS)
         if not self.known.utc_ms:
-            return "a prototype was to be asked, and nothing is known of the plant to begin with"
+            return "a simulation is required, but the present state of the plant is not known"
         try:
             found = await self._process(self._form(question, command))
         except FieldtwinError as e:
             found = str(e)
-        return f"a prototype was asked: {found}" if found else ""
+        return f"simulated: {found}" if found else ""
 
     def _form(self, question: Question, command: COMMAND | None = None, *, only_check: bool = False) -> Asked:
         state = self.known.state("")

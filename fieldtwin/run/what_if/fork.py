@@ -128,7 +128,7 @@ class _ForkRun:
                     self.outcome.error = str(e)
             for context in loop.unhandled[:1]:
                 told = f"{context.get('message')} {context.get('exception') or ''}".strip()
-                self.outcome.error = self.outcome.error or f"nobody caught: {told}"
+                self.outcome.error = self.outcome.error or f"unhandled exception: {told}"
 
     async def _main(self, loop: VirtualLoop, run_dir: Path) -> None:
         run = self._run = VirtualPrototype(
@@ -162,7 +162,7 @@ class _ForkRun:
         assert self._run is not None
         device = next(iter(self._run.field.far), None)
         if device is None:
-            raise UsageError("nobody can command this system", expected="a transmitter with a far end")
+            raise UsageError("this system cannot be commanded", expected="a transmitter with a topside end")
         return Shore(self.system, device, self._run.field.far[device], self._run.clock, self._run.net)
 
     async def _watch(self, run: VirtualPrototype, loop: VirtualLoop) -> None:

@@ -28,7 +28,7 @@ async def known_state(place: str, system: System, origin: str = "") -> KnownStat
     try:
         origins = list(await store.origins(system.name))
         if origin and origin not in origins:
-            raise UsageError(f"nothing is known of {origin!r}", expected=", ".join(origins) or "an origin with events")
+            raise UsageError(f"no state is known of {origin!r}", expected=", ".join(origins) or "an origin with events")
         found = {}
         for name in [origin] if origin else origins:
             known = LastKnown(system)
@@ -36,10 +36,10 @@ async def known_state(place: str, system: System, origin: str = "") -> KnownStat
             if known.utc_ms or origin:
                 found[name] = known
         if not found and not origin:
-            raise UsageError(f"{place} knows nothing of {system.name}", expected="the last that was known of a plant")
+            raise UsageError(f"{place} contains no state of {system.name}", expected="the last known state of a plant")
         if len(found) != 1:
             raise UsageError(
-                "which origin of the knowledge?",
+                "the origin of the knowledge is ambiguous",
                 expected=", ".join(found),
                 got="none",
                 hint="--origin NAME",

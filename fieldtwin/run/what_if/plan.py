@@ -98,7 +98,7 @@ def load_plans(path: Path) -> tuple[str, list[Plan]]:
     names = [plan.name for plan in form.plans]
     for n, plan in enumerate(form.plans):
         if plan.name in names[:n]:
-            raise file.error(("plans", n, "name"), "two plans of one name", expected="another", got=plan.name)
+            raise file.error(("plans", n, "name"), "two plans with the same name", expected="another", got=plan.name)
     return form.what_if, [_plan(file, form, n, plan) for n, plan in enumerate(form.plans)]
 
 

@@ -44,7 +44,7 @@ class KnownState:
     values: Mapping[str, Number] = field(default_factory=dict)
     programs: Mapping[str, Mapping[str, Number]] = field(default_factory=dict)
     utc_ms: int = 0
-    source: str = "the beginning: nothing is known"
+    source: str = "the initial state"
     retained: Path | None = None
 
     def dump(self, system: System) -> str:
@@ -61,19 +61,22 @@ def read_state(path: Path, system: System) -> KnownState:
     except OSError as e:
         raise FileInvalid(f"cannot be read: {e.strerror or e}", path=str(path)) from e
     if not data:
-        raise FileInvalid("no state of a system", path=str(path), expected=f"JSON of at most {MAX_BYTES >> 20} MiB")
+        raise FileInvalid("not a state of a system", path=str(path), expected=f"JSON of at most {MAX_BYTES >> 20} MiB")
     try:
         form = msgspec.json.decode(data, type=_File)
     except msgspec.MsgspecError as e:
         raise FileInvalid(
-            "no state of a system", path=str(path), expected="as --save-state writes it", got=str(e)
+            "not a state of a system", path=str(path), expected="as --save-state writes it", got=str(e)
         ) from e
     if form.fieldtwin_state != VERSION:
         raise FileInvalid(
-            "a state of another version", path=str(path), expected=str(VERSION), got=str(form.fieldtwin_state)
+            "a state in a different format version",
+            path=str(path),
+            expected=str(VERSION),
+            got=str(form.fieldtwin_state),
         )
     if form.system != system.name:
-        raise FileInvalid("another system's state", path=str(path), expected=system.name, got=form.system)
+        raise FileInvalid("the state of a different system", path=str(path), expected=system.name, got=form.system)
     for name in form.values:
         device, _, tag = name.partition(".")
         if device not in system.devices or tag not in system.devices[device].profile.tags:
@@ -92,7 +95,7 @@ async def of_instance(run_dir: Path, system: System) -> KnownState:
     """
     gateway, plc = await _asked(run_dir / "gateway.sock"), await _asked(run_dir / "plc.sock")
     if (runs := gateway["config"]["system"]) != system.name:
-        raise UsageError(f"the instance {run_dir.name!r} is one of another system", expected=system.name, got=runs)
+        raise UsageError(f"the instance {run_dir.name!r} runs a different system", expected=system.name, got=runs)
     values = {
         name: tag["value"]
         for name, tag in gateway["tags"].items()

@@ -92,7 +92,7 @@ async def _like_held(expect: Expect, watched: Watched, value: object, reading_ag
     if any(_near(value, truth, expect.tolerance) for truth in truths if truth is not None):
         return None
     last = truths[-1] if truths else "nothing"
-    return f"{expect.tag} as the device holds it, ± {expect.tolerance:g}", f"{value!r}; the device holds {last!r}"
+    return f"{expect.tag} as the device's value, ± {expect.tolerance:g}", f"{value!r}; the device holds {last!r}"
 
 
 def held_since(held: Sequence[tuple[float, bytes]], since_s: float) -> list[bytes]:

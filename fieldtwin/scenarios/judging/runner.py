@@ -81,10 +81,10 @@ def _too_late(expected: str, got: str, bound_s: float, allowed: Allowance) -> _B
     """Return the failure of a missed deadline. If the host's lateness has already been waited for, the system has failed."""
     if allowed.exhausted:
         return _Broken(
-            Verdict.INCONCLUSIVE, expected, f"{got}; this host was late by itself for more than {allowed.any_s:.3f} s"
+            Verdict.INCONCLUSIVE, expected, f"{got}; this host itself was late for more than {allowed.any_s:.3f} s"
         )
     if allowed.applies:
-        waited = f"; also not in {allowed.any_s:.3f} s more, by which this host was late" if allowed.any_s else ""
+        waited = f"; also not in {allowed.any_s:.3f} s more, the lateness of this host" if allowed.any_s else ""
         return _Broken(Verdict.FAILED, expected, got + waited)
     return _Broken(Verdict.FAILED, expected, got, bound_s)
 
@@ -222,7 +222,7 @@ class Runner:
                 continue
             where = self.scenario.line("steps", steps[one.id]) if one.id in steps else ""
             text, now_ns = f"{one.name} strikes {one.on}", self._now_ns()
-            got = "never struck: nothing was tested with it; if it need not strike, say optional: true"
+            got = "never took effect, so it tested nothing; if this is acceptable, set optional: true"
             self.results.append(
                 CheckResult(
                     f"fault {one.id}", text, Verdict.INCONCLUSIVE, now_ns, 0, text, got, where=where, vacuous=True
@@ -236,7 +236,7 @@ class Runner:
                 effect[one.on] += one.struck
         for tag in (tag for tag, times in effect.items() if not times):
             text, now_ns = f"set: {tag} takes effect", self._now_ns()
-            got = "no effect: the device has not given the value away since it was set"
+            got = "no effect: the device has not sent the value since it was set"
             self.results.append(
                 CheckResult(f"set {tag}", text, Verdict.INCONCLUSIVE, now_ns, 0, text, got, vacuous=True)
             )
@@ -259,10 +259,10 @@ class Runner:
         except _Broken as broken:
             verdict, expected, got = self._judged_on_time(broken, since_s)
             if self._by_chance is not None:
-                verdict, got = Verdict.SKIPPED, f"not judged under random faults: {got}"
+                verdict, got = Verdict.SKIPPED, f"not checked under random faults: {got}"
         except _RuleBroken as broken_rule:
             rule = broken_rule
-            verdict, got = Verdict.INCONCLUSIVE, f"not finished: {rule.rule.number} was broken first"
+            verdict, got = Verdict.INCONCLUSIVE, f"not finished: {rule.rule.number} was violated first"
         except UsageError as e:
             verdict, got = Verdict.ERROR, str(e)
         result = CheckResult(
@@ -300,7 +300,7 @@ class Runner:
         """
         late_s = self.bench.host_late_s(since_s if broken.since_s is None else broken.since_s)
         if broken.verdict is Verdict.FAILED and broken.bound_s and late_s > LATE_SHARE * broken.bound_s:
-            got = f"{broken.got}; but this host was {late_s * 1000:.0f} ms late by itself"
+            got = f"{broken.got}; but this host itself was {late_s * 1000:.0f} ms late"
             return Verdict.INCONCLUSIVE, broken.expected, got
         return broken.verdict, broken.expected, broken.got
 
@@ -349,9 +349,9 @@ class Runner:
         if not within_s or took_s <= within_s:
             return
         allowed = allowance(self.bench, since_s, within_s, expressions)
-        late = f"met after {took_s:.3f} s; this host was late by itself for {allowed.own_s:.3f} s"
+        late = f"met after {took_s:.3f} s; this host itself was late for {allowed.own_s:.3f} s"
         if not allowed.in_time(took_s):
-            got = f"{late}, and {allowed.any_s:.3f} s of lateness were seen in all: host or system, nobody knows"
+            got = f"{late}, and {allowed.any_s:.3f} s of total lateness were measured: the host or the system may be the cause"
             raise _Broken(Verdict.INCONCLUSIVE, expected, got)
         if allowed.own_s:
             self._remark = f"{late}, which was subtracted"
@@ -370,14 +370,14 @@ class Runner:
             await self._until(self.bench.now_s() + max(within_s, during_s))
             if self._dropped != dropped:
                 raise _Broken(
-                    Verdict.INCONCLUSIVE, f"at most {KEPT} exchanges in that time", "more; some were forgotten"
+                    Verdict.INCONCLUSIVE, f"at most {KEPT} exchanges in that time", "more; the oldest were dropped"
                 )
             said = judge_wire(expect, watched)
             if said is not None:
                 raise _Broken(Verdict.FAILED, *said, max(within_s, during_s))
             # Too few exchanges prove nothing if the bus was never seen working.
             if not self._whole.requests[expect.wire]:
-                got = f"no exchange with {expect.wire} was seen since the start"
+                got = f"no exchange with {expect.wire} was recorded since the start"
                 raise _Broken(Verdict.INCONCLUSIVE, f"exchanges with {expect.wire}", got)
             return
         assert expect.tag is not None
@@ -481,12 +481,12 @@ class Runner:
             if rule.verdict is not Verdict.PASSED and verdict is not Verdict.FAILED:
                 verdict, reason = rule.verdict, f"{rule.number}: {rule.text}: {rule.got}"
         if self.scenario.invariants and not self._invariants:
-            got = "not judged: the controller is another program, so nothing is published that they look at"
+            got = "not checked: a third-party controller publishes none of the checked values"
             self.results.append(
                 CheckResult("invariants", "those of the system file", Verdict.SKIPPED, now_ns, 0, got=got)
             )
         if verdict is Verdict.PASSED and not self._judges():
-            return Verdict.INCONCLUSIVE, "it expects nothing: no expect, no wait, nothing that always or never holds"
+            return Verdict.INCONCLUSIVE, "it has no expectation: no expect, wait, always or never"
         return verdict, reason
 
     def _judges(self) -> bool:

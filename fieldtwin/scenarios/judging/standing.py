@@ -117,12 +117,12 @@ class AlwaysRule:
         names, verdict = tuple(self.expression.names), Verdict.PASSED
         vacuous = self.since_s is None
         if vacuous:
-            verdict, got = Verdict.INCONCLUSIVE, f"nothing was ever known of {', '.join(dict.fromkeys(names))}"
+            verdict, got = Verdict.INCONCLUSIVE, f"there was never a value of {', '.join(dict.fromkeys(names))}"
         else:
             got = f"{self.looks} looks from {self.since_s:.3f} s on"
         if self.unknown_s is not None:
             verdict = Verdict.INCONCLUSIVE
-            got += f"; unknown at {self.unknown_looks} looks, first at {self.unknown_s:.3f} s"
+            got += f"; no value in {self.unknown_looks} looks, first at {self.unknown_s:.3f} s"
         since_ns = round((self.since_s or 0.0) * NS_PER_S)
         return CheckResult(
             self.number,
@@ -170,7 +170,7 @@ class _NeverOnWire:
 
     def result(self, now_ns: int, requests: Counter[str]) -> CheckResult:
         seen = requests[self.form.wire]
-        got = f"{seen} exchanges seen" if seen else f"nothing was ever known of the wire of {self.form.wire}"
+        got = f"{seen} exchanges seen" if seen else f"no exchange was ever recorded on the bus of {self.form.wire}"
         verdict = Verdict.PASSED if seen else Verdict.INCONCLUSIVE
         return CheckResult(
             self.number,

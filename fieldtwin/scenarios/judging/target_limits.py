@@ -31,6 +31,6 @@ def refusal(scenario: Scenario, target: str, can: Collection[Can], allowed: Dang
         return f"the target {target} cannot {', '.join(lacking)}{said}{why}"
     for danger, what in dangers(scenario):
         if danger.rank > allowed.rank:
-            said = f"{what} is of the class {danger.value}, and the target {target} allows {allowed.value}"
+            said = f"{what} has the impact level {danger.value}, and the target {target} allows {allowed.value}"
             return f"{said} (--allow {danger.value})"
     return ""

@@ -185,9 +185,7 @@ class WithinRule:
         if then:
             self.due_s = None
             if not allowed.in_time(now_s - self._since_s):
-                got = (
-                    f"so {now_s - self._since_s:.3f} s after it; this host was late by itself for {allowed.own_s:.3f} s"
-                )
+                got = f"so {now_s - self._since_s:.3f} s after it; this host itself was late for {allowed.own_s:.3f} s"
                 return Violation(
                     self.number, self.text, got, self.names, self.limit_s, self._since_s, self.where, nobody_knows=True
                 )
@@ -202,7 +200,7 @@ class WithinRule:
 
     def summary(self) -> tuple[str, bool]:
         """Return what was seen, and whether the rule was judged."""
-        seen = f"{self.times} times" if self.times else "0 times: nothing was there to judge"
+        seen = f"{self.times} times" if self.times else "0 times: nothing to check"
         if self._unknown_s is not None:
             return f"{seen}; whether {self.after.text} was unknown from {self._unknown_s:.3f} s on for a while", False
         return seen, self.times > 0
@@ -258,9 +256,9 @@ class _Rate:
     def summary(self) -> tuple[str, bool]:
         """Return what was seen, and whether the rule was judged."""
         if not self.judged:
-            return "0 looks: nothing was there to judge", False
+            return "0 checks: nothing to check", False
         if not self.seen:
-            what = "was never published" if self.form.tag else "was never asked"
+            what = "was never published" if self.form.tag else "was never polled"
             return f"{self.judged} looks, but {self.names[0]} {what}", False
         return f"{self.judged} looks", True
 
@@ -347,4 +345,4 @@ class _Cycle:
     def summary(self) -> tuple[str, bool]:
         """Return what was seen, and whether the rule was judged."""
         unit = "looks" if self._late_s is not None else "changes"
-        return f"{self.judged} {unit}{'' if self.judged else ': nothing was there to judge'}", self.judged > 0
+        return f"{self.judged} {unit}{'' if self.judged else ': nothing to check'}", self.judged > 0

@@ -81,7 +81,7 @@ def _steps(system: System, program: str, made: Program, way: tuple[Given, ...]) 
                 told += _input(tag, value, bad)
             before[name] = value
         if not given.taken:
-            told.append(("#", "nobody takes the messages that the program sent"))
+            told.append(("#", "no receiver takes the messages that the program sent"))
         if told:
             yield "pause", f"{waited_ms:g}ms"
             waited_ms = 0.0

@@ -90,7 +90,7 @@ class Expression:
         self._words = words
         self._prefix = prefix
         if len(text) > LONGEST:
-            raise UsageError("too long an expression", expected=f"at most {LONGEST} characters")
+            raise UsageError("the expression is too long", expected=f"at most {LONGEST} characters")
         self._lead = len(text) - len(text.lstrip())
         self._plain = _TOKEN.sub(_plain, text[self._lead :]).rstrip()
         try:
@@ -140,7 +140,7 @@ class Expression:
 
     def _check(self, node: ast.expr, depth: int) -> None:
         if depth > DEEPEST:
-            raise UsageError("an expression nested too deep", got=self.text)
+            raise UsageError("the expression is nested too deeply", got=self.text)
         if isinstance(node, ast.BoolOp):
             parts: list[ast.expr] = node.values
         elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not | ast.USub):

@@ -127,7 +127,7 @@ def load_scenario(path: Path, profiles: tuple[Path, ...] = ()) -> Scenario:
     own = names_of(system, network)
     for probe in probes:
         if probe.name in system.devices or probe.name in system.plc.programs:
-            raise file.error(("probes", probe.name), f"{probe.name!r} is a device or program of the system already")
+            raise file.error(("probes", probe.name), f"{probe.name!r} is already a device or program of the system")
     known = tuple(dict.fromkeys([*own, *(name for probe in probes for name in probe.names)]))
     scenario = Scenario(
         path,
@@ -177,7 +177,9 @@ def _check_one_thing(file: YamlFile) -> None:
     for n, step in enumerate(steps if isinstance(steps, list) else ()):
         said = [word for word in step if word in WORDS] if isinstance(step, dict) else []
         if len(said) > 1:
-            raise file.error(("steps", n), "a step is one thing", expected=" or ".join(WORDS), got=", ".join(said))
+            raise file.error(
+                ("steps", n), "a step has exactly one key", expected=" or ".join(WORDS), got=", ".join(said)
+            )
 
 
 def _system(file: YamlFile, form: ScenarioForm, profiles: tuple[Path, ...]) -> tuple[System, Network | None]:
@@ -235,7 +237,9 @@ def _check_step(scenario: Scenario, step: Step, n: int) -> None:
     file, loc = scenario.file, ("steps", n)
     said = [word for word in WORDS if getattr(step, word) is not None]
     if len(said) != 1:
-        raise file.error(loc, "a step is one thing", expected=" or ".join(WORDS), got=", ".join(said) or "nothing")
+        raise file.error(
+            loc, "a step has exactly one key", expected=" or ".join(WORDS), got=", ".join(said) or "nothing"
+        )
     try:
         if step.fault is not None:
             spec = parse_fault(step.fault, file, (*loc, "fault"), n + 1)
@@ -277,28 +281,30 @@ def _check_of_network(file: YamlFile, form: ScenarioForm) -> None:
     for key in ("probes", "prototype"):
         if getattr(form, key):
             raise file.error(
-                (key,), f"{key!r} says nothing about a network", expected="a scenario of one of its systems"
+                (key,), f"{key!r} has no meaning for a network", expected="a scenario of one of its systems"
             )
 
 
 def _check_expect(scenario: Scenario, expect: Expect, loc: tuple[Key, ...]) -> None:
     said = [word for word in ("tag", "wire", "that") if getattr(expect, word) is not None]
     if len(said) != 1:
-        raise scenario.file.error(loc, "an expectation is about one thing", expected="tag, wire or that")
+        raise scenario.file.error(
+            loc, "an expectation has exactly one of tag, wire and that", expected="tag, wire or that"
+        )
     kind = "rate" if expect.requests_per_s is not None else "updates" if expect.updates_per_s is not None else said[0]
     for name in sorted(expect.model_fields_set):
         key = type(expect).model_fields[name].alias or name
         if key not in _TOGETHER[kind]:
             raise scenario.file.error(
-                (*loc, key), f"{key!r} says nothing about this", expected=", ".join(_TOGETHER[kind])
+                (*loc, key), f"{key!r} has no meaning for this expectation", expected=", ".join(_TOGETHER[kind])
             )
     if kind in ("rate", "updates") and expect.during is None:
-        raise scenario.file.error(loc, "a rate is one of some time", expected="during: 10s")
+        raise scenario.file.error(loc, "a rate needs a time", expected="during: 10s")
     _check_numbers(scenario.file, expect, loc)
     if expect.quality is not None:
         _known(scenario.file, (*loc, "quality"), "quality", expect.quality, QUALITIES)
     if expect.like is not None and (expect.tag or "").rpartition(".")[0] not in scenario.system.devices:
-        raise scenario.file.error((*loc, "like"), "only what a device holds can be like it", expected="tag: DEVICE.TAG")
+        raise scenario.file.error((*loc, "like"), "`like: device` needs a tag of a device", expected="tag: DEVICE.TAG")
     if expect.tag is not None:
         _known(scenario.file, (*loc, "tag"), "tag", expect.tag, scenario.known)
         words = scenario.words.get(expect.tag, ())
@@ -319,13 +325,13 @@ def _check_register(scenario: Scenario, device: str, register: str | None, value
         tags = list(scenario.system.devices[device].profile.tags)
         _known(scenario.file, (*loc, "register"), f"tag of {device}", register, tags)
     elif value is not None:
-        raise scenario.file.error((*loc, "value"), "a value of which register?", expected="register: TAG")
+        raise scenario.file.error((*loc, "value"), "the register of the value is missing", expected="register: TAG")
 
 
 def _check_numbers(file: YamlFile, expect: Expect, loc: tuple[Key, ...]) -> None:
     """Check the times, and that the bounds can be both met and missed."""
     if expect.during is not None and _time(file, (*loc, "during"), expect.during) <= 0:
-        raise file.error((*loc, "during"), "what is looked at for no time is not seen", expected="during: 10s")
+        raise file.error((*loc, "during"), "an observation needs a time above 0", expected="during: 10s")
     if expect.within is not None:
         _time(file, (*loc, "within"), expect.within)
     _check_bounds(file, (*loc, "requests_per_s"), expect.requests_per_s)
@@ -333,7 +339,7 @@ def _check_numbers(file: YamlFile, expect: Expect, loc: tuple[Key, ...]) -> None
     rate = list(expect.updates_per_s or (0, 0))
     if len(rate) != 2 or rate[0] > rate[1]:
         raise file.error(
-            (*loc, "updates_per_s"), "a rate is from one number to another", expected="[9, 11]", got=str(rate)
+            (*loc, "updates_per_s"), "a rate needs bounds: [LOWEST, HIGHEST]", expected="[9, 11]", got=str(rate)
         )
 
 
@@ -341,7 +347,9 @@ def _looks(scenario: Scenario, text: str, loc: tuple[Key, ...]) -> Expression:
     """Return an expression that names something of the system, so that it can be true or false."""
     expression = scenario.expression(text, *loc)
     if expression.is_constant:
-        raise scenario.file.error(loc, "this looks at nothing", expected="a tag or a variable in it", got=text)
+        raise scenario.file.error(
+            loc, "the expression refers to no value", expected="a tag or a variable in it", got=text
+        )
     return expression
 
 
@@ -349,16 +357,16 @@ def _check_bounds(file: YamlFile, loc: tuple[Key, ...], bounds: Bounds | None) -
     if bounds is None:
         return
     if bounds.min is None and bounds.max is None:
-        raise file.error(loc, "these bounds hold whatever comes", expected="min or max")
+        raise file.error(loc, "these bounds are always met", expected="min or max")
     if bounds.max is None and bounds.min is not None and bounds.min <= 0:
         got = f"min {bounds.min:g}"
-        raise file.error(loc, "these bounds hold whatever comes", expected="min above 0, or max", got=got)
+        raise file.error(loc, "these bounds are always met", expected="min above 0, or max", got=got)
     if bounds.max is not None and bounds.max < 0:
         raise file.error(
             loc, "a count or a rate is never negative", expected="max of 0 or more", got=f"max {bounds.max:g}"
         )
     if bounds.min is not None and bounds.max is not None and bounds.min > bounds.max:
-        raise file.error(loc, "nothing is within these bounds", got=f"min {bounds.min:g}, max {bounds.max:g}")
+        raise file.error(loc, "these bounds can never be met", got=f"min {bounds.min:g}, max {bounds.max:g}")
 
 
 def _check_whole_run(scenario: Scenario) -> None:
@@ -373,7 +381,7 @@ def _check_whole_run(scenario: Scenario) -> None:
         ours = (rate.tag is not None, rate.updates_per_s is not None, rate.wire is None, rate.requests_per_s is None)
         if len(set(ours)) != 1:
             expected = "tag and updates_per_s, or wire and requests_per_s"
-            raise file.error(loc, "a rate is one of a tag or of a wire", expected=expected)
+            raise file.error(loc, "a rate needs a tag or a wire", expected=expected)
         if rate.tag is not None:
             _known(file, (*loc, "tag"), "tag", rate.tag, scenario.known)
             scenario.used.add(rate.tag)
@@ -382,14 +390,14 @@ def _check_whole_run(scenario: Scenario) -> None:
         _check_bounds(file, (*loc, "updates_per_s"), rate.updates_per_s)
         _check_bounds(file, (*loc, "requests_per_s"), rate.requests_per_s)
         if _time(file, (*loc, "over"), rate.over) <= 0:
-            raise file.error((*loc, "over"), "a rate is one of some time", expected="over: 10s")
+            raise file.error((*loc, "over"), "a rate needs a time", expected="over: 10s")
         if rate.while_ is not None:
             scenario.expression(rate.while_, *loc, "while")
     for n, cycle in enumerate(form.cycle):
         loc = ("cycle", n)
         bounds = (cycle.min is not None or cycle.max is not None) and cycle.changes_of is not None
         if bounds == (cycle.late is not None):
-            raise file.error(loc, "a cycle has bounds", expected="changes_of: NAME with min or max; or late: 5ms")
+            raise file.error(loc, "a cycle needs bounds", expected="changes_of: NAME with min or max; or late: 5ms")
         if cycle.changes_of is not None:
             _known(file, (*loc, "changes_of"), "tag or variable", cycle.changes_of, scenario.known)
             scenario.used.add(cycle.changes_of)
@@ -403,7 +411,7 @@ def _check_whole_run(scenario: Scenario) -> None:
                 (*loc, "min"), "this bound holds whatever comes", expected="min above 0, or max", got="min 0"
             )
         if times.get("min", 0) > times.get("max", times.get("min", 0)):
-            raise file.error(loc, "nothing is within these bounds", got=f"min {cycle.min}, max {cycle.max}")
+            raise file.error(loc, "these bounds can never be met", got=f"min {cycle.min}, max {cycle.max}")
         if cycle.while_ is not None:
             scenario.expression(cycle.while_, *loc, "while")
 

@@ -75,7 +75,9 @@ def load_invariants(system: System, names: Mapping[str, tuple[str, ...]], prefix
         except UsageError as e:
             raise system.file.error(loc, e.message, expected=e.expected, got=e.got, hint=e.hint) from e
         if read.is_constant:
-            raise system.file.error(loc, "this looks at nothing", expected="a tag or a variable in it", got=text)
+            raise system.file.error(
+                loc, "the expression refers to no value", expected="a tag or a variable in it", got=text
+            )
         return read
 
     def where(*loc: Key) -> str:

@@ -66,7 +66,7 @@ class Probe:
         missing = [name for name in _VARIABLE.findall(self.written) if name not in environ]
         if missing:
             raise UsageError(
-                f"{where} names variables of the environment that are not set: {', '.join(missing)}",
+                f"{where} uses environment variables that are not set: {', '.join(missing)}",
                 hint="`fieldtwin test --with -- CMD` and `fieldtwin with` set those of the system's buses",
             )
         text = _VARIABLE.sub(lambda found: environ[found[1]], self.written)
@@ -83,7 +83,7 @@ def read_probe(file: YamlFile, name: str, form: ProbeForm, served: list[str]) ->
     if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
         raise file.error(loc, "a probe's name", expected="small letters, digits and _", got=name)
     if (form.endpoint is None) == (form.serve is None):
-        raise file.error(loc, "a probe asks at one place", expected="endpoint: tcp://HOST:PORT, or serve: NAME")
+        raise file.error(loc, "a probe has one endpoint", expected="endpoint: tcp://HOST:PORT, or serve: NAME")
     if form.serve is not None and form.serve not in served:
         raise file.error(
             (*loc, "serve"), f"the system serves no {form.serve!r}", expected=", ".join(served) or "nothing"
@@ -108,7 +108,7 @@ def read_probe(file: YamlFile, name: str, form: ProbeForm, served: list[str]) ->
 def _modbus(endpoint: Endpoint, where: str) -> Endpoint:
     if endpoint.is_can or endpoint.scheme in ("pty", "udp"):
         raise UsageError(
-            "a probe asks over Modbus", where=where, expected="tcp://, rtu+tcp://, rtu: or ascii:", got=str(endpoint)
+            "a probe uses Modbus", where=where, expected="tcp://, rtu+tcp://, rtu: or ascii:", got=str(endpoint)
         )
     return endpoint
 

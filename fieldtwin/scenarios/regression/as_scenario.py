@@ -63,11 +63,15 @@ def as_scenario(system: System, story: Story, wanted: Wanted) -> str:
     stimuli = sorted(_stimuli(system, story, wanted), key=lambda s: s.t_ns)
     steps = list(_steps(system, story, wanted, stimuli))
     if not any("expect:" in step for step in steps):
-        raise UsageError("nothing in this run can be expected again", expected="a trace with values or states")
+        raise UsageError("this run has nothing to expect", expected="a trace with values or states")
     if len(steps) > MOST_STEPS:
-        raise UsageError("too long for a scenario", expected=f"at most {MOST_STEPS:,} steps", got=f"{len(steps):,}")
+        raise UsageError(
+            "the run is too long for a scenario",
+            expected=f"at most {MOST_STEPS:,} steps",
+            got=f"{len(steps):,}",
+        )
     lines = [
-        f"# Made from {wanted.source or 'a run'}: what came in, and what followed. Edit it: it is a scenario like others.",
+        f"# Made from {wanted.source or 'a run'}: its inputs, and their effects. It can be edited like any scenario.",
         f"scenario: {json.dumps(wanted.name, ensure_ascii=False)}",
         f"system: {json.dumps(wanted.system)}",
     ]

@@ -53,7 +53,9 @@ class Host:
                 lambda: asyncio.streams.FlowControlMixin(loop=loop), os.fdopen(os.dup(1), "wb")
             )
         except ValueError as e:
-            raise UsageError("nobody to talk to", expected="pipes, as a test run gives them", got="a file") from e
+            raise UsageError(
+                "there is no client on stdin and stdout", expected="pipes, as from a test run", got="a file"
+            ) from e
         writer = asyncio.StreamWriter(transport, protocol, None, loop)
         server = ControlServer(self.verbs())
         try:
@@ -146,14 +148,14 @@ class Host:
 
     def _next(self) -> int:
         if len(self._benches) + len(self._programs) >= MOST:
-            raise UsageError(f"{MOST} at once", hint="end those that are no longer used")
+            raise UsageError(f"{MOST} at once", hint="end those that are no longer needed")
         self._number += 1
         return self._number
 
     def _bench(self, args: dict[str, Any]) -> Bench:
         bench = self._benches.get(args.get("id", 0))
         if bench is None:
-            raise UsageError(f"no field side {args.get('id')!r}", expected="the id that `device` or `system` gave")
+            raise UsageError(f"no field simulator {args.get('id')!r}", expected="the id that `device` or `system` gave")
         bench.alive()
         return bench
 
@@ -197,7 +199,7 @@ class Host:
     def _plc(self, args: dict[str, Any]) -> RunningPlc:
         plc = self._bench(args).plc
         if plc is None:
-            raise UsageError("no PLC runs there", hint="`control` starts one")
+            raise UsageError("no PLC is running", hint="`control` starts one")
         return plc
 
     async def _image(self, args: dict[str, Any]) -> dict[str, Any]:

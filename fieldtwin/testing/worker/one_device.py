@@ -118,7 +118,7 @@ def _stand_in(wanted: Wanted, profile: DeviceProfile, path: Path, beside: Path |
         return {**playing, **common}
     if model:
         return {"model": "profile", "values": wanted.values, **common}
-    raise UsageError(f"nothing to play for {profile.name}", expected='recording="FILE.jsonl"')
+    raise UsageError(f"no data source for {profile.name}", expected='recording="FILE.jsonl"')
 
 
 def _shipped(stem: str) -> str:

@@ -112,7 +112,7 @@ class RunningPlc:
     async def steer(self, verb: str, args: dict[str, Any]) -> dict[str, Any]:
         """Execute one of the commands in `STEERING`."""
         if verb not in STEERING:
-            raise UsageError(f"no way to steer a PLC: {verb!r}", expected=", ".join(STEERING))
+            raise UsageError(f"not a command for a PLC: {verb!r}", expected=", ".join(STEERING))
         if verb == "step":
             return {"scans": await step_and_wait(self._call, int(args["count"]), BY)}
         return await self._call(verb, **args, by=BY)
@@ -120,7 +120,7 @@ class RunningPlc:
     def send(self, period_s: int) -> None:
         """Command a period at the remote end."""
         if self._shore is None:
-            raise UsageError("nobody can command this system", expected="a transmitter with a far end")
+            raise UsageError("this system cannot be commanded", expected="a transmitter with a topside end")
         self._shore.send(period_s)
 
     async def _call(self, verb: str, **args: Any) -> dict[str, Any]:

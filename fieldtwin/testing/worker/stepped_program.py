@@ -66,7 +66,7 @@ class SteppedProgram:
     def scan(self, scans: int) -> None:
         """Run `scans` scans. Raises `ProgramFailed` with file and line where the program fails."""
         if not 0 < scans <= MAX_SCANS:
-            raise UsageError("scans at once", expected=f"1 to {MAX_SCANS:,}", got=str(scans))
+            raise UsageError("number of scans", expected=f"1 to {MAX_SCANS:,}", got=str(scans))
         for _ in range(scans):
             self._once()
 

@@ -293,7 +293,7 @@ def resolve_address(text: int | str, numbering: str, count: int = 1) -> Register
             f"address {text!r} starts with {str(text)[0]}: 0 coil, 1 discrete, 3 input, 4 holding register"
         )
     if address < 0 or address + count > 65536:
-        raise ValueError(f"address {text!r} with {count} registers leaves the table (0 to 65535 as sent)")
+        raise ValueError(f"address {text!r} with {count} registers exceeds the table (0 to 65535 as sent)")
     return RegisterRange(found, address, count)
 
 
@@ -331,7 +331,7 @@ def resolve(file: YamlFile) -> DeviceProfile:
     for name, tag_form in form.tags.items():
         for tag in _tags_of(file, form, name, tag_form):
             if tag.name in tags:
-                raise file.error(("tags", name), f"the tag {tag.name!r} stands twice")
+                raise file.error(("tags", name), f"the tag {tag.name!r} is defined twice")
             tags[tag.name] = tag
     profile = DeviceProfile(
         path=file.path,
@@ -468,7 +468,7 @@ def _check_reads(file: YamlFile, p: DeviceProfile) -> None:
             )
         for i, gap in enumerate(p.gaps):
             if tag.at is not None and tag.at.overlaps(gap):
-                raise file.error(("gaps", i), f"the gap {p.form.gaps[i]!r} is where the tag {tag.name!r} stands")
+                raise file.error(("gaps", i), f"the gap {p.form.gaps[i]!r} overlaps the tag {tag.name!r}")
     for message in p.messages.values():
         if message.at.count > most:
             raise file.error(
@@ -558,4 +558,4 @@ def _check_references(file: YamlFile, p: DeviceProfile) -> None:
         _check_sets(file, p, ("functions", name), function.sets)
     _check_stated(file, p)
     if p.protocol == "canopen" and p.form.eds is None:
-        raise FileInvalid("a CANopen profile names its EDS", path=p.path, line=1, expected="`eds: FILE.eds`")
+        raise FileInvalid("a CANopen profile needs an EDS", path=p.path, line=1, expected="`eds: FILE.eds`")

@@ -56,15 +56,17 @@ class Limits(Strict):
     functions: list[int] | None = None
     read_registers: int = Field(default=125, ge=1, le=125)
     even_only: bool = False
-    max_gap: int = Field(default=8, ge=0, le=125, description="registers read over to merge two reads into one")
+    max_gap: int = Field(
+        default=8, ge=0, le=125, description="unused registers to read, at most, so that two reads become one"
+    )
 
 
 class TimingForm(Strict):
     """The timing that the device needs from its clients, in milliseconds. A system file may override it."""
 
-    timeout_ms: int | None = Field(default=None, ge=1, le=3_600_000, description="how long a reply may take")
+    timeout_ms: int | None = Field(default=None, ge=1, le=3_600_000, description="maximum time until a reply, ms")
     spacing_ms: int = Field(default=0, ge=0, le=60_000, description="pause between a reply and the next request")
-    connect_pause_ms: int = Field(default=0, ge=0, le=60_000, description="pause behind connecting")
+    connect_pause_ms: int = Field(default=0, ge=0, le=60_000, description="pause after connecting, ms")
 
 
 class Defaults(Strict):
@@ -82,7 +84,7 @@ class TagForm(Strict):
     object: str | None = Field(default=None, pattern=r"^[0-9A-Fa-f]{4}:[0-9A-Fa-f]{2}$")
     type: ValueType | None = None
     order: Order | None = None
-    registers: int | None = Field(default=None, ge=1, le=125, description="length of a string or of bytes")
+    registers: int | None = Field(default=None, ge=1, le=125, description="number of registers of a string or of bytes")
     poll: str | None = None
     access: Access = "ro"
     unit: str = ""
@@ -90,7 +92,9 @@ class TagForm(Strict):
     offset: float = 0.0
     scale_by: str | None = Field(default=None, description="tag that holds the power of ten to multiply by (SunSpec)")
     bits: tuple[int, int] | None = Field(default=None, description="lowest and highest bit of one register, 0 to 15")
-    sentinels: list[int] = Field(default=[], description="raw values that mean: not there (SunSpec 0x8000, 0xFFFF)")
+    sentinels: list[int] = Field(
+        default=[], description="raw values that mean that the value is not implemented (SunSpec 0x8000, 0xFFFF)"
+    )
     values: dict[int, str] | None = None
     range: tuple[float, float] | None = None
     counter: bool = False
@@ -138,10 +142,10 @@ class IdentifyForm(Strict):
     """A read whose reply distinguishes this device from others; `tag` names the value to compare with `expect`."""
 
     tag: str
-    expect: str | int | None = Field(
-        default=None, description="what it reads on such a device; spaces around do not count"
+    expect: str | int | None = Field(default=None, description="the expected value; surrounding spaces are ignored")
+    between: tuple[float, float] | None = Field(
+        default=None, description="plausible range, for a device without an identity to read"
     )
-    between: tuple[float, float] | None = Field(default=None, description="plausibility only: no identity to read")
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=False)
 
@@ -159,9 +163,13 @@ class FunctionForm(Strict):
     """A device-specific function (AP 5). Request and reply are data bytes in hex, without the function code."""
 
     code: int = Field(ge=1, le=127)
-    request: str = Field(default="", pattern=r"^([0-9A-Fa-f]{2} ?)*$", description="what it takes; else exception 03")
-    reply: str | None = Field(default=None, pattern=r"^([0-9A-Fa-f]{2} ?)*$", description="default: as the request")
-    sets: dict[Name, int | float] = Field(default={}, description="tag -> what it holds afterwards")
+    request: str = Field(
+        default="",
+        pattern=r"^([0-9A-Fa-f]{2} ?)*$",
+        description="the accepted request data; other data gets exception 03",
+    )
+    reply: str | None = Field(default=None, pattern=r"^([0-9A-Fa-f]{2} ?)*$", description="default: the request data")
+    sets: dict[Name, int | float] = Field(default={}, description="tag -> its value afterwards")
     danger: str = ""
 
 
@@ -170,8 +178,8 @@ class EffectForm(Strict):
 
     read: Name | None = None
     written: Name | None = None
-    value: int | float | None = Field(default=None, description="only when this is written; default: whatever is")
-    sets: dict[Name, int | float] = Field(min_length=1, description="tag -> what it holds afterwards")
+    value: int | float | None = Field(default=None, description="only when this value is written; default: any value")
+    sets: dict[Name, int | float] = Field(min_length=1, description="tag -> its value afterwards")
 
     @model_validator(mode="after")
     def _one_of_both(self) -> EffectForm:
@@ -190,7 +198,7 @@ class ProfileForm(Strict):
     numbering: Literal["printed", "sent"] = "printed"
     limits: Limits = Limits()
     timing: TimingForm = TimingForm()
-    gaps: list[str] = Field(default=[], description='registers that no read may go over, such as "holding:10..19"')
+    gaps: list[str] = Field(default=[], description='registers that a read must not include, such as "holding:10..19"')
     undeclared: Literal["exception", "zero", "hold"] = Field(
         default="exception",
         description="what registers are that no tag names, in the tables that have tags: refused (02), 0, or 0 until written",
@@ -203,24 +211,26 @@ class ProfileForm(Strict):
     mailbox: MailboxForm | None = None
     messages: dict[Name, MessageForm] = Field(default={}, max_length=1)
     tags: dict[Name, TagForm] = {}
-    functions: dict[Name, FunctionForm] = Field(default={}, description="functions that no standard knows")
-    effects: list[EffectForm] = Field(default=[], description="what reading or writing a tag does to others")
+    functions: dict[Name, FunctionForm] = Field(default={}, description="function codes that are not in the standard")
+    effects: list[EffectForm] = Field(default=[], description="the effects of reading or writing a tag on other tags")
     server_id: str | None = Field(
-        default=None, pattern=r"^([0-9A-Fa-f]{2} ?){1,249}$", description="what function 11h tells, in hex"
+        default=None,
+        pattern=r"^([0-9A-Fa-f]{2} ?){1,249}$",
+        description="server id in the reply to function 11h, in hex",
     )
     server_data: str = Field(
         default="",
         pattern=r"^([0-9A-Fa-f]{2} ?){0,249}$",
-        description="what function 11h tells after the run indicator, in hex",
+        description="data after the run indicator in the reply to function 11h, in hex",
     )
     identification: dict[ByteNumber, Annotated[str, Field(max_length=244)]] = Field(
         default={}, description="objects of function 2Bh/0Eh: 0 vendor, 1 product code, 2 revision, 3 to 6, 128 to 255"
     )
     files: dict[FileNumber, Annotated[int, Field(ge=1, le=10_000)]] = Field(
-        default={}, description="file of functions 14h and 15h -> how many records"
+        default={}, description="file of functions 14h and 15h -> its number of records"
     )
     fifos: dict[Word, Annotated[list[Word], Field(max_length=1000)]] = Field(
-        default={}, description="queue of function 18h: its pointer address -> what is in it"
+        default={}, description="FIFO queue of function 18h: its pointer address -> its values"
     )
     commands: dict[Name, str] = Field(default={}, description="command name -> the tag it writes")
     behaviours: dict[Name, dict[str, int | float]] = Field(default={}, description="behaviour -> command -> value")

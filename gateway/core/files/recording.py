@@ -244,7 +244,7 @@ class RecordingReader:
                 expected='{"fieldtwin_recording": 1, "device": ..., "kind": ..., "source": ...}',
             ) from error
         if header.kind == "signals" and not header.signals:
-            raise FileInvalid("a recording of signals names none", path=str(self.path), line=1)
+            raise FileInvalid("a recording of signals has no signals", path=str(self.path), line=1)
         return header
 
     def _next_line(self) -> bytes:
@@ -252,7 +252,9 @@ class RecordingReader:
         try:
             line = self._file.readline(MAX_LINE_BYTES + 1)
         except OSError as error:
-            raise FileInvalid(f"cannot read on: {error.strerror}", path=str(self.path), line=self.lines + 1) from error
+            raise FileInvalid(
+                f"cannot continue reading: {error.strerror}", path=str(self.path), line=self.lines + 1
+            ) from error
         if len(line) > MAX_LINE_BYTES:
             raise FileInvalid(
                 "the line is too long", path=str(self.path), line=self.lines + 1, expected=f"{MAX_LINE_BYTES} bytes"
@@ -325,7 +327,7 @@ class RecordingWriter:
         try:
             os.fsync(self._fd)
         except OSError as error:
-            raise FileInvalid(f"cannot write on: {error.strerror}", path=str(self.path)) from error
+            raise FileInvalid(f"cannot continue writing: {error.strerror}", path=str(self.path)) from error
 
     def close(self) -> None:
         """Close the file; closing twice does nothing."""
@@ -344,7 +346,7 @@ class RecordingWriter:
                 done += os.write(self._fd, line[done:])
         except OSError as error:
             os.ftruncate(self._fd, self._size)
-            raise FileInvalid(f"cannot write on: {error.strerror}", path=str(self.path)) from error
+            raise FileInvalid(f"cannot continue writing: {error.strerror}", path=str(self.path)) from error
         self._size += len(line)
 
 

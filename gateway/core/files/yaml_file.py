@@ -127,7 +127,7 @@ def parse(text: str, path: str) -> YamlFile:
         node = loader.get_single_node()
         positions: dict[tuple[Key, ...], Position] = {}
         if not isinstance(node, yaml.MappingNode):
-            raise FileInvalid("the file holds no keys", path=path, line=1, expected="a mapping such as `key: value`")
+            raise FileInvalid("the file contains no keys", path=path, line=1, expected="a mapping such as `key: value`")
         _note_positions(loader, node, (), positions, path)
         data = loader.construct_document(node)
     except yaml.MarkedYAMLError as e:
@@ -152,7 +152,7 @@ def _note_positions(
     """Walk the node tree, note the position of each value, and refuse duplicate keys."""
     out.setdefault(loc, (node.start_mark.line + 1, node.start_mark.column + 1))
     if len(out) > MAX_VALUES:  # a few aliases of aliases can expand to millions of values
-        raise FileInvalid("the file holds too many values", path=path, line=1, expected=f"at most {MAX_VALUES}")
+        raise FileInvalid("the file contains too many values", path=path, line=1, expected=f"at most {MAX_VALUES}")
     if isinstance(node, yaml.SequenceNode):
         for i, child in enumerate(node.value):
             _note_positions(loader, child, (*loc, i), out, path)
@@ -165,7 +165,7 @@ def _note_positions(
             key = loader.construct_object(key_node)
             if key in seen:
                 raise FileInvalid(
-                    f"the key {key!r} stands twice",
+                    f"the key {key!r} is defined twice",
                     path=path,
                     line=line,
                     column=column,

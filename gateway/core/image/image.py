@@ -113,7 +113,7 @@ class ImageLayout:
             raise FileInvalid("not a process image", expected=f"format {FORMAT}", got=f"{magic!r}, format {version}")
         if digest != self.digest:
             raise FileInvalid(
-                "the process image has another layout",
+                "the process image has a different layout",
                 expected=self.digest.hex()[:16],
                 got=digest.hex()[:16],
                 hint="gateway and PLC were started from different system files",

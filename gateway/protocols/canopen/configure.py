@@ -104,9 +104,9 @@ async def verify_number(
     held = await read_number(master, node, index, subindex, data_type)
     if held != value:
         where = f"node {node} {index:04X}h:{subindex:02X}"
-        raise VerifyFailed("the node took the value and holds another", expected=f"{value:X}h", got=f"{held:X}h").at(
-            where
-        )
+        raise VerifyFailed(
+            "the node accepted the value, but holds a different one", expected=f"{value:X}h", got=f"{held:X}h"
+        ).at(where)
 
 
 async def set_heartbeat_producer(master: CanopenMaster, node: int, ms: int) -> None:

@@ -243,7 +243,7 @@ class _Values:
         try:
             return read_value(kind, text, self._node_id)
         except (ValueError, OverflowError):
-            self.mended.append(f"[{section.name}] {key}: no value of data type {kind:04X}h: {text[:40]}")
+            self.mended.append(f"[{section.name}] {key}: not a value of data type {kind:04X}h: {text[:40]}")
             return None
 
     def _limit(self, section: Section, key: str, kind: int) -> int | float | None:
@@ -251,5 +251,5 @@ class _Values:
         try:
             return read_limit(kind, text)
         except (ValueError, OverflowError):
-            self.mended.append(f"[{section.name}] {key}: no number of its type, left out: {text[:40]}")
+            self.mended.append(f"[{section.name}] {key}: not a number of its type, left out: {text[:40]}")
             return None

@@ -224,7 +224,7 @@ def _mend_count(section: Section, key: str, kept: Section, path: str, mended: li
     try:
         number = int(_number(section, key, "0", path, mended), 0)
     except FileInvalid:
-        mended.append(f"[{section.name}] {key}: no number, left out")
+        mended.append(f"[{section.name}] {key}: not a number, left out")
         return
     if number > _AT_MOST.get(key, number):
         mended.append(f"[{section.name}] {key}: not 1 to {_AT_MOST[key]}, left out")
@@ -317,7 +317,7 @@ def _spell_out(values: Section, parent: Section, kept: dict[str, Section], path:
     """
     array = kept[parent.name]
     if "CompactSubObj" not in array.values:
-        mended.append(f"[{values.name}]: left out, [{parent.name}] is no compact array")
+        mended.append(f"[{values.name}]: left out, [{parent.name}] is not a compact array")
         return
     count = min(int(array.values["CompactSubObj"], 0), 254)
     for key in values.values:
@@ -337,7 +337,7 @@ def _mend_names(names: Section, parent: Section, kept: dict[str, Section], path:
     """Complete [xxxxName], which lists the names of a compact array's entries only where they differ from the default."""
     array = kept[parent.name]
     if "CompactSubObj" not in array.values:
-        mended.append(f"[{names.name}]: left out, [{parent.name}] is no compact array")
+        mended.append(f"[{names.name}]: left out, [{parent.name}] is not a compact array")
         return
     count = int(array.values["CompactSubObj"], 0)
     filled = Section(names.name, names.line, {"NrOfEntries": str(count)})

@@ -136,7 +136,7 @@ class LssMaster:
                 return None
             found = LssAddress(*[await self._scan_part(part) for part in range(4)])
         if verify and (told := await self.inquire_address()) != found:
-            raise Desync("the slave that fastscan found is another", expected=str(found), got=str(told))
+            raise Desync("fastscan found a different slave", expected=str(found), got=str(told))
         return found
 
     async def _scan_part(self, part: int) -> int:
@@ -145,7 +145,7 @@ class LssMaster:
             if not await self._anybody(lss.fastscan(number, bit, part, part), lss.SLAVE_FOUND):
                 number |= 1 << bit
         if not await self._anybody(lss.fastscan(number, 0, part, (part + 1) % 4), lss.SLAVE_FOUND):
-            raise Desync(f"nobody stands to part {part} of the address that fastscan found", got=f"{number:08X}h")
+            raise Desync(f"no slave confirms part {part} of the address that fastscan found", got=f"{number:08X}h")
         return number
 
     async def assign(self, address: LssAddress, node: int, *, store: bool = True) -> int:

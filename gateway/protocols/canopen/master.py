@@ -201,7 +201,7 @@ class CanopenMaster:
     def listen(self, can_id: int, callback: PdoCallback) -> None:
         """Call `callback` for each data frame of a service that belongs to no node: 7E4h (LSS). One callback per identifier."""
         if can_id in self._services:
-            raise UsageError("somebody listens to this identifier already", got=f"{can_id:X}h")
+            raise UsageError("this identifier already has a listener", got=f"{can_id:X}h")
         self._services[can_id] = callback
 
     def subscribe_pdo(self, cob_id_: int, callback: PdoCallback) -> None:

@@ -257,7 +257,7 @@ class SdoTransfer(ABC):
         self.strays += 1
         if self.over or self.strays <= MAX_STRAYS:
             return Stray(why)
-        return self._break(abort_codes.UNKNOWN_SPECIFIER, f"{self.strays} frames that are no reply", b"")
+        return self._break(abort_codes.UNKNOWN_SPECIFIER, f"{self.strays} frames that are not a reply", b"")
 
     def _aborted(self, data: bytes) -> Failed:
         self.answered = self.over = True
@@ -322,7 +322,7 @@ class SdoUpload(SdoTransfer):
 
     def _on_segment_reply(self, data: bytes) -> Step:
         if not self._toggled(data):
-            return self._break(abort_codes.TOGGLE_NOT_ALTERNATED, "a segment twice or out of turn", data)
+            return self._break(abort_codes.TOGGLE_NOT_ALTERNATED, "a repeated or out-of-order segment", data)
         last = data[0] & 0x01
         segment = data[1 : 8 - ((data[0] >> 1) & 7)]
         if not segment and not last:  # the transfer would never end
@@ -375,7 +375,7 @@ class SdoDownload(SdoTransfer):
 
     def _on_segment_reply(self, data: bytes) -> Step:
         if not self._toggled(data):
-            return self._break(abort_codes.TOGGLE_NOT_ALTERNATED, "a segment acknowledged twice or out of turn", data)
+            return self._break(abort_codes.TOGGLE_NOT_ALTERNATED, "a repeated or out-of-order acknowledgement", data)
         return Done(b"") if self._last_sent else self._next_segment()
 
     def _next_segment(self) -> Step:

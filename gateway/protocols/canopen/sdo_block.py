@@ -106,7 +106,7 @@ class SdoBlockUpload(SdoUpload):
         if number != self._good + 1:  # one was lost, or an old one is repeated: only the expected segment is taken
             self._surplus += 1
             if self._surplus > 2 * BLOCK_MAX:
-                return self._break(abort_codes.INVALID_SEQUENCE, "segments, and never the one that is due", data)
+                return self._break(abort_codes.INVALID_SEQUENCE, "segments, but never the expected one", data)
             return self._again(data) if last or number == self._block else Wait()
         self._good, self._surplus, self._repeats, self._nudged = number, 0, 0, False
         self._received += data[1:]
@@ -119,7 +119,7 @@ class SdoBlockUpload(SdoUpload):
         """Acknowledge at the end of a sub-block of which a part is missing."""
         self._repeats += not self._good
         if self._repeats > MAX_REPEATS:
-            return self._break(abort_codes.INVALID_SEQUENCE, "blocks that bring nothing", data)
+            return self._break(abort_codes.INVALID_SEQUENCE, "blocks without new segments", data)
         return self._acknowledge()
 
     def _acknowledge(self) -> Send:
@@ -207,7 +207,7 @@ class SdoBlockDownload(SdoDownload):
             )
         self._repeats = 0 if acknowledged else self._repeats + 1
         if self._repeats > MAX_REPEATS:
-            return self._break(abort_codes.INVALID_SEQUENCE, "blocks of which nothing arrives", data)
+            return self._break(abort_codes.INVALID_SEQUENCE, "blocks of which no segment arrives", data)
         self._done += acknowledged
         return self._end() if self._done == self._segments else self._next_block(data[2], data)
 

@@ -225,7 +225,7 @@ class SdoChannel:
                 async with asyncio.timeout(transfer.timeout_ns / NS_PER_S):
                     await self._send(self._owed)
             except TimeoutError as e:
-                raise ReplyTimeout(f"{transfer.name}: nothing can be sent", hint="the bus takes no frames") from e
+                raise ReplyTimeout(f"{transfer.name}: nothing can be sent", hint="the bus accepts no frames") from e
             self._owed = None
 
     async def _drive(self, transfer: SdoTransfer) -> bytes:
@@ -276,7 +276,9 @@ class SdoChannel:
             self._counters.sdo_timeouts += 1
             self._owe(transfer)
             transfer.over = True
-            raise ReplyTimeout(f"{transfer.name}: the request could not be sent", hint="the bus takes no frames") from e
+            raise ReplyTimeout(
+                f"{transfer.name}: the request could not be sent", hint="the bus accepts no frames"
+            ) from e
 
     async def _confirm(self, last: CanFrame | None, transfer: SdoTransfer) -> None:
         """Send the final confirmation. The node has sent everything, so the value is valid even if this fails."""

@@ -104,7 +104,7 @@ class AsciiFramer(Framer):
     def overdue(self, waited_s: float) -> WireError:
         if self._damaged:
             return CrcError(
-                f"{self._damaged} damaged frames arrived and no whole one",
+                f"{self._damaged} damaged frames arrived, but no valid one",
                 expected=self._expectation(),
                 hint="check baud rate, parity and wiring",
             )
@@ -139,7 +139,9 @@ class AsciiFramer(Framer):
             self.noise_bytes += len(text)
             if text.upper().startswith((ours, f":{self._unit:02X}{request.function | 0x80:02X}".encode())):
                 self._end()
-                raise CrcError("a reply is damaged", expected="hexadecimal digits and a right LRC", got=repr(text[:48]))
+                raise CrcError(
+                    "a reply is damaged", expected="hexadecimal digits and a correct LRC", got=repr(text[:48])
+                )
             return None
         if frame[0] != self._unit:
             self._seen = f"a frame of unit {frame[0]}"
@@ -151,9 +153,9 @@ class AsciiFramer(Framer):
         pdu = frame[1:]
         echoed = text == self._sent and request.reply_length(pdu) != len(pdu)
         if echoed or pdu[0] & 0x7F != request.function:
-            hint = "the line echoes what is sent: say so in its settings" if echoed else ""
+            hint = "the line echoes sent bytes: set `echo: true` for its bus, or --echo" if echoed else ""
             raise Desync(
-                "a frame that answers another request", expected=self._expectation(), got=short_hex(frame), hint=hint
+                "a reply to a different request", expected=self._expectation(), got=short_hex(frame), hint=hint
             )
         return pdu
 

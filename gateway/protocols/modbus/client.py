@@ -485,7 +485,11 @@ class ModbusClient:
             if data and now_ns >= babble_ns:
                 self._line.babbled()
                 where = str(self._connection.endpoint)
-                raise Desync("the line is never silent", where=where, hint="another master, or a unit that babbles")
+                raise Desync(
+                    "the line is never silent",
+                    where=where,
+                    hint="another client on the line, or a unit that sends continuously",
+                )
         lost = self._connection.lost
         if lost is not None:
             raise ConnectionLost(lost.message, where=lost.where)

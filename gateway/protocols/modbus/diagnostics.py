@@ -76,7 +76,9 @@ class Loopback(Request[DiagnosticsReply]):
     def __post_init__(self) -> None:
         check_range("bytes of loopback data", len(self.data), 2, MAX_PDU - 3)
         if len(self.data) % 2:
-            raise UsageError("loopback data is words", expected="an even number of bytes", got=str(len(self.data)))
+            raise UsageError(
+                "loopback data consists of words", expected="an even number of bytes", got=str(len(self.data))
+            )
 
     @property
     def function(self) -> int:
@@ -171,7 +173,7 @@ def _check_echo(sub_function: int, sent: bytes, pdu: bytes) -> None:
     if pdu[1:3] != sent[1:3]:
         raise Desync("a reply to another diagnostics sub-function", expected=sent[1:3].hex(), got=short_hex(pdu))
     if sub_function in _ECHOED and pdu != sent:
-        raise Desync("the loopback came back changed", expected=short_hex(sent), got=short_hex(pdu))
+        raise Desync("the loopback data came back changed", expected=short_hex(sent), got=short_hex(pdu))
 
 
 def _busy(status: bytes) -> bool:

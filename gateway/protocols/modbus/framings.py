@@ -26,7 +26,9 @@ _OF_SCHEME: dict[str, Framing] = {
 def framing_of(endpoint: Endpoint) -> Framing:
     """Return the framing for the scheme of `endpoint`. Raises `UsageError` if the scheme is not one of Modbus."""
     if endpoint.scheme not in _OF_SCHEME:
-        raise UsageError("Modbus is not spoken there", expected=", ".join(_OF_SCHEME), got=str(endpoint))
+        raise UsageError(
+            "this kind of endpoint does not carry Modbus", expected=", ".join(_OF_SCHEME), got=str(endpoint)
+        )
     return _OF_SCHEME[endpoint.scheme]
 
 
@@ -38,7 +40,7 @@ def make_framer(framing: str, *, char_time_ns: int, echo: bool, strict: bool, ac
     if echo and not serial:
         raise UsageError("only a serial line echoes", got=f"echo with framing {framing}")
     if strict and framing != "rtu":
-        raise UsageError("only RTU has silences to be strict about", got=f"strict with framing {framing}")
+        raise UsageError("only RTU frames are separated by silences", got=f"strict with framing {framing}")
     if strict and not char_time_ns:
         raise UsageError("strict RTU timing needs the baud rate and frame of the line")
     if accepts_zero_id and serial:

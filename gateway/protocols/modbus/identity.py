@@ -99,5 +99,5 @@ class ReadDeviceIdentification(Request[DeviceIdentificationReply]):
             at += 2 + size
         more = pdu[4] == 0xFF
         if more and pdu[5] <= self.object_id and self.read_code != 4:
-            raise Desync("device identification goes round in circles", got=short_hex(pdu))
+            raise Desync("device identification repeats objects", got=short_hex(pdu))
         return DeviceIdentificationReply(tuple(objects), pdu[3], more, pdu[5], bytes(pdu[1:]), t_ns)

@@ -116,7 +116,7 @@ class RtuFramer(Framer):
             return Desync("a reply of the wrong size", expected=self._expectation(), got=self._wrong_header)
         if self._garbage >= self._shortest_reply():
             return CrcError(
-                f"{self._garbage} bytes arrived and no frame is in them",
+                f"{self._garbage} bytes arrived, but no valid frame",
                 expected=self._expectation(),
                 hint="check baud rate, parity and wiring",
             )
@@ -231,8 +231,8 @@ class RtuFramer(Framer):
         frame = bytes(self._buffer[:size])
         expected = self._expectation()
         self._end(size)
-        hint = "the line echoes what is sent: say so in its settings" if frame == self._sent else ""
-        other = "a frame that answers another request"
+        hint = "the line echoes sent bytes: set `echo: true` for its bus, or --echo" if frame == self._sent else ""
+        other = "a reply to a different request"
         if frame[1] == request.function and (carried := counted_bytes(frame[1:-2])):
             raise WrongSize(other, expected=expected, got=short_hex(frame), hint=hint, got_bytes=carried)
         raise Desync(other, expected=expected, got=short_hex(frame), hint=hint)
@@ -264,7 +264,7 @@ class RtuFramer(Framer):
         if gap_ns >= self.t35_ns:
             self._after_foreign = False
         elif self._after_foreign:
-            self._seen = "a frame too close behind another"
+            self._seen = "a frame too soon after another"
 
     def _drop_foreign(self, size: int) -> None:
         self._seen = f"a frame of unit {self._buffer[0]}"

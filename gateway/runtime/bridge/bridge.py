@@ -144,7 +144,10 @@ class Bridge:
         self.cache = ReplyCache(config.cache_ms)
         self._buses = {name: buses[name] for name in config.buses}
         if any(r.unit == 0 and self._is_line(r.bus) for r in config.routes.values()):
-            raise UsageError(f"bridge {config.name!r}: unit 0 of a line is every unit", hint="`broadcast` passes it on")
+            raise UsageError(
+                f"bridge {config.name!r}: unit 0 is a broadcast to all units of the line",
+                hint="`broadcast` passes it on",
+            )
         self._clock = clock
         self._audit = audit
         self._blocked = blocked
@@ -154,7 +157,7 @@ class Bridge:
         self.front: TcpFront | LineFront
         if config.listen.is_serial:
             if framing_of(config.listen) != "rtu":
-                raise UsageError(f"bridge {config.name!r} hears RTU only", got=str(config.listen))
+                raise UsageError(f"bridge {config.name!r} supports only RTU", got=str(config.listen))
             self.front = LineFront(config.listen, connector, self.ask, self._is_ours, clock)
         else:
             self.front = TcpFront(

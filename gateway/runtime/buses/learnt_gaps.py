@@ -73,7 +73,7 @@ class LearntFile:
                 file.write(msgspec.json.encode(entries))
             new.replace(self._path)
         except OSError as e:
-            raise Unreachable(f"cannot write what was learnt: {e.strerror}", where=str(self._path)) from e
+            raise Unreachable(f"cannot store the learnt gaps: {e.strerror}", where=str(self._path)) from e
         self._saved = changes
 
     def _same(self, driver: RegisterDriver, entry: Entry) -> bool:

@@ -310,7 +310,7 @@ class ModbusBus:
                 self._heard_late(client)
             if stream and unanswered.too_many(any(device.online for device in self.devices)):
                 raise ConnectionLost(
-                    f"{MOST_UNANSWERED} requests in a row were not answered: the connection is made anew",
+                    f"{MOST_UNANSWERED} consecutive requests were not answered: the gateway reconnects",
                     where=str(self.config.endpoint),
                 )
             if self._coming is not None:
@@ -555,7 +555,7 @@ class ModbusBus:
     async def _run_job(self, job: Job) -> None:
         device = next((d for d in self.devices if d.driver is job.driver), None)
         if device is not None and device.tried and not device.online:
-            job.done(Unreachable(f"the device is away: {device.error}", where=job.driver.config.where))
+            job.done(Unreachable(f"the device is lost: {device.error}", where=job.driver.config.where))
             return
         try:
             await self._attempts(device, job.run)

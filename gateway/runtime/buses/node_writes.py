@@ -123,12 +123,14 @@ class NodeWrites:
     async def _put_on_bus(self, rpdo: Rpdo, values: dict[str, bytes]) -> FieldtwinError | None:
         """Send an RPDO and return the error, or None. Nothing is sent to a node that would not accept it."""
         if not self._driver.operational or rpdo not in self._driver.rpdos:
-            return Unreachable("the node is not OPERATIONAL: it takes no process data", where=self._driver.config.where)
+            return Unreachable(
+                "the node is not OPERATIONAL: it accepts no process data", where=self._driver.config.where
+            )
         try:
             async with asyncio.timeout(self._timeout_s):
                 await self._driver.send_rpdo(rpdo, values)
         except TimeoutError:
-            return ReplyTimeout("the bus takes no frames", where=self._driver.config.where)
+            return ReplyTimeout("the bus accepts no frames", where=self._driver.config.where)
         except ConnectionLost:
             raise
         except FieldtwinError as e:

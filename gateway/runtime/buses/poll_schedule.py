@@ -111,7 +111,7 @@ class PollSchedule:
         self.due_ns = dict.fromkeys([*self._rates, *self._once], now_ns)
 
     def stop(self) -> None:
-        """Stop polling, because the device is away: no group is due, and no period counts as missed."""
+        """Stop polling, because the device is lost: no group is due, and no period counts as missed."""
         self.due_ns = {}
 
     def took(self, group: str, now_ns: int) -> None:

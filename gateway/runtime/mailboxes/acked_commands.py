@@ -53,4 +53,4 @@ class TakenFile:
                 file.write(msgspec.json.encode({name: held.hex() for name, held in self._taken.items()}))
             new.replace(self._path)
         except OSError as e:
-            raise Unreachable(f"cannot write what was taken: {e.strerror}", where=str(self._path)) from e
+            raise Unreachable(f"cannot store the executed commands: {e.strerror}", where=str(self._path)) from e

@@ -68,7 +68,7 @@ class MailboxPump:
         """Handle a command that did not come through the mailbox. Return False if the plant's switch is set to `local`.
         The command is recorded in both cases."""
         name = self.driver.config.name
-        result = "taken" if self.remote else "the plant says local"
+        result = "taken" if self.remote else "the plant is switched to local"
         with suppress(Unreachable):
             self._audit.note("command" if self.remote else "refuse", name, by=by, result=result, payload=payload.hex())
         if self.remote:
@@ -100,10 +100,10 @@ class MailboxPump:
                         "refuse",
                         self.driver.config.name,
                         by="far side",
-                        result="the plant says local",
+                        result="the plant is switched to local",
                         payload=item.data.hex(),
                     )
-                self._tell("inbox", item.data.hex(), Cause.LOCAL, "the plant says local", "far side")
+                self._tell("inbox", item.data.hex(), Cause.LOCAL, "the plant is switched to local", "far side")
 
     def _tell(
         self, tag: str, value: object, cause: Cause, reason: str, by: str = "plc", *, audit: bool = False

@@ -102,7 +102,7 @@ class OutputWriter:
     def _turned_away(self, output: Output | None, tag: str, where: str) -> tuple[Cause, FieldtwinError | None]:
         """Return why a client's write of a tag is not started; the error is None if it may start."""
         if output is None or output.by == "plc":
-            return Cause.NOT_WRITABLE, NotAllowed(f"{tag} cannot be commanded from here", where=where)
+            return Cause.NOT_WRITABLE, NotAllowed(f"{tag} cannot be commanded by this client", where=where)
         if output.tag in self._group_of:
             group = self._group_of[output.tag].name
             return Cause.NOT_WRITABLE, NotAllowed(f"{tag} is written with its group {group!r} only", where=where)
@@ -294,7 +294,9 @@ class OutputWriter:
                 error: FieldtwinError = NotAllowed(f"writes are blocked: {wrong}", where=config.where)
                 self._note(output, value, Cause.WRONG_DEVICE, error, output.by)
             else:
-                error = Unreachable("the device takes no write; the value is written when it does", where=config.where)
+                error = Unreachable(
+                    "the device accepts no writes now; the value is written when it does", where=config.where
+                )
                 self._note(output, value, Cause.AWAY, error, output.by)
 
     def _waiting_frames(self, now_ns: int) -> set[object]:
@@ -334,7 +336,7 @@ class OutputWriter:
             output.answer(e)
             return
         if not self._on_record(output, name, old, value):
-            output.answer(Unreachable("the write could not be put on record", where=name))
+            output.answer(Unreachable("the write could not be recorded in the audit log", where=name))
             return
         output.pending, output.untouched = True, False
         by = output.by

@@ -92,7 +92,7 @@ class Analyze(DTDigitalThreadProcess):
     def _judge(self, status: SeenStatus) -> None:
         equal = self.check_statuses(status)
         if equal is None:
-            self._say("unreadable", status.whose, f"a status that is none: {status.data.hex() or 'empty'}", status.t_ms)
+            self._say("unreadable", status.whose, f"an invalid status: {status.data.hex() or 'empty'}", status.t_ms)
             return
         self.compared += 1
         self.equal += equal
@@ -107,7 +107,7 @@ class Analyze(DTDigitalThreadProcess):
     def _weigh(self, message: SeenMeasurement) -> None:
         event = message.event
         self._heard[event.name] = message.arrived_ms
-        self._turn(event.name, "stale", "fresh", False, f"{event.name} is heard of again", message.arrived_ms)
+        self._turn(event.name, "stale", "fresh", False, f"{event.name} is received again", message.arrived_ms)
         late = message.arrived_ms - event.t_ms > LATE_MS
         for wrong, right, is_wrong, text in self._weighed(message):
             self._turn(event.name, wrong, right, is_wrong, text, event.t_ms, late=late)
@@ -133,7 +133,7 @@ class Analyze(DTDigitalThreadProcess):
         now_ms = self._clock.utc_ns() // 1_000_000
         for name, heard_ms in self._heard.items():
             if now_ms - heard_ms > self._stale_after_ms:
-                text = f"{name} was not heard of for {(now_ms - heard_ms) / 1000:.0f} s"
+                text = f"{name} was not received for {(now_ms - heard_ms) / 1000:.0f} s"
                 self._turn(name, "stale", "fresh", True, text, now_ms)
 
     def _turn(

@@ -130,7 +130,7 @@ class Execute(DTDigitalThreadProcess):
             if objection or question is None:
                 return command, objection
             if self._what_if is None:
-                return command, "a prototype was to be asked first, and nobody here can"
+                return command, "a what-if simulation is required first, and this process cannot run one"
             self._pending = command
             self.asked += 1
             self._what_if.ask(command, question)

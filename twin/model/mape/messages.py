@@ -61,15 +61,15 @@ class Verdict(DATA):
 
 
 FINDINGS = {
-    "agree": "state and period reported by the plant are those of the model",
-    "mismatch": "the state that the plant reports is not the one that its period leads to in the model",
+    "agree": "state and period that the plant reports agree with the model",
+    "mismatch": "the state that the plant reports differs from the model's state for its period",
     "inside": "a value is inside its limits again",
     "outside": "a value is outside the limits that its profile states",
     "good": "a value is good again",
-    "bad": "the plant says that a value cannot be trusted",
-    "fresh": "a tag is heard of again",
-    "stale": "a tag was not heard of for too long",
-    "unreadable": "a status is none",
+    "bad": "the plant reports that a value cannot be trusted",
+    "fresh": "a tag is received again",
+    "stale": "a tag was not received for too long",
+    "unreadable": "a status is invalid",
 }
 
 

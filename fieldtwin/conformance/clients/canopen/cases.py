@@ -100,7 +100,7 @@ CASES: tuple[CanopenCase, ...] = (
     _case("CO-027", "NMT reset during a transfer", ROBUST, "7.3.2.2.1", READ, plays.restarts, judges.survives,
           "sends a boot-up message instead of a reply", "end the transfer; go on"),
     _case("CO-028", "SDO in STOPPED", ROBUST, "7.3.2.2.4", CUT, plays.honest, judges.survives,
-          "is STOPPED for 4 s, reports this state, and answers no SDO",
+          "is STOPPED for 4 s, reports this state, and does not answer SDO requests",
           "go on asking, without a flood of requests").on(strikes=1, mutes="sdo"),
     _case("CO-029", "expedited without the size bit", REQUIRED, "7.2.4", READ, plays.no_size, judges.accepts,
           "leaves the size to the object", "take the object's own length").on(holds_good=True, strikes=4),

@@ -40,7 +40,7 @@ def _block_ended(seen: Observation) -> Finding | None:
     for told in seen.of(Told, seen.begun_ns):
         if told.data[:1] == bytes((BLOCK_ENDED,)):
             return None
-    return failed("the block download was never brought to its end")
+    return failed("the block download was never completed")
 
 
 completes = owes(_block_ended)
@@ -49,10 +49,10 @@ completes = owes(_block_ended)
 def _noticed(seen: Observation) -> Finding | None:
     """Check that a missing heartbeat has an effect on the published value or causes a command."""
     if any(shown.word is Word.NONE for shown in seen.of(Shown, seen.begun_ns, seen.over_ns)):
-        return passed("its value was none meanwhile")
+        return passed("it published no value meanwhile")
     if any(_id(sent) == NMT for sent in seen.of(Sent, seen.begun_ns)):
         return passed("it commanded the node")
-    return inconclusive("nothing shows that it noticed: right only for a master that watches no heartbeat")
+    return inconclusive("there is no sign that it noticed: correct only for a master that monitors no heartbeat")
 
 
 notices = owes(_noticed)
@@ -62,7 +62,7 @@ def _unmoved(seen: Observation) -> Finding | None:
     """Check that a heartbeat that is slightly late has no effect: no command is sent and no value disappears."""
     moved = any(_id(sent) == NMT for sent in seen.of(Sent, seen.begun_ns))
     if moved or any(shown.word is Word.NONE for shown in seen.of(Shown, seen.begun_ns)):
-        return inconclusive("it took the node for lost: right only where its consumer time is shorter than that")
+        return inconclusive("it treated the node as lost: correct only if its consumer time is shorter")
     return None
 
 
@@ -125,11 +125,11 @@ one_a_block = owes(_one_a_block)
 def _restarted(seen: Observation) -> Finding | None:
     for sent in seen.of(Sent, seen.over_ns):
         if _id(sent) == NMT:
-            return passed("it commanded the node anew")
+            return passed("it commanded the node again")
     for asked in seen.of(Asked, seen.over_ns):
         if asked.target[1] >> 5 == 1:
-            return passed("it wrote to the node anew")
-    return inconclusive("it neither commanded nor wrote to the node: right only for a master that configures nothing")
+            return passed("it wrote to the node again")
+    return inconclusive("it neither commanded nor wrote to the node: correct only for a master that configures no node")
 
 
 reconfigures = owes(_restarted)

@@ -51,7 +51,7 @@ class PtyLine:
             plugged_in_again = True
             move, self._unplugged = self._unplugged, None
             if move is None:
-                raise Unreachable("the virtual port is gone", where=str(self._listen))
+                raise Unreachable("the virtual serial port is gone", where=str(self._listen))
             try:
                 Path(self._listen.path).unlink(missing_ok=True)
                 await asyncio.sleep(move.out_s)

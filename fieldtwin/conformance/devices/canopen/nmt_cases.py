@@ -50,7 +50,7 @@ async def _reset(wire: CanopenWire, command: int) -> Finding:
         beat = await wire.hear(ERROR_CONTROL + wire.node, min(2.0, wire.boot_s))
         if beat is not None and beat.data not in (b"\x7f", b"\x00"):
             told = NAMES.get(beat.data[0] & 0x7F, beat.data.hex()) if beat.data else "nothing"
-            return await verdict(wire, f"boots, then tells {told} instead of PRE-OPERATIONAL")
+            return await verdict(wire, f"boots, then reports {told} instead of PRE-OPERATIONAL")
         return await verdict(wire, "")
 
 
@@ -74,7 +74,7 @@ async def reset_in_a_transfer(wire: CanopenWire) -> Finding:
             return await verdict(wire, f"no boot-up within {wire.boot_s:g} s")
         reply = await wire.ask(b"\x60")
         if reply.data and not reply.abort:
-            return await verdict(wire, f"goes on with the transfer from before: {reply}")
+            return await verdict(wire, f"continues the earlier transfer: {reply}")
         return await verdict(wire, "")
 
 
@@ -112,7 +112,7 @@ async def guarding(wire: CanopenWire) -> Finding:
             raise NotHere("it answers no guard request")
         toggles.append(answer.data[0] >> 7)
     if toggles[0] == toggles[1]:
-        raise Unsaid("the toggle bit stays the same: heartbeats, or a guarding that is wrong")
+        raise Unsaid("the toggle bit does not change: it sends heartbeats, or its guarding is wrong")
     return passed()
 
 
@@ -131,5 +131,5 @@ async def fastscan(wire: CanopenWire) -> Finding:
     wire.forget()
     await wire.send(CanFrame(LSS_REQUEST, b"\x51\0\0\0\0\x80\0\0"))
     if await wire.hear(LSS_REPLY) is not None:
-        raise Unsaid("somebody answers: there is a node without an id on this bus, or one that answers with one")
+        raise Unsaid("a node answers: it has no node ID, or answers although it has one")
     return await verdict(wire, "")

@@ -71,7 +71,7 @@ async def begun_anew(wire: CanopenWire) -> Finding:
     await wire.ask(b"\x60")
     found = await wire.upload((0x1000, 0))
     if isinstance(found, Reply) and found.abort:
-        return await verdict(wire, "", f"{found}, then good service")
+        return await verdict(wire, "", f"{found}, then normal service")
     if found != wire.device_type:
         said = str(found) if isinstance(found, Reply) else found.hex(" ").upper()
         return failed(f"{said} instead of 1000h")
@@ -96,7 +96,7 @@ async def missing_index(wire: CanopenWire) -> Finding:
             await wire.abandon((index, 0))
             continue
         return await verdict(wire, aborted(reply, 0x0602_0000))
-    raise Unsaid("it has all of " + ", ".join(f"{index:04X}h" for index in UNLIKELY))
+    raise Unsaid("it has all objects of " + ", ".join(f"{index:04X}h" for index in UNLIKELY))
 
 
 async def subindex_of_a_var(wire: CanopenWire) -> Finding:
@@ -110,7 +110,7 @@ async def subindex_beyond(wire: CanopenWire) -> Finding:
         count = await wire.upload((index, 0))
         if isinstance(count, bytes) and len(count) == 1 and count[0] < 0xFE:
             return await must_abort(wire, b"\x40" + mux(index, count[0] + 1), 0x0609_0011)
-    raise NotHere("it has none of " + ", ".join(f"{index:04X}h" for index in COUNTED))
+    raise NotHere("it has no object of " + ", ".join(f"{index:04X}h" for index in COUNTED))
 
 
 async def empty_history(wire: CanopenWire) -> Finding:

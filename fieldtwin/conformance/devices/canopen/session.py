@@ -87,7 +87,7 @@ async def check_canopen(
         heard = await wire.listen(LISTEN_S)
         if not options.share_bus and any(f.can_id == SDO_REQUEST + options.node and not f.extended for f in heard):
             raise NotAllowed(
-                f"another master speaks SDO with node {options.node}", hint="--share-bus checks all the same"
+                f"another master uses SDO with node {options.node}", hint="--share-bus runs the check all the same"
             )
         identity = await learn(wire)
         say(f"1000h is {wire.device_type.hex(' ').upper()}")
@@ -106,8 +106,8 @@ async def learn(wire: CanopenWire) -> dict[str, str]:
     if isinstance(found, Reply):
         if found.abort:
             raise Unreachable(f"node {wire.node} has no 1000h: {found}", hint="every CANopen node has one (7.5.2.1)")
-        stopped = "; its heartbeat says STOPPED: start it first" if wire.state == 0x04 else ""
-        raise Unreachable(f"node {wire.node} does not answer SDO{stopped}", hint="another node id, or bit rate?")
+        stopped = "; its heartbeat reports STOPPED: start it first" if wire.state == 0x04 else ""
+        raise Unreachable(f"node {wire.node} does not answer SDO{stopped}", hint="check the node ID and the bit rate")
     wire.device_type = found
     identity = {"device type": f"{int.from_bytes(found, 'little'):08X}h"}
     for sub, name in NUMBERS.items():

@@ -34,7 +34,7 @@ async def _borrowed(wire: CanopenWire, key: Key) -> AsyncIterator[bytes]:
             now = await wire.upload(key)
             if now != before:
                 said = now.hex() if isinstance(now, bytes) else now
-                raise Unsaid(f"{shown(key)} could not be put back: {said} instead of {before.hex()}")
+                raise Unsaid(f"{shown(key)} could not be restored: {said} instead of {before.hex()}")
 
 
 async def _unchanged(wire: CanopenWire, key: Key, before: bytes, wrong: str) -> Finding:
@@ -150,7 +150,7 @@ async def _limit(wire: CanopenWire, *, above: bool) -> Finding:
                 continue
             reply = await wire.download(key, (value % (1 << bits)).to_bytes(len(before), "little"))
             return await _unchanged(wire, key, before, aborted(reply, TOO_HIGH if above else TOO_LOW))
-    raise NotHere("no object given by --write has such a limit in the EDS, with values of its type beyond it")
+    raise NotHere("no object of --write has such a limit in the EDS, with values of its type outside it")
 
 
 async def above_limit(wire: CanopenWire) -> Finding:

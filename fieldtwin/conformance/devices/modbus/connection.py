@@ -53,7 +53,7 @@ class Heard:
 
     def __str__(self) -> str:
         said = [str(answer) for answer in self.answers]
-        said += [f"{short(self.rest)}, which is no frame"] if self.rest else []
+        said += [f"{short(self.rest)}, which is not a frame"] if self.rest else []
         said += ["hangs up"] if self.closed else []
         return ", ".join(said) or "silence"
 

@@ -51,7 +51,8 @@ async def learn(wire: ModbusWire, given: dict[str, int], writable: dict[str, int
         wire.good, wire.good_reply = refusal
     if not wire.good_reply:
         raise Unreachable(
-            f"unit {wire.unit} answers no read", hint="is it another unit, baud rate or framing? `fieldtwin scan` looks"
+            f"unit {wire.unit} answers no read",
+            hint="check the unit ID, the baud rate and the framing; `fieldtwin scan` finds them",
         )
     await _widen(wire)
 

@@ -35,7 +35,7 @@ async def half_then_whole(wire: ModbusWire) -> Finding:
     await wire.pause(max(LONG_PAUSE_S, 2 * wire.pause_s))
     await wire.say(frame, wire.good)
     heard = await wire.hear()
-    return passed() if answers_good(wire, heard, 1) else failed(f"{heard} instead of an answer to the whole one")
+    return passed() if answers_good(wire, heard, 1) else failed(f"{heard} instead of an answer to the complete one")
 
 
 async def gap_inside(wire: ModbusWire) -> Finding:
@@ -122,7 +122,7 @@ async def _silent_neighbour(wire: ModbusWire) -> int:
         if (await wire.ask(wire.good, unit, due=False)).nothing:
             await wire.settle()
             return unit
-    raise Unsaid("every other unit id that was tried is answered: see MB-029")
+    raise Unsaid("it answers to every other unit ID that was tried: see MB-029")
 
 
 def _neighbours(wire: ModbusWire) -> list[int]:
@@ -142,7 +142,7 @@ async def other_unit(wire: ModbusWire) -> Finding:
     units = ", ".join(str(unit) for unit, _ in said)
     if len(pdus) == 1:
         return failed(f"answers for units {units} alike: {said[0][1]}")
-    raise Unsaid(f"units {units} answer, each otherwise: there are others on this line")
+    raise Unsaid(f"units {units} answer, each differently: there are other units on this line")
 
 
 async def neighbours_talk(wire: ModbusWire) -> Finding:
@@ -193,7 +193,7 @@ async def two_masters(wire: ModbusWire) -> Finding:
     """MB-069: send two overlapping requests, combined bit by bit."""
     one, other = wire.frame(wire.good), framed("rtu", wire.unit, read_of(0x04, 0x1234, 9))
     if wire.framing == "ascii":
-        raise NotHere("it is played on RTU")
+        raise NotHere("this test case runs on RTU")
     await wire.say(bytes(a & b for a, b in zip(one, other, strict=False)), b"\x80")
     await wire.pause(LONG_PAUSE_S)
     return await silent_then_good(wire, await wire.hear())

@@ -138,7 +138,7 @@ async def _objects(wire: ModbusWire, code: int) -> tuple[dict[int, bytes], str]:
             objects[pdu[place]] = pdu[place + 2 : place + 2 + pdu[place + 1]]
             place += 2 + pdu[place + 1]
         if place != len(pdu):
-            return objects, f"{len(pdu) - place} bytes behind the last object"
+            return objects, f"{len(pdu) - place} bytes after the last object"
         if not more:
             return objects, ""
         if following <= at or not objects or following <= max(objects):
@@ -170,7 +170,7 @@ async def unknown_object(wire: ModbusWire) -> Finding:
     """MB-045: one object that is not there."""
     first = await wire.ask(b"\x2b\x0e\x04\x00")
     if first.first is None or first.first.refusal:
-        raise NotHere(f"it gives no single objects: {first}")
+        raise NotHere(f"it does not answer for single objects: {first}")
     for object_id in (0x7F, 0x6F):
         heard = await wire.ask(bytes((0x2B, 0x0E, 0x04, object_id)))
         answer = heard.first
@@ -204,7 +204,7 @@ async def counters(wire: ModbusWire) -> Finding:
     counted = (await _counter(wire, 0x0E) - before) & 0xFFFF
     if counted in (3, 4):  # the one that asks may count, or not yet
         return passed()
-    return failed(f"counted {counted} requests where there were 4")
+    return failed(f"counted {counted} requests instead of 4")
 
 
 async def _counter(wire: ModbusWire, which: int) -> int:

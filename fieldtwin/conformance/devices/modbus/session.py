@@ -94,7 +94,9 @@ async def check_modbus(
             heard = await wire.hear(0, options.listen_s)
             if not heard.nothing:
                 raise NotAllowed(
-                    "somebody else talks on this line", got=str(heard)[:60], hint="--share-bus checks all the same"
+                    "this line carries other traffic",
+                    got=str(heard)[:60],
+                    hint="--share-bus runs the check all the same",
                 )
         await learn(wire, options.given, {table: at for table, (at, _) in options.may_write.items()})
         say(f"the usual request is {wire.good.hex(' ').upper()}, its answer {wire.good_reply.hex(' ').upper()}")

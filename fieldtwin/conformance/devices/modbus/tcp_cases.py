@@ -54,7 +54,9 @@ async def more_than_allowed(wire: ModbusWire) -> Finding:
     if odd:
         return failed(f"{odd[0]} instead of an answer or exception 06")
     if len(heard.answers) != 40:
-        return failed(f"{len(heard.answers)} answers to 40 requests" + (", and hangs up" if heard.closed else ""))
+        return failed(
+            f"{len(heard.answers)} answers to 40 requests" + (", and closes the connection" if heard.closed else "")
+        )
     return passed(f"{40 - len(busy)} answered, {len(busy)} refused with 06")
 
 
@@ -135,7 +137,7 @@ def _told(answer: Answer | None) -> str:
 async def _as_itself(wire: ModbusWire, unit: int) -> Finding:
     """A direct device answers to `unit`, and echoes it (TG 4.4.1.2)."""
     if wire.unit == unit:
-        raise NotHere(f"all the rest is asked of unit {unit}")
+        raise NotHere(f"all other test cases use unit {unit}")
     heard = await wire.ask(wire.good, unit)
     answer = heard.first
     if answer is None:
@@ -145,7 +147,7 @@ async def _as_itself(wire: ModbusWire, unit: int) -> Finding:
     if answer.refusal in GATEWAY_SAYS_NO:
         raise NotHere(f"a gateway, not a direct device: {named(answer.refusal)}")
     same = answer.pdu[:2] == wire.good_reply[:2] and len(answer.pdu) == len(wire.good_reply)
-    return passed() if same else failed(f"{answer} instead of what unit {wire.unit} answers")
+    return passed() if same else failed(f"{answer} instead of the answer of unit {wire.unit}")
 
 
 async def unit_255(wire: ModbusWire) -> Finding:

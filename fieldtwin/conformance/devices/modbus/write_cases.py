@@ -35,7 +35,7 @@ def _write(table: str, address: int, data: bytes) -> bytes:
 async def _borrowed(wire: ModbusWire, table: str) -> AsyncIterator[tuple[int, bytes]]:
     """Yield the cell that may be written and its value, and restore it. Raises `Unsaid` where that failed."""
     if table not in wire.may_write:
-        raise NotHere(f"no cell to write was given: --write {table}:ADDRESS")
+        raise NotHere(f"no address to write was given: --write {table}:ADDRESS")
     address, _ = wire.may_write[table]
     before = await _read(wire, table, address)
     try:
@@ -46,7 +46,7 @@ async def _borrowed(wire: ModbusWire, table: str) -> AsyncIterator[tuple[int, by
             await wire.ask(_write(table, address, before))
             now = await _read(wire, table, address)
             if now != before:
-                raise Unsaid(f"{table} {address} could not be put back: {now.hex()} instead of {before.hex()}")
+                raise Unsaid(f"{table} {address} could not be restored: {now.hex()} instead of {before.hex()}")
 
 
 async def _unchanged(wire: ModbusWire, table: str, address: int, before: bytes, finding: Finding) -> Finding:
@@ -132,14 +132,14 @@ async def coils_mismatch(wire: ModbusWire) -> Finding:
 async def partly_outside(wire: ModbusWire) -> Finding:
     """MB-041: send FC 16 that ends one register after the map."""
     if "holding" not in wire.may_write:
-        raise NotHere("no cell to write was given: --write holding:ADDRESS+COUNT")
+        raise NotHere("no address to write was given: --write holding:ADDRESS+COUNT")
     address, count = wire.may_write["holding"]
     end = address + count
     if end > 0xFFFF or count > 122:
         raise NotHere("give the last registers of the map, at most 122: --write holding:ADDRESS+COUNT")
     beyond = await wire.ask(read_of(0x03, end, 1))
     if beyond.first is None or beyond.first.refusal != 0x02:
-        raise NotHere(f"register {end} is there: give the last ones of the map, --write holding:ADDRESS+COUNT")
+        raise NotHere(f"register {end} exists: give the last ones of the map, --write holding:ADDRESS+COUNT")
     async with _borrowed(wire, "holding") as (address, before):
         data = _other(before) + (await _read(wire, "holding", address, count))[2:] + b"\0\0"
         pdu = b"\x10" + address.to_bytes(2) + (count + 1).to_bytes(2) + bytes((2 * count + 2,)) + data

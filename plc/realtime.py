@@ -29,6 +29,7 @@ import errno
 import gc
 import os
 import signal
+import threading
 import sys
 import time
 from collections.abc import Callable
@@ -180,6 +181,17 @@ class StuckAlarm:
     def _on_alarm(self, number: int, frame: object) -> None:
         if self._armed:
             raise ScanStuck(f"{self._s * 1000:g} ms and no end")
+
+
+VIRTUAL_STUCK_MS = 10_000.0
+"""The limit in ms of real time for a scan under virtual time, if `stuck_ms` of the system file is not longer."""
+
+
+def alarm_if_free(stuck_ms: float) -> StuckAlarm | None:
+    """Return an alarm, or None if it cannot be used: outside the main thread, or where SIGALRM belongs to other code."""
+    if threading.current_thread() is not threading.main_thread() or not hasattr(signal, "setitimer"):
+        return None
+    return StuckAlarm(stuck_ms) if signal.getsignal(signal.SIGALRM) is signal.SIG_DFL else None
 
 
 def lead(until_due_ns: int) -> int:

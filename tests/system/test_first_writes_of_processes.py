@@ -15,10 +15,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from procs import CHECKOUT, Asking, Fieldtwin, alive, fieldtwin, free_port, no_tracebacks, run_to_end, wait_for
-
-sys.path.insert(0, str(CHECKOUT / "tests" / "unit"))
 from fan_hall import hall, writes
+from procs import CHECKOUT, Asking, Fieldtwin, alive, fieldtwin, free_port, no_tracebacks, run_to_end, wait_for
 
 
 @contextmanager

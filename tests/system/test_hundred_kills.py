@@ -10,11 +10,11 @@ import json
 import os
 import signal
 import sqlite3
-import sys
 from contextlib import closing, suppress
 from pathlib import Path
 
 import pytest
+from fan_hall import hall, writes
 from many_kills_rig import KILLS, KILLS_OF_A_RUN, nothing_is_left, processes_of, victim
 from procs import (
     CHECKOUT,
@@ -28,9 +28,6 @@ from procs import (
     wait_for,
 )
 from stores import ask, log_of, own
-
-sys.path.insert(0, str(CHECKOUT / "tests" / "unit"))
-from fan_hall import hall, writes
 
 pytestmark = [pytest.mark.long, pytest.mark.timeout(900 + 15 * max(KILLS, KILLS_OF_A_RUN))]
 

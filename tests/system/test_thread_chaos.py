@@ -1,7 +1,8 @@
 """A digital twin and a prototype as processes, over each carrier: a link loses 20 % of the frames, and repeats and reorders
 others; either side is killed at random instants. At the end the two logs are equal, row by row.
 
-tests/unit/test_thread_core.py and test_thread_carriers.py test the same in virtual time, with many seeds and in milliseconds.
+tests/twin/thread/test_thread_core.py and test_thread_carriers.py test the same in virtual time, with many seeds and in
+milliseconds.
 """
 
 from __future__ import annotations
@@ -10,17 +11,14 @@ import random
 import re
 import shutil
 import socket
-import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 
 import pytest
+from mosquitto_here import broker
 from procs import CHECKOUT, Fieldtwin, fieldtwin, free_port, no_tracebacks, wait_for
 from stores import ask, log_of, own
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "unit"))
-from mosquitto_here import broker
 
 pytestmark = [pytest.mark.long, pytest.mark.interop, pytest.mark.timeout(240)]
 

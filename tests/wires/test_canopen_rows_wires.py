@@ -6,15 +6,10 @@ import asyncio
 import contextlib
 import itertools
 import socket
-import sys
-from pathlib import Path
 
 import pytest
-from support import eventually, run
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "unit"))
-
 from canopen_rows import Row, happen, load, parse_frame
+from support import eventually, run
 
 from fieldtwin.emulators.canopen.node import CanopenNode
 from fieldtwin.emulators.canopen.serve import Poke, serve_node

@@ -69,7 +69,7 @@ def test_every_kind_of_frame_from_every_kind_of_end_to_all_others(sender: str) -
 
 
 def test_exact_frame_times_and_real_pace() -> None:
-    # Identifier 1 without data keeps the bus for 50 bits (tests/unit/test_can_timing.py): 400 us at 125 kbit/s.
+    # Identifier 1 without data keeps the bus for 50 bits (tests/emulators/wires/test_can_timing.py): 400 us at 125 kbit/s.
     async def main() -> None:
         loop = asyncio.get_running_loop()
         async with bus() as server:

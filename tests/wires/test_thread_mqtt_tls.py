@@ -5,13 +5,14 @@ from __future__ import annotations
 import asyncio
 import shutil
 import subprocess
-import sys
 from contextlib import suppress
 from pathlib import Path
 
 import pytest
 from modbus_pki import Pki, make_pki
+from mosquitto_here import Mosquitto, broker, program
 from support import eventually, run
+from thread_rig import Twin, equal, value
 
 from fieldtwin.gateway.core.errors import Unreachable, UsageError
 from fieldtwin.gateway.wallclock import WallClock
@@ -21,10 +22,6 @@ from fieldtwin.twin.thread.end import ThreadEnd
 from fieldtwin.twin.thread.link import Carrier, Unwelcome
 from fieldtwin.twin.thread.place import plant_carrier, twin_carrier
 from fieldtwin.twin.thread.thread import schema_of
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "unit"))
-from mosquitto_here import Mosquitto, broker, program
-from thread_rig import Twin, equal, value
 
 pytestmark = [
     pytest.mark.interop,

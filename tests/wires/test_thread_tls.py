@@ -4,21 +4,18 @@ computer."""
 from __future__ import annotations
 
 import shutil
-import sys
 from pathlib import Path
 
 import pytest
 from modbus_pki import Pki, make_pki
 from support import eventually, run
+from thread_rig import Twin, equal, value
 
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.twin.site.system import load_system
 from fieldtwin.twin.thread.place import plant_carrier, twin_carrier
 from fieldtwin.twin.thread.thread import schema_of
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "unit"))
-from thread_rig import Twin, equal, value
 
 CLOCK = WallClock()
 SYSTEM = load_system(str(Path(__file__).resolve().parents[2] / "profiles" / "systems" / "observatory.yaml"))

@@ -13,7 +13,7 @@ from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.errors import NotAllowed
 from fieldtwin.gateway.devices.canopen_device import CanopenDriver
-from fieldtwin.gateway.devices.config import CanopenBusConfig, DeviceConfig
+from fieldtwin.gateway.devices.config import CanopenBusConfig, DeviceConfig, Tpdo
 from fieldtwin.gateway.runtime.audit_log import AuditLog
 from fieldtwin.gateway.runtime.tags import TagTable
 from fieldtwin.gateway.wallclock import WallClock

@@ -64,7 +64,7 @@ def test_many_seeds() -> None:
         (["--prototype", "--virtual"], "needs an end"),
         (["--prototype", "--seed", "1"], "need --virtual"),
         (["--prototype", "--virtual", "--for", "1s", "--seeds", "5..1"], "the lower first"),
-        (["--prototype", "--virtual", "--for", "1s", "--seeds", "1..2", "--seed", "1"], "belong to one"),
+        (["--prototype", "--virtual", "--for", "1s", "--seeds", "1..2", "--seed", "1"], "need a single run"),
     ],
 )
 def test_invalid_options_are_refused(words: list[str], told: str) -> None:

@@ -20,7 +20,7 @@ for folder in (ROOT, ROOT / "tests" / "unit"):
 from infer_corpus import Map, corpus  # noqa: E402
 
 from fieldtwin.commissioning.infer.calibration import fitted, kind_of  # noqa: E402
-from fieldtwin.commissioning.infer.fields import Level, Reading  # noqa: E402
+from fieldtwin.commissioning.infer.fields import Interpretation, Level  # noqa: E402
 from fieldtwin.commissioning.infer.infer import Series, infer  # noqa: E402
 
 FIT_SEED, CHECK_SEED = 1, 2
@@ -50,7 +50,7 @@ class Bin:
     observed: float
 
 
-def is_right(reading: Reading, one: Map) -> bool:
+def is_right(reading: Interpretation, one: Map) -> bool:
     """Return whether a generated map has this value there: same registers, type and order."""
     kinds = {reading.type, reading.type[1:]} if reading.sign_open else {reading.type}
     for f in one.fields:

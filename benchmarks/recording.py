@@ -23,7 +23,7 @@ from statistics import median
 from peers import Goals, ratio
 
 from fieldtwin.emulators.replay.replay import ExchangeReplay
-from fieldtwin.gateway.core.files.recording import Exchange, RecordingHeader, RecordingReader, RecordingWriter
+from fieldtwin.gateway.core.files.recording import RecordedExchange, RecordingHeader, RecordingReader, RecordingWriter
 
 WRITES_PER_S = 100_000
 LOAD_S = 3.0
@@ -32,9 +32,9 @@ REQUEST = bytes.fromhex("040000000a")
 HEADER = RecordingHeader(version=1, device="benchmark", kind="exchanges", source="synthetic")
 
 
-def exchanges(count: int) -> Iterator[Exchange]:
+def exchanges(count: int) -> Iterator[RecordedExchange]:
     for i in range(count):
-        yield Exchange(i * 0.001, 1 + i % 4, REQUEST, b"\x04\x14" + i.to_bytes(20), 0.0123)
+        yield RecordedExchange(i * 0.001, 1 + i % 4, REQUEST, b"\x04\x14" + i.to_bytes(20), 0.0123)
 
 
 def write(path: Path, count: int) -> float:
@@ -73,7 +73,7 @@ def read_json(path: Path) -> float:
         next(file)
         for line in file:
             raw = json.loads(line)
-            Exchange(raw["t"], raw["unit"], bytes.fromhex(raw["req"]), bytes.fromhex(raw["rep"]), raw["lat"])
+            RecordedExchange(raw["t"], raw["unit"], bytes.fromhex(raw["req"]), bytes.fromhex(raw["rep"]), raw["lat"])
     return time.perf_counter() - began
 
 

@@ -21,7 +21,7 @@ from virtual_run import CASES, faster, system
 
 from fieldtwin.run.what_if.fork import Fork, answer
 from fieldtwin.run.what_if.last_known import of_period
-from fieldtwin.run.what_if.plan import Plan
+from fieldtwin.run.what_if.plan import WhatIfPlan
 from fieldtwin.run.what_if.state import KnownState
 
 HORIZON_S = 6 * 3600.0
@@ -42,7 +42,9 @@ def main() -> int:
         path = system(Path(folder), scan, sensor, mailbox, node)
         traced = []
         for _ in range(runs):
-            outcome = answer(Fork(str(path), state, horizon_s), Plan("ahead", require=("relay.state == 'ACTIVE'",)))
+            outcome = answer(
+                Fork(str(path), state, horizon_s), WhatIfPlan("ahead", require=("relay.state == 'ACTIVE'",))
+            )
             assert outcome.met, outcome.described()
             took.append(outcome.took_s)
             traced.append(faster(path, 600.0)[0])

@@ -59,7 +59,7 @@ class ClientCounts:
                 self.add(OLDER, gone.requests, gone.replies)
 
 
-class Difference:
+class CountDifference:
     """Assigns the growth of `totals` since the last call to a client: for a line with one client at a time.
 
     `totals` returns the requests and replies of all devices on the line so far.

@@ -20,7 +20,7 @@ MAX_ENTRIES = 500_000
 """Recordings that a context keeps: about 100 MB at most."""
 
 
-class WhenUsedUp(Enum):
+class EndOfRecording(Enum):
     """The behaviour of an emulator at the end of its recording (SPEC ruling 3); named in the prototype file."""
 
     HOLD = "hold"
@@ -28,7 +28,7 @@ class WhenUsedUp(Enum):
     ERROR = "error"
 
     @classmethod
-    def parse(cls, text: str) -> WhenUsedUp:
+    def parse(cls, text: str) -> EndOfRecording:
         """Return the policy of that name; raises `UsageError`."""
         try:
             return cls(text)
@@ -67,7 +67,7 @@ class _Series:
     __slots__ = ("at", "last", "recorded", "shared", "skip", "when_used_up", "whole")
 
     def __init__(
-        self, when_used_up: WhenUsedUp, recorded: Sequence[Recorded] | None = None, *, whole: bool = False
+        self, when_used_up: EndOfRecording, recorded: Sequence[Recorded] | None = None, *, whole: bool = False
     ) -> None:
         self.recorded: Sequence[Recorded] = [] if recorded is None else recorded
         self.shared = recorded is not None
@@ -85,7 +85,7 @@ class _Series:
         """Remove and return the oldest remaining recording."""
         recorded = self.last = self.recorded[self.at]
         self.at += 1
-        wanted_again = self.shared or self.when_used_up is WhenUsedUp.LOOP
+        wanted_again = self.shared or self.when_used_up is EndOfRecording.LOOP
         if self.at >= RELEASE_AT and 2 * self.at >= len(self.recorded) and not wanted_again:
             del _own(self)[: self.at]
             self.at = 0
@@ -112,7 +112,7 @@ class VirtualContext:
         commands: Iterable[COMMAND] | None = None,
         recordings: Iterable[tuple[COMMAND, Recorded]] = (),
         *,
-        when_used_up: WhenUsedUp = WhenUsedUp.HOLD,
+        when_used_up: EndOfRecording = EndOfRecording.HOLD,
         max_entries: int = MAX_ENTRIES,
     ) -> None:
         self.when_used_up = when_used_up
@@ -196,7 +196,7 @@ class VirtualContext:
         self._series[command.data] = _Series(self.when_used_up, recorded, whole=True)
         self._left += len(recorded)
 
-    def set_policies(self, policies: Mapping[bytes, WhenUsedUp]) -> None:
+    def set_policies(self, policies: Mapping[bytes, EndOfRecording]) -> None:
         """Set different policies for single commands, which must be in the list."""
         for data, policy in policies.items():
             if data not in self._series:
@@ -223,7 +223,7 @@ class VirtualContext:
         series = self._find(command)
         if series is None:
             raise self._unknown(command)
-        if not series.left and series.at and series.when_used_up is WhenUsedUp.LOOP:
+        if not series.left and series.at and series.when_used_up is EndOfRecording.LOOP:
             self._left += series.at
             if self._origin is None and not series.whole:
                 self._held += series.at
@@ -231,7 +231,7 @@ class VirtualContext:
             series.at = 0
         if series.left:
             return self._remove(series)
-        if series.last is not None and series.when_used_up is WhenUsedUp.HOLD:
+        if series.last is not None and series.when_used_up is EndOfRecording.HOLD:
             return series.last
         raise UsedUp(f"the recording has no further entry for command {command.data.hex(' ')}")
 

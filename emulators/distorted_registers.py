@@ -10,7 +10,7 @@ import math
 from collections.abc import Iterable, Sequence
 
 from fieldtwin.emulators.distortion import Distortions
-from fieldtwin.emulators.journal import HeldJournal
+from fieldtwin.emulators.journal import DeviceValueLog
 from fieldtwin.emulators.modbus.bank import BIT_TABLES, RegisterBank, Table
 from fieldtwin.emulators.stated import Peek, bytes_of, cells_of, merged, raw_of, touches
 from fieldtwin.gateway.core.files.profile import DeviceProfile, Tag
@@ -27,7 +27,7 @@ class DistortedRegisters(RegisterBank):
         bank: RegisterBank,
         peek: Peek,
         profile: DeviceProfile,
-        journal: HeldJournal,
+        journal: DeviceValueLog,
         tags: Iterable[Tag] | None = None,
         distortions: Distortions | None = None,
     ) -> None:

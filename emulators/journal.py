@@ -16,7 +16,7 @@ SHARED, LEAST = 1_000_000, 1_000
 """Most entries of all devices in a process together, about 60 bytes each; and the minimum for one device."""
 
 
-class Held(msgspec.Struct, frozen=True, gc=False):
+class DeviceValue(msgspec.Struct, frozen=True, gc=False):
     """From `t_ns` (the emulator's monotonic time) on, `tag` had the value `raw`."""
 
     number: int
@@ -25,7 +25,7 @@ class Held(msgspec.Struct, frozen=True, gc=False):
     t_ns: int
 
 
-class HeldJournal:
+class DeviceValueLog:
     """One device's journal. Consecutive equal values are one entry.
 
     Entries are stored in columns, and numbered by position, because a thousand devices in one process hold a million
@@ -73,12 +73,12 @@ class HeldJournal:
         if tag in self._last:
             changed(self._last[tag], 0)
 
-    def since(self, number: int) -> list[Held]:
+    def since(self, number: int) -> list[DeviceValue]:
         """Return the entries after entry `number`, as far as they are kept."""
         count = min(self.number - number, len(self._tags))
         numbers = range(self.number, self.number - count, -1)
         newest = zip(numbers, reversed(self._tags), reversed(self._raws), reversed(self._times), strict=False)
-        return [Held(*entry) for entry in newest][::-1]
+        return [DeviceValue(*entry) for entry in newest][::-1]
 
 
 def share_of(devices: int) -> int:

@@ -11,10 +11,10 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from fieldtwin.emulators.codec import encode
-from fieldtwin.emulators.context import WhenUsedUp
+from fieldtwin.emulators.context import EndOfRecording
 from fieldtwin.emulators.distortion import Distortions
 from fieldtwin.emulators.emulator import emulator_kind
-from fieldtwin.emulators.journal import HeldJournal
+from fieldtwin.emulators.journal import DeviceValueLog
 from fieldtwin.emulators.replay.counters import CounterSpan
 from fieldtwin.emulators.replay.profiled import ProfiledReplay
 from fieldtwin.emulators.replay.replay import ExchangeReplay
@@ -30,7 +30,9 @@ MOST_COUNTED = 4
 """Most registers that a counter may have."""
 
 
-def load_replay(profile: DeviceProfile, path: Path, at_end: WhenUsedUp = WhenUsedUp.HOLD) -> tuple[ExchangeReplay, int]:
+def load_replay(
+    profile: DeviceProfile, path: Path, at_end: EndOfRecording = EndOfRecording.HOLD
+) -> tuple[ExchangeReplay, int]:
     """Return a recording of exchanges with a device of `profile`, and its unit ID in the recording.
 
     That is the factory's unit ID if it was recorded, else the lowest. Raises `FileInvalid`.
@@ -68,7 +70,7 @@ class RecordedDevice(ProfiledReplay):
         super().__init__(profile, replay, unit_id, name)
         end, self._line = wire(kind)
         self.emulator = emulator_kind(end.type, profile)(end, profile, replay.context, super().respond)
-        self.journal = HeldJournal()
+        self.journal = DeviceValueLog()
         self.distortions = Distortions()
         """Value faults of its answers to reads."""
         self.unlisted = 0

@@ -14,7 +14,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Protocol
 
-from fieldtwin.emulators.context import UsedUp, WhenUsedUp
+from fieldtwin.emulators.context import EndOfRecording, UsedUp
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.gateway.core.files.recording import RecordingReader, SignalRow
@@ -172,7 +172,7 @@ class SignalPlayer(Signals):
     """
 
     def __init__(
-        self, track: SignalTrack, start_ns: int, *, speed: float = 1.0, at_end: WhenUsedUp = WhenUsedUp.HOLD
+        self, track: SignalTrack, start_ns: int, *, speed: float = 1.0, at_end: EndOfRecording = EndOfRecording.HOLD
     ) -> None:
         if not (speed > 0 and math.isfinite(speed)):
             raise UsageError("a recording cannot be played at that speed", expected="more than 0", got=str(speed))
@@ -189,9 +189,9 @@ class SignalPlayer(Signals):
         first, last = self.track.first_s, self.track.last_s
         if t_s <= last:
             return t_s
-        if self.at_end is WhenUsedUp.ERROR:
+        if self.at_end is EndOfRecording.ERROR:
             raise UsedUp("the recording has ended", path=self.track.path, got=f"{t_s:.3f} s of {last:.3f} s")
-        if self.at_end is WhenUsedUp.LOOP and last > first:
+        if self.at_end is EndOfRecording.LOOP and last > first:
             return first + math.fmod(t_s - first, last - first)
         return last
 

@@ -8,7 +8,7 @@ from typing import NoReturn
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
 
-from fieldtwin.gateway.core.escaping import visible
+from fieldtwin.gateway.core.escaping import escape_controls
 
 
 class _Console(Console):
@@ -21,16 +21,16 @@ class _Console(Console):
         """As rich does, but control characters in a text are shown and never sent: a name in a stranger's file could otherwise
         clear the screen or retitle the terminal."""
         for segment in super().render(renderable, options):
-            text = segment.text if segment.control is not None else visible(segment.text)
+            text = segment.text if segment.control is not None else escape_controls(segment.text)
             yield segment if text is segment.text else Segment(text, segment.style)
 
 
 # emoji=False: `model.py:Boom:` in a text is a user's class, and no picture of an explosion.
-talk = _Console(stderr=True, highlight=False, emoji=False)
-data = _Console(highlight=False, emoji=False)
+stderr = _Console(stderr=True, highlight=False, emoji=False)
+stdout = _Console(highlight=False, emoji=False)
 
 
 def show_warnings(warnings: Iterable[str]) -> None:
     """What the author of a file should know, one line each on stderr."""
     for warning in warnings:
-        talk.print(f"warning: {warning}", style="yellow", soft_wrap=True, markup=False)
+        stderr.print(f"warning: {warning}", style="yellow", soft_wrap=True, markup=False)

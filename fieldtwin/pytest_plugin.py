@@ -16,7 +16,7 @@ import pytest
 
 if TYPE_CHECKING:
     from fieldtwin.testing.handles import Device, Plc, Prototype
-    from fieldtwin.testing.outcome import Outcome
+    from fieldtwin.testing.outcome import ScenarioOutcome
     from fieldtwin.testing.results import Results
     from fieldtwin.testing.runner import Runner
     from fieldtwin.testing.running_plc import RunningPlc
@@ -28,7 +28,7 @@ MARKER = "fieldtwin"
 _RUNNER: pytest.StashKey[Runner] = pytest.StashKey()
 _RESULTS: pytest.StashKey[Results] = pytest.StashKey()
 _WIRES: pytest.StashKey[list[Wire]] = pytest.StashKey()
-_OUTCOMES: pytest.StashKey[list[Outcome]] = pytest.StashKey()
+_OUTCOMES: pytest.StashKey[list[ScenarioOutcome]] = pytest.StashKey()
 _SHOWN = 20
 
 
@@ -247,10 +247,10 @@ def plc(request: pytest.FixtureRequest) -> Iterator[Plc | RunningPlc]:
 
 
 @pytest.fixture
-def scenario(request: pytest.FixtureRequest) -> Callable[..., Outcome]:
+def scenario(request: pytest.FixtureRequest) -> Callable[..., ScenarioOutcome]:
     """Runs scenario files, beside the test: ``assert scenario("pump.scenario.yaml", seed=3)``."""
 
-    def run(path: str | Path, seed: int | None = None, target: str = "") -> Outcome:
+    def run(path: str | Path, seed: int | None = None, target: str = "") -> ScenarioOutcome:
         from fieldtwin.testing.outcome import run_scenario
 
         config = request.config

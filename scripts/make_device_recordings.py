@@ -21,7 +21,7 @@ if str(ROOT) not in sys.path:  # run as a file, the checkout's packages are not 
 
 from fieldtwin.emulators.codec import encode  # noqa: E402
 from fieldtwin.gateway.core.files.profile import READ_FUNCTION, DeviceProfile, load_profile  # noqa: E402
-from fieldtwin.gateway.core.files.recording import Exchange, RecordingHeader, RecordingWriter, SignalInfo  # noqa: E402
+from fieldtwin.gateway.core.files.recording import RecordedExchange, RecordingHeader, RecordingWriter, SignalInfo  # noqa: E402
 
 DEFAULT_SEED = 1
 ROUNDS = 20
@@ -228,12 +228,14 @@ def _round(
             if profile.form.trigger is not None and tag.name == profile.form.trigger.tag:
                 data = at.address.to_bytes(2) + b"\x00\x01"
                 request = b"\x10" + data + b"\x02" + profile.form.trigger.value.to_bytes(2)
-                writer.exchange(Exchange(round(t_s, 3), unit, request, b"\x10" + data, latency_s))
+                writer.exchange(RecordedExchange(round(t_s, 3), unit, request, b"\x10" + data, latency_s))
             continue
         words = encode(values[tag.name], tag.type, tag.order, registers=at.count)
         request = bytes([READ_FUNCTION[at.table]]) + at.address.to_bytes(2) + at.count.to_bytes(2)
         body = b"".join(w.to_bytes(2) for w in words)
-        writer.exchange(Exchange(round(t_s, 3), unit, request, request[:1] + bytes([len(body)]) + body, latency_s))
+        writer.exchange(
+            RecordedExchange(round(t_s, 3), unit, request, request[:1] + bytes([len(body)]) + body, latency_s)
+        )
         t_s += 0.05
 
 

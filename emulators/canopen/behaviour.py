@@ -70,7 +70,7 @@ class Situation(msgspec.Struct, frozen=True):
     nmt: NmtState = NmtState.PRE_OPERATIONAL
 
 
-class Outcome(msgspec.Struct, frozen=True):
+class ModelOutput(msgspec.Struct, frozen=True):
     """The output of a model. Objects that the node does not have are ignored; numbers are rounded and limited to their
     type.
 
@@ -100,7 +100,7 @@ class DeviceModel(ABC):
         return None
 
     @abstractmethod
-    def step(self, situation: Situation) -> Outcome:
+    def step(self, situation: Situation) -> ModelOutput:
         """Advance the device to the present time.
 
         Called when it requested, after writes, and before each read; time never goes back.

@@ -18,7 +18,7 @@ from fieldtwin.emulators.wires.can_faults import Rule
 from fieldtwin.gateway.core.can_error import CanErrorState, state_frame, violation_frame
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.clock import NS_PER_S
-from fieldtwin.gateway.core.connection import CANConnection, closed_here
+from fieldtwin.gateway.core.connection import CANConnection, closed_locally
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import ConnectionLost, FieldtwinError
 
@@ -312,7 +312,7 @@ class AttachedConnection(TellsOverrun):
 
     async def aclose(self) -> None:
         self._runner.leave(self._node)
-        self.feed_lost(closed_here(self.endpoint))
+        self.feed_lost(closed_locally(self.endpoint))
         self.inbound.data_stream.clear()
         self._room.set()
 

@@ -19,7 +19,7 @@ from fieldtwin.emulators.endpoints.bus_hello import WANTS_CONFIRMATIONS, WANTS_E
 from fieldtwin.emulators.endpoints.overrun import TellsOverrun
 from fieldtwin.gateway.core.canframe import RECORD_SIZE, CanFrame, pack_record, unpack_record
 from fieldtwin.gateway.core.clock import NS_PER_S
-from fieldtwin.gateway.core.connection import CANConnection, CanConnection, closed_here
+from fieldtwin.gateway.core.connection import CANConnection, CanConnection, closed_locally
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import (
     ConnectionLost,
@@ -144,7 +144,7 @@ class SoftBusEnd(TellsOverrun):
                 await asyncio.wait_for(self._all_sent.wait(), CLOSE_TIMEOUT_S)
             except TimeoutError:
                 pass  # a slow bus: it sends the rest after this node has left
-        self._end(closed_here(self.endpoint))
+        self._end(closed_locally(self.endpoint))
         self.inbound.data_stream.clear()
         self._task.cancel()
         await asyncio.gather(self._task, return_exceptions=True)
@@ -244,7 +244,7 @@ class KernelCanEnd(TellsOverrun):
             raise self._loss()
 
     async def aclose(self) -> None:
-        self._end(closed_here(self.endpoint))
+        self._end(closed_locally(self.endpoint))
         self.inbound.data_stream.clear()
 
     def _read_some(self) -> None:

@@ -13,7 +13,7 @@ from typing import Any
 from fieldtwin.emulators.endpoints.pty import PtyEnd
 from fieldtwin.emulators.endpoints.socket_end import SocketEnd
 from fieldtwin.emulators.faults.engine import WireFaults, in_time
-from fieldtwin.emulators.faults.fault import Active, Hang, Outcome, Piece, WireFault
+from fieldtwin.emulators.faults.fault import Active, FaultEffect, Hang, Piece, WireFault
 from fieldtwin.emulators.faults.frames import FLUSH_S, Assembler, Frame, Way
 from fieldtwin.emulators.virtual.memory_stream import MemoryEnd
 from fieldtwin.gateway.core.clock import NS_PER_S
@@ -141,7 +141,7 @@ class FaultyEnd(ByteConnection):
         if frame.pdu:
             self._asked = frame
         outcome = self._faults.decide(frame, self._now_ns())
-        for piece in self._carry_out(Way.REQUEST, outcome or Outcome((Piece(frame.data),))):
+        for piece in self._carry_out(Way.REQUEST, outcome or FaultEffect((Piece(frame.data),))):
             self._pass_in(piece)
 
     def _flush_later(self) -> None:
@@ -171,12 +171,12 @@ class FaultyEnd(ByteConnection):
             if self._asked is not None:
                 frame = replace(frame, address=self._asked.address, count=self._asked.count)
             outcome = self._faults.decide(frame, self._now_ns())
-            out += self._carry_out(Way.REPLY, outcome or Outcome((Piece(frame.data),)), after_s)
+            out += self._carry_out(Way.REPLY, outcome or FaultEffect((Piece(frame.data),)), after_s)
         return out
 
     # -- carrying out ---------------------------------------------------------------------------------------------------
 
-    def _carry_out(self, way: Way, outcome: Outcome, after_s: float = 0.0) -> list[bytes]:
+    def _carry_out(self, way: Way, outcome: FaultEffect, after_s: float = 0.0) -> list[bytes]:
         """Return the pieces to send immediately; schedule those with a delay or the opposite direction."""
         now_ns = self._now_ns()
         at_once: list[bytes] = []

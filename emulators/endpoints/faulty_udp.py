@@ -12,7 +12,7 @@ from dataclasses import replace
 
 from fieldtwin.emulators.endpoints.ports import Datagrams
 from fieldtwin.emulators.faults.engine import WireFaults
-from fieldtwin.emulators.faults.fault import Outcome, Piece
+from fieldtwin.emulators.faults.fault import FaultEffect, Piece
 from fieldtwin.emulators.faults.frames import Way, understood
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.endpoint import Endpoint
@@ -50,7 +50,7 @@ class FaultyDatagrams(Datagrams):
         address, count = self._asked.pop(peer, (-1, -1))
         frame = replace(understood(Way.REPLY, self._faults.framing, data), address=address, count=count)
         outcome = self._faults.decide(frame, round(self._loop.time() * NS_PER_S))
-        for piece in (outcome or Outcome((Piece(data),))).pieces:
+        for piece in (outcome or FaultEffect((Piece(data),))).pieces:
             if piece.back:
                 self._pass_in(piece.data, peer)
             elif piece.delay_s > 0:
@@ -102,7 +102,7 @@ class FaultyDatagrams(Datagrams):
                 if len(self._asked) < MOST_WAITING:
                     self._asked[peer] = frame.address, frame.count
                 outcome = self._faults.decide(frame, round(self._loop.time() * NS_PER_S))
-                for piece in (outcome or Outcome((Piece(data),))).pieces:
+                for piece in (outcome or FaultEffect((Piece(data),))).pieces:
                     if piece.back:
                         self._send(piece.data, peer)
                     elif piece.delay_s > 0:

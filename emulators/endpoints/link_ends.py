@@ -12,7 +12,7 @@ import os
 import socket
 from typing import Any
 
-from fieldtwin.gateway.core.connection import ByteConnection, RS232Connection, TCPConnection, closed_here
+from fieldtwin.gateway.core.connection import ByteConnection, RS232Connection, TCPConnection, closed_locally
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import (
     ConnectionLost,
@@ -84,7 +84,7 @@ class TcpEnd(ByteConnection):
             self.wire.transport.write_eof()
 
     async def aclose(self) -> None:
-        self.feed_lost(closed_here(self.endpoint))
+        self.feed_lost(closed_locally(self.endpoint))
         self.inbound.data_stream.clear()
         self.wire.transport.close()
         try:
@@ -274,7 +274,7 @@ class TtyEnd(ByteConnection):
                 self._end(ConnectionLost(f"the serial device is gone: {e.strerror}", where=str(self.endpoint)))
 
     async def aclose(self) -> None:
-        self._end(closed_here(self.endpoint))
+        self._end(closed_locally(self.endpoint))
         self.inbound.data_stream.clear()
 
     def on_room(self) -> None:

@@ -17,7 +17,7 @@ from fieldtwin.emulators.endpoints.ports import OnClient
 from fieldtwin.emulators.virtual.loop import VirtualLoop
 from fieldtwin.emulators.virtual.memory_stream import MemoryEnd, MemoryWire
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
-from fieldtwin.gateway.core.connection import ByteConnection, CanConnection, Client, closed_here
+from fieldtwin.gateway.core.connection import ByteConnection, CanConnection, Client, closed_locally
 from fieldtwin.gateway.core.endpoint import Endpoint, SerialSettings
 from fieldtwin.gateway.core.errors import Bug, ConnectionLost, EndpointBusy, Unreachable, UsageError
 
@@ -153,7 +153,7 @@ class _SerialPort:
         self._pace = pace
         self._plant = plant
         self._wire = net._wire(plant, plant, pace, serial=True)
-        self._wire.near.feed_lost(closed_here(plant))
+        self._wire.near.feed_lost(closed_locally(plant))
         self.field: MemoryEnd = self._wire.far
 
     def plug_in(self) -> MemoryEnd:
@@ -236,7 +236,7 @@ class MemoryDatagrams:
     async def receive(self) -> tuple[bytes, tuple[str, int]]:
         while not self._pending:
             if self._closed:
-                raise closed_here(self.bound)
+                raise closed_locally(self.bound)
             if self._waiter is not None:
                 raise Bug("two readers on one socket", where=str(self.bound))
             self._waiter = self._net.loop.create_future()
@@ -274,4 +274,4 @@ class MemoryBus:
 
     async def aclose(self) -> None:
         self._net._buses.pop(str(self.bound), None)
-        self._runner.close(closed_here(self.bound))
+        self._runner.close(closed_locally(self.bound))

@@ -13,7 +13,7 @@ from fieldtwin.emulators.endpoints.faulty import FaultyEnd
 from fieldtwin.emulators.endpoints.ports import Datagrams
 from fieldtwin.emulators.endpoints.pty import PtyEnd
 from fieldtwin.emulators.endpoints.socket_end import SocketEnd
-from fieldtwin.emulators.modbus.line import Exchange, LineSlave
+from fieldtwin.emulators.modbus.line import LineSlave, ServedFrame
 from fieldtwin.emulators.modbus.mbap import MbapSlave
 from fieldtwin.gateway.core.clock import NS_PER_S, Clock
 from fieldtwin.gateway.core.connection import ByteConnection, Direction
@@ -25,7 +25,7 @@ OnFrame = Callable[[Direction, int, bytes], None]
 is monotonic: when the request was complete, or when the last byte of the reply was handed over. It may not raise.
 """
 
-Latency = Callable[[Exchange], float]
+Latency = Callable[[ServedFrame], float]
 """Processing time of a device for one exchange, in seconds."""
 
 
@@ -141,7 +141,7 @@ async def _read_or_silence(connection: ByteConnection, slave: LineSlave) -> byte
 
 async def _reply(
     send: Callable[[bytes], Awaitable[None]],
-    exchanges: list[Exchange],
+    exchanges: list[ServedFrame],
     clock: Clock,
     now_ns: int,
     latency_s: float | Latency,
@@ -164,7 +164,7 @@ async def _reply(
 
 async def _reply_on_line(
     end: PtyEnd | FaultyEnd,
-    exchanges: list[Exchange],
+    exchanges: list[ServedFrame],
     clock: Clock,
     now_ns: int,
     latency_s: float | Latency,
@@ -182,6 +182,6 @@ async def _reply_on_line(
                 on_frame(Direction.RECEIVED, clock.monotonic_ns(), exchange.reply)
 
 
-def _tell_heard(exchanges: list[Exchange], now_ns: int, on_frame: OnFrame) -> None:
+def _tell_heard(exchanges: list[ServedFrame], now_ns: int, on_frame: OnFrame) -> None:
     for exchange in exchanges:  # all of them arrived before any was answered
         on_frame(Direction.SENT, now_ns, exchange.heard)

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from fieldtwin.emulators.wires.serial_line import SerialPacer
 from fieldtwin.gateway.core.clock import NS_PER_S
-from fieldtwin.gateway.core.connection import ByteConnection, RS232Connection, closed_here
+from fieldtwin.gateway.core.connection import ByteConnection, RS232Connection, closed_locally
 from fieldtwin.gateway.core.endpoint import Endpoint, SerialSettings
 from fieldtwin.gateway.core.errors import ConnectionLost, EndpointBusy, Unreachable
 
@@ -117,7 +117,7 @@ class PtyEnd(ByteConnection):
     async def aclose(self) -> None:
         """Close the port; remove the link unless a different port has replaced it."""
         if self.lost is None:
-            self.feed_lost(closed_here(self.endpoint))
+            self.feed_lost(closed_locally(self.endpoint))
         self._close()
 
     def on_room(self) -> None:
@@ -192,7 +192,7 @@ class PtyEnd(ByteConnection):
     async def _hand_over(self, data: bytes) -> None:
         while data:
             if self._master < 0:
-                raise self.lost or closed_here(self.endpoint)
+                raise self.lost or closed_locally(self.endpoint)
             try:
                 data = data[os.write(self._master, data) :]
             except BlockingIOError:

@@ -13,7 +13,7 @@ from collections.abc import Awaitable, Callable
 from typing import Any, cast
 
 from fieldtwin.emulators.endpoints.tls_server import client_role, make_context
-from fieldtwin.gateway.core.connection import ByteConnection, TCPConnection, closed_here
+from fieldtwin.gateway.core.connection import ByteConnection, TCPConnection, closed_locally
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import ConnectionLost, EndpointBusy, Unreachable, os_reason
 
@@ -87,7 +87,7 @@ class SocketEnd(ByteConnection, asyncio.BufferedProtocol):
 
     async def aclose(self) -> None:
         """Send buffered bytes and close, within a second; bytes that the client has not taken by then are dropped."""
-        self.feed_lost(closed_here(self.endpoint))
+        self.feed_lost(closed_locally(self.endpoint))
         if self._transport is None or self._closed.done():
             return
         self._transport.close()
@@ -112,7 +112,7 @@ class SocketEnd(ByteConnection, asyncio.BufferedProtocol):
 
     def _raise_if_gone(self) -> None:
         if self._transport is None or self._transport.is_closing():
-            raise self.lost or closed_here(self.endpoint)
+            raise self.lost or closed_locally(self.endpoint)
 
     # -- called by asyncio ----------------------------------------------------------------------------------------
 

@@ -12,7 +12,7 @@ import socket
 from collections import deque
 from typing import cast
 
-from fieldtwin.gateway.core.connection import closed_here
+from fieldtwin.gateway.core.connection import closed_locally
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import Bug, ConnectionLost, EndpointBusy, Unreachable, os_reason
 
@@ -76,7 +76,7 @@ class UdpEnd(asyncio.DatagramProtocol):
     async def send(self, data: bytes, peer: Peer) -> None:
         """Send `data` to `peer`, without a delivery report. Raises `ConnectionLost` once this end is closed."""
         if self._lost is not None or self._transport is None:
-            raise self._lost or closed_here(self.endpoint)
+            raise self._lost or closed_locally(self.endpoint)
         if self._full:  # 64 KiB already wait (asyncio's limit)
             self.dropped += 1
             return
@@ -84,7 +84,7 @@ class UdpEnd(asyncio.DatagramProtocol):
 
     async def aclose(self) -> None:
         """Close the socket. Closing twice does nothing."""
-        self._end(closed_here(self.endpoint))
+        self._end(closed_locally(self.endpoint))
         if self._transport is not None:
             self._transport.abort()
             await asyncio.shield(self._closed)

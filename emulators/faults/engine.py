@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 
-from fieldtwin.emulators.faults.fault import Active, Hang, Outcome, Piece, WireFault, passed
+from fieldtwin.emulators.faults.fault import Active, FaultEffect, Hang, Piece, WireFault, passed
 from fieldtwin.emulators.faults.frames import Frame, Framing, Way, understood
 
 
@@ -53,12 +53,12 @@ class WireFaults:
             active.struck += 1
         return bool(refusing)
 
-    def decide(self, frame: Frame, now_ns: int) -> Outcome | None:
+    def decide(self, frame: Frame, now_ns: int) -> FaultEffect | None:
         """Return the effect on the frame, or None if no fault strikes it.
 
         Faults are applied in the order in which they were put in, except that faults which divide the frame come last.
         """
-        outcome: Outcome | None = None
+        outcome: FaultEffect | None = None
         if frame.spared:
             return None
         dividing: list[tuple[Active, WireFault]] = []
@@ -78,14 +78,14 @@ def in_time(active: Active, now_ns: int) -> bool:
     return active.from_ns <= now_ns and (active.until_ns is None or now_ns < active.until_ns)
 
 
-def _struck(before: Outcome | None, frame: Frame, fault: WireFault, active: Active) -> Outcome:
+def _struck(before: FaultEffect | None, frame: Frame, fault: WireFault, active: Active) -> FaultEffect:
     """Apply a fault, and count it as struck if it changed anything."""
     after = _joined(before, frame, fault, active)
     active.struck += after != (before or passed(frame.data))
     return after
 
 
-def _joined(before: Outcome | None, frame: Frame, fault: WireFault, active: Active) -> Outcome:
+def _joined(before: FaultEffect | None, frame: Frame, fault: WireFault, active: Active) -> FaultEffect:
     if before is None:
         return fault.strike(frame, active.random)
     pieces: list[Piece] = []
@@ -100,7 +100,7 @@ def _joined(before: Outcome | None, frame: Frame, fault: WireFault, active: Acti
         )
         pieces += _later(after.pieces, piece)
         hang = hang or after.hang
-    return Outcome(tuple(pieces), hang)
+    return FaultEffect(tuple(pieces), hang)
 
 
 def _later(pieces: Iterable[Piece], behind: Piece) -> list[Piece]:

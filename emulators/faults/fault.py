@@ -48,19 +48,19 @@ class Piece:
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class FaultEffect:
     """The effect of a fault on a frame: pieces in order, and the effect on the connection after them."""
 
     pieces: tuple[Piece, ...] = ()
     hang: Hang | None = None
 
 
-def passed(*data: bytes) -> Outcome:
+def passed(*data: bytes) -> FaultEffect:
     """Return an outcome that forwards these bytes without delay."""
-    return Outcome(tuple(Piece(d) for d in data))
+    return FaultEffect(tuple(Piece(d) for d in data))
 
 
-LOST = Outcome()
+LOST = FaultEffect()
 
 
 class Aim(BaseModel):
@@ -135,7 +135,7 @@ class WireFault(Fault):
     kind = Kind.BYTES
 
     @abstractmethod
-    def strike(self, frame: Frame, random: Random) -> Outcome:
+    def strike(self, frame: Frame, random: Random) -> FaultEffect:
         """Return the effect on `frame`."""
 
     def appears(self) -> Hang | None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from fieldtwin.emulators.modbus.line import Exchange, LineSlave
+from fieldtwin.emulators.modbus.line import LineSlave, ServedFrame
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.clock import NS_PER_S
 
@@ -111,7 +111,7 @@ class AsciiSlave(LineSlave):
     def as_heard(self, frame: bytes) -> bytes:
         return _COLON + frame.hex().upper().encode("ascii") + _RETURN + self._ascii.delimiter
 
-    def _exchange(self, frame: bytes, now_ns: int) -> Exchange:
+    def _exchange(self, frame: bytes, now_ns: int) -> ServedFrame:
         exchange = super()._exchange(frame, now_ns)  # the reply still ends with the old delimiter
         unit = self.units.get(frame[0])
         if unit is not None:

@@ -20,7 +20,7 @@ BROADCAST = 0
 LOWEST_UNIT, HIGHEST_UNIT = 1, 247
 
 
-class Exchange(msgspec.Struct, frozen=True, gc=False):
+class ServedFrame(msgspec.Struct, frozen=True, gc=False):
     """A complete frame that was received, and the complete frame to send in reply; empty if there is no reply.
 
     `latency_s` is the processing time that the unit states for this reply (`ModbusUnit.latency_s`).
@@ -92,7 +92,7 @@ class LineSlave(ABC):
         """
         return [exchange.reply for exchange in self.receive(data, now_ns) if exchange.reply]
 
-    def receive(self, data: bytes, now_ns: int) -> list[Exchange]:
+    def receive(self, data: bytes, now_ns: int) -> list[ServedFrame]:
         """Do the same as `feed`, but return every received frame too, for taps and journals."""
         errors_before = self._receiver.crc_errors
         frames = self._receiver.feed(data, now_ns)
@@ -110,7 +110,7 @@ class LineSlave(ABC):
         """Return a received frame as it was on the line."""
         return frame
 
-    def _exchange(self, frame: bytes, now_ns: int) -> Exchange:
+    def _exchange(self, frame: bytes, now_ns: int) -> ServedFrame:
         for unit in self.units.values():
             unit.counters.bus_messages += 1
         heard = self.as_heard(frame)
@@ -118,17 +118,17 @@ class LineSlave(ABC):
         if unit_id == BROADCAST:
             for unit in self.units.values():
                 unit.execute_broadcast(pdu, now_ns)
-            return Exchange(heard)
+            return ServedFrame(heard)
         addressed = self.units.get(unit_id)
         if addressed is None:
-            return Exchange(heard)
+            return ServedFrame(heard)
         response = addressed.respond(pdu, now_ns)
         if response is None:
-            return Exchange(heard)
+            return ServedFrame(heard)
         if len(self.units) > 1:
             for (
                 unit
             ) in self.units.values():  # the other units hear the reply too; the sender's receiver is off meanwhile
                 if unit is not addressed:
                     unit.heard(messages=1)
-        return Exchange(heard, self.encode(bytes((unit_id,)) + response), addressed.latency_s)
+        return ServedFrame(heard, self.encode(bytes((unit_id,)) + response), addressed.latency_s)

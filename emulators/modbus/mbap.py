@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 from fieldtwin.emulators.client_counts import Counts
-from fieldtwin.emulators.modbus.line import Exchange
+from fieldtwin.emulators.modbus.line import ServedFrame
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.errors import Desync, UsageError
 
@@ -76,7 +76,7 @@ class MbapSlave:
         """Return response ADUs to the requests that are now complete, in order. Never raises, whatever `data` contains."""
         return [exchange.reply for exchange in self.receive(data, now_ns) if exchange.reply]
 
-    def receive(self, data: bytes, now_ns: int) -> list[Exchange]:
+    def receive(self, data: bytes, now_ns: int) -> list[ServedFrame]:
         """Do the same as `feed`, but return every request ADU too, for taps and journals."""
         if self.desync is not None:
             return []
@@ -84,7 +84,7 @@ class MbapSlave:
             self.requests += 1
             return [self._exchange(data, False, now_ns)]
         self._buffer += data
-        exchanges: list[Exchange] = []
+        exchanges: list[ServedFrame] = []
         while adu := self._next_adu():
             self.requests += 1
             busy = len(exchanges) >= self.max_in_flight
@@ -103,7 +103,7 @@ class MbapSlave:
             return self._reply(self._route(data[6]), data, False, now_ns)
         return b"".join(self.feed(data, now_ns))
 
-    def receive_datagram(self, data: bytes, now_ns: int) -> list[Exchange]:
+    def receive_datagram(self, data: bytes, now_ns: int) -> list[ServedFrame]:
         """Do the same as `receive`, for a datagram: an ADU that is incomplete at its end is dropped, and no state is kept."""
         exchanges = self.receive(data, now_ns)
         self.discarded += bool(self._buffer)
@@ -131,10 +131,10 @@ class MbapSlave:
         del buffer[:at]  # only once, so that a flood of invalid ADUs costs one deletion
         return adu
 
-    def _exchange(self, adu: bytes, busy: bool, now_ns: int) -> Exchange:
+    def _exchange(self, adu: bytes, busy: bool, now_ns: int) -> ServedFrame:
         unit = self._route(adu[6])
         reply = self._reply(unit, adu, busy, now_ns)
-        return Exchange(adu, reply, unit.latency_s if unit is not None and reply else 0.0)
+        return ServedFrame(adu, reply, unit.latency_s if unit is not None and reply else 0.0)
 
     def _reply(self, unit: ModbusUnit | None, adu: bytes, busy: bool, now_ns: int) -> bytes:
         """Return the complete response, or an empty byte string for silence."""

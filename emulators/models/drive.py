@@ -13,7 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from fieldtwin.emulators.canopen.aborts import Abort
-from fieldtwin.emulators.canopen.behaviour import DeviceModel, Number, Objects, Outcome, Situation
+from fieldtwin.emulators.canopen.behaviour import DeviceModel, ModelOutput, Number, Objects, Situation
 from fieldtwin.emulators.canopen.dictionary import Key
 from fieldtwin.emulators.models import drive_objects as od
 from fieldtwin.emulators.models.drive_homing import METHODS, Axis, Speeds, Way, plan
@@ -117,7 +117,7 @@ class Drive(DeviceModel):
         codes = od.OPTIONS.get(key[0]) if key[1] == 0 else None
         return None if codes is None or int(value) in codes else Abort.VALUE
 
-    def step(self, situation: Situation) -> Outcome:
+    def step(self, situation: Situation) -> ModelOutput:
         now_ns, objects = situation.now_ns, situation.objects
         self._by_itself(now_ns, objects)
         self._mind_errors(situation)
@@ -382,7 +382,7 @@ class Drive(DeviceModel):
 
     # -- values of the objects ----------------------------------------------------------------------------------------
 
-    def _outcome(self, situation: Situation, clears: tuple[int, ...]) -> Outcome:
+    def _outcome(self, situation: Situation, clears: tuple[int, ...]) -> ModelOutput:
         now_ns, objects = situation.now_ns, situation.objects
         x, v = self._motion.at((now_ns - self._began_ns) / NS_PER_S)
         in_fault = self.state in (DriveState.FAULT, DriveState.FAULT_REACTION)
@@ -405,7 +405,7 @@ class Drive(DeviceModel):
         recorded = situation.played.keys()
         end_ns = self._end_ns()
         wakes = [t for t in (self._ready_ns, end_ns if end_ns > now_ns else None) if t is not None]
-        return Outcome(
+        return ModelOutput(
             {key: value for key, value in states.items() if key not in recorded},
             {key: value for key, value in readings.items() if key not in recorded},
             clears,

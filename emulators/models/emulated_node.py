@@ -14,7 +14,7 @@ from fieldtwin.emulators.canopen.dictionary import Dictionary, Key, load_eds
 from fieldtwin.emulators.canopen.node import CanopenNode, NodeContext
 from fieldtwin.emulators.canopen.remarks import Remark, remarks
 from fieldtwin.emulators.distortion import Distortions
-from fieldtwin.emulators.journal import HeldJournal
+from fieldtwin.emulators.journal import DeviceValueLog
 from fieldtwin.emulators.models.by_profile import NO_MODEL, model_for
 from fieldtwin.emulators.models.distorted_objects import DistortedObjects
 from fieldtwin.emulators.models.drive import Drive
@@ -47,7 +47,7 @@ class EmulatedNode:
     """
 
     node: CanopenNode
-    journal: HeldJournal
+    journal: DeviceValueLog
     distortions: Distortions
     remarks: Sequence[Remark] = ()
 

@@ -9,7 +9,7 @@ shaft in steps, 6501h per turn.
 from __future__ import annotations
 
 from fieldtwin.emulators.canopen.aborts import Abort
-from fieldtwin.emulators.canopen.behaviour import DeviceModel, Number, Objects, Outcome, Situation
+from fieldtwin.emulators.canopen.behaviour import DeviceModel, ModelOutput, Number, Objects, Situation
 from fieldtwin.emulators.canopen.dictionary import Key
 from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
 
@@ -48,7 +48,7 @@ class Encoder(DeviceModel):
             return Abort.VALUE_HIGH if value else Abort.VALUE_LOW
         return None
 
-    def step(self, situation: Situation) -> Outcome:
+    def step(self, situation: Situation) -> ModelOutput:
         objects = situation.objects
         shaft = round(situation.played.get((POSITION, 0), 0))
         raw = _raw_position(shaft, objects)
@@ -58,7 +58,7 @@ class Encoder(DeviceModel):
         self._take_speed(raw, situation)
         parameters = objects.whole(PARAMETERS) & (COUNTER_CLOCKWISE | SCALING)
         states = {(OPERATING_STATUS, 0): parameters, (OFFSET, 0): self._offset}
-        return Outcome(states, {(POSITION, 0): position, (SPEED, 1): self._speed})
+        return ModelOutput(states, {(POSITION, 0): position, (SPEED, 1): self._speed})
 
     def _take_speed(self, raw: int, situation: Situation) -> None:
         now_ns, whole = situation.now_ns, _range(situation.objects)

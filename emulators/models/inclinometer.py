@@ -8,7 +8,7 @@ measures.
 
 from __future__ import annotations
 
-from fieldtwin.emulators.canopen.behaviour import DeviceModel, Number, Outcome, Situation
+from fieldtwin.emulators.canopen.behaviour import DeviceModel, ModelOutput, Number, Situation
 from fieldtwin.emulators.canopen.dictionary import Key
 
 SLOPES = (0x6010, 0x6020)
@@ -30,7 +30,7 @@ class Inclinometer(DeviceModel):
     def power_on(self, situation: Situation) -> None:
         self._offsets = {slope: situation.objects.whole(slope + _OFFSET) for slope in SLOPES}
 
-    def step(self, situation: Situation) -> Outcome:
+    def step(self, situation: Situation) -> ModelOutput:
         objects, played, written = situation.objects, situation.played, situation.written
         states: dict[Key, Number] = {}
         readings: dict[Key, Number] = {}
@@ -50,4 +50,4 @@ class Inclinometer(DeviceModel):
             offset = self._offsets.get(slope, 0)
             readings[reading] = measured + (offset + differential if parameter & SCALED else 0)
             states[offset_key] = offset
-        return Outcome(states, readings)
+        return ModelOutput(states, readings)

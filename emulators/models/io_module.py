@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from fieldtwin.emulators.canopen.behaviour import DeviceModel, Number, Objects, Outcome, Situation
+from fieldtwin.emulators.canopen.behaviour import DeviceModel, ModelOutput, Number, Objects, Situation
 from fieldtwin.emulators.canopen.dictionary import Key
 from fieldtwin.emulators.canopen.service import NmtState
 from fieldtwin.gateway.core.clock import NS_PER_MS
@@ -40,14 +40,14 @@ class IoModule(DeviceModel):
         self._inputs.clear()
         self._told.clear()
 
-    def step(self, situation: Situation) -> Outcome:
+    def step(self, situation: Situation) -> ModelOutput:
         self._set_outputs(situation)
         states: dict[Key, Number] = {}
         readings: dict[Key, Number] = {}
         for key, value, event in (*self._digital(situation), *self._analogue(situation)):
             (states if event else readings)[key] = value
         scanning = situation.nmt is NmtState.OPERATIONAL and bool(situation.played)
-        return Outcome(states, readings, (), situation.now_ns + SCAN_NS if scanning else None)
+        return ModelOutput(states, readings, (), situation.now_ns + SCAN_NS if scanning else None)
 
     def _digital(self, situation: Situation) -> Iterator[tuple[Key, int, bool]]:
         """Yield each group of eight inputs with its value, and whether the masks let its change cause an interrupt."""

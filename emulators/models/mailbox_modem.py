@@ -13,9 +13,9 @@ from collections.abc import Mapping, Sequence
 from random import Random
 
 from fieldtwin.emulators.codec import encode
-from fieldtwin.emulators.journal import HeldJournal
+from fieldtwin.emulators.journal import DeviceValueLog
 from fieldtwin.emulators.modbus.bank import IllegalValue, MapBank, RegisterBank, Span, Table
-from fieldtwin.emulators.models.packet_link import TAME, Incoming, Outgoing, PacketLink, Untamed
+from fieldtwin.emulators.models.packet_link import TAME, Incoming, LinkImpairments, Outgoing, PacketLink
 from fieldtwin.emulators.stated import bytes_of, cells_held
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.core.files.profile import Box, DeviceProfile, RegisterRange, Tag
@@ -40,7 +40,7 @@ class MailboxModem(RegisterBank):
         if profile.inbox is None or profile.outbox is None:
             raise FileInvalid("the profile has no mailbox", path=profile.path, expected="`mailbox:`")
         self._inbox, self._outbox = profile.inbox, profile.outbox
-        self.journal = HeldJournal()
+        self.journal = DeviceValueLog()
         self._outgoing, self._incoming = outgoing, incoming
         self._tags = profile.tags
         self._cells = MapBank(_spans(profile), self._on_write)
@@ -157,7 +157,7 @@ class ModemPair:
         latency_s: float,
         loss: float,
         seed: int,
-        untamed: Untamed = TAME,
+        untamed: LinkImpairments = TAME,
         identity: Mapping[str, str] | None = None,
     ) -> None:
         up = PacketLink(bytes_per_s, latency_s, loss, Random(f"{seed} up"), untamed=untamed)

@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable
 
 from fieldtwin.emulators.canopen.aborts import Abort
-from fieldtwin.emulators.canopen.behaviour import DeviceModel, Number, Objects, Outcome, Situation
+from fieldtwin.emulators.canopen.behaviour import DeviceModel, ModelOutput, Number, Objects, Situation
 from fieldtwin.emulators.canopen.dictionary import Key
 
 FIELD_VALUE, OPERATING_MODE = 0x6100, 0x6112
@@ -47,12 +47,12 @@ class MeasuringDevice(DeviceModel):
             return Abort.INCOMPATIBLE  # two points with the same field value do not define a line
         return None
 
-    def step(self, situation: Situation) -> Outcome:
+    def step(self, situation: Situation) -> ModelOutput:
         readings: dict[Key, Number] = {}
         states: dict[Key, Number] = {}
         for sub in situation.objects.channels(PROCESS_VALUE):
             self._channel(sub, situation, readings, states)
-        return Outcome(states, readings)
+        return ModelOutput(states, readings)
 
     def _channel(self, sub: int, situation: Situation, readings: dict[Key, Number], states: dict[Key, Number]) -> None:
         objects = situation.objects

@@ -2,7 +2,7 @@
 
 Packets are sent one after the other at `bytes_per_s`, arrive `latency_s` after their last byte, and are lost with
 probability `loss`. The sender detects a loss by the missing acknowledgement and resends. Packets are therefore late but
-never lost, unless the link is configured to be worse (`Untamed`). Seeded, and a function of time: the arrival of a
+never lost, unless the link is configured to be worse (`LinkImpairments`). Seeded, and a function of time: the arrival of a
 packet is known when it is sent.
 """
 
@@ -46,7 +46,7 @@ class ModemEnd(Outgoing, Incoming, Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Untamed:
+class LinkImpairments:
     """Faults of the link that the modems do not correct, as probabilities per packet: it never arrives, it arrives twice, or it
     arrives before its predecessor.
     """
@@ -56,7 +56,7 @@ class Untamed:
     overtakes: float = 0.0
 
 
-TAME = Untamed()
+TAME = LinkImpairments()
 
 
 class PacketLink:
@@ -69,7 +69,7 @@ class PacketLink:
         loss: float,
         random: Random,
         capacity: int = 8,
-        untamed: Untamed = TAME,
+        untamed: LinkImpairments = TAME,
     ) -> None:
         self._bytes_per_s = bytes_per_s
         self._latency_ns = round(latency_s * NS_PER_S)

@@ -9,7 +9,7 @@ from math import isnan
 from fieldtwin.emulators.canopen.codec import encode, held_encoder, integer_range
 from fieldtwin.emulators.canopen.dictionary import Dictionary
 from fieldtwin.emulators.distortion import Distortions
-from fieldtwin.emulators.journal import HeldJournal
+from fieldtwin.emulators.journal import DeviceValueLog
 from fieldtwin.emulators.signals import Signals
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.core.files.profile import Tag
@@ -88,7 +88,7 @@ class HeldObjects:
     """Journals the values of a node's objects by the profile's tags: `NodeContext.held` of a node in a prototype run."""
 
     def __init__(self, tags: Iterable[Tag]) -> None:
-        self.journal = HeldJournal()
+        self.journal = DeviceValueLog()
         self._names: dict[Key, list[str]] = {}
         for tag in tags:
             if tag.object is not None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 
-from fieldtwin.emulators.journal import HeldJournal
+from fieldtwin.emulators.journal import DeviceValueLog
 from fieldtwin.emulators.modbus.bank import IllegalValue, MapBank, RegisterBank, Table
 from fieldtwin.emulators.modbus.unit import Handler, ModbusUnit
 from fieldtwin.emulators.stated import Effects, bytes_of, cells_held, cells_of, fits, merged, spans_of, touches
@@ -20,7 +20,7 @@ from fieldtwin.gateway.core.files.profile import DeviceProfile, OwnFunction, Tag
 _WHOLE = re.compile(r"[1-9][0-9]{0,18}|0|0x[0-9a-fA-F]{1,16}")
 
 
-class StatedRegisters(RegisterBank):
+class ProfileRegisters(RegisterBank):
     """The registers of a device by its profile. `values`: tag -> initial value, in engineering units, or text."""
 
     def __init__(self, profile: DeviceProfile, values: Mapping[str, float | str], now_ns: int) -> None:
@@ -28,7 +28,7 @@ class StatedRegisters(RegisterBank):
             if name not in profile.tags:
                 known = ", ".join(profile.tags)
                 raise FileInvalid(f"{profile.name} has no tag {name!r}", path=profile.path, expected=known)
-        self.journal = HeldJournal()
+        self.journal = DeviceValueLog()
         self._tags = [tag for tag in profile.tags.values() if tag.readable]
         self._cells = MapBank(spans_of(profile), undeclared=profile.form.undeclared)
         self._effects = Effects(profile.effects)
@@ -86,7 +86,7 @@ class StatedRegisters(RegisterBank):
         self.journal.note(tag.name, bytes_of(tag, cells_held(tag, self._cells.peek)), now_ns)
 
 
-def add_own_functions(unit: ModbusUnit, bank: StatedRegisters, profile: DeviceProfile) -> None:
+def add_own_functions(unit: ModbusUnit, bank: ProfileRegisters, profile: DeviceProfile) -> None:
     """Let `unit` answer every device-specific function of the profile.
 
     It answers the one documented request, and gives exception 03 to all others.
@@ -95,7 +95,7 @@ def add_own_functions(unit: ModbusUnit, bank: StatedRegisters, profile: DevicePr
         unit.register(function.code, _handler(bank, function), request_length=1 + len(function.request))
 
 
-def _handler(bank: StatedRegisters, function: OwnFunction) -> Handler:
+def _handler(bank: ProfileRegisters, function: OwnFunction) -> Handler:
     def respond(pdu: bytes, now_ns: int) -> bytes:
         if pdu[1:] != function.request:
             raise IllegalValue(f"{function.name}: {pdu[1:].hex(' ')}")

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 
 from fieldtwin.emulators.codec import decode, encode
 from fieldtwin.emulators.distortion import Distortions
-from fieldtwin.emulators.journal import HeldJournal
+from fieldtwin.emulators.journal import DeviceValueLog
 from fieldtwin.emulators.modbus.bank import Access, IllegalValue, MapBank, RegisterBank, Span, Table
 from fieldtwin.emulators.signals import Signals
 from fieldtwin.emulators.stated import bytes_of, cells_held, touches
@@ -35,7 +35,7 @@ class SampledSensor(RegisterBank):
     def __init__(self, profile: DeviceProfile, player: Signals, identity: Mapping[str, str]) -> None:
         if profile.sampled is None:
             raise FileInvalid("the profile has no `sampled`", path=profile.path, expected="`sampled:`")
-        self.journal = HeldJournal()
+        self.journal = DeviceValueLog()
         self.distortions = Distortions()
         """Value faults of its signals, which apply to the next samples."""
         self.samples = 0

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from fieldtwin.emulators.modbus.bank import Table
-from fieldtwin.emulators.models.register_device import StatedRegisters
+from fieldtwin.emulators.models.register_device import ProfileRegisters
 from fieldtwin.emulators.signals import Signals
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.core.files.profile import DeviceProfile
 
 
-class SimulatedRegisters(StatedRegisters):
+class SimulatedRegisters(ProfileRegisters):
     """The registers of the device. `signals` gives the values of its tags in engineering units.
 
     A value that a client writes to one of these tags lasts until the next read. Raises `FileInvalid` for a signal that

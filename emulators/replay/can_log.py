@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-from fieldtwin.emulators.context import WhenUsedUp
+from fieldtwin.emulators.context import EndOfRecording
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.core.files.input_file import open_input
@@ -33,7 +33,7 @@ class CanLog:
 
     path: Path
     speed: float = 1.0
-    at_end: WhenUsedUp = WhenUsedUp.HOLD
+    at_end: EndOfRecording = EndOfRecording.HOLD
 
     def frames(self) -> Iterator[tuple[float, CanFrame]]:
         """Yield the frames of the file (`read_can_log`). Raises `FileInvalid`, also if the file cannot be read."""

@@ -15,7 +15,7 @@ from typing import overload
 
 from fieldtwin.emulators.context import Recorded
 from fieldtwin.emulators.replay.requests import CellRequest
-from fieldtwin.gateway.core.files.recording import Exchange
+from fieldtwin.gateway.core.files.recording import RecordedExchange
 from fieldtwin.gateway.core.values import RECORDING
 
 BESIDE = 32
@@ -49,7 +49,7 @@ class Column:
     def __len__(self) -> int:
         return len(self.orders)
 
-    def add(self, order: int, exchange: Exchange) -> bool:
+    def add(self, order: int, exchange: RecordedExchange) -> bool:
         """Add an outcome. Return whether it is a normal reply."""
         reply = exchange.reply
         normal = reply is not None and len(reply) == self.stride and reply.startswith(self.head)

@@ -12,7 +12,7 @@ import struct
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from fieldtwin.emulators.context import Recorded, UsedUp, VirtualContext, WhenUsedUp
+from fieldtwin.emulators.context import EndOfRecording, Recorded, UsedUp, VirtualContext
 from fieldtwin.emulators.modbus.bank import Table
 from fieldtwin.emulators.replay.situation import Cell
 from fieldtwin.gateway.core.errors import Bug, UnknownCommand
@@ -79,7 +79,7 @@ class Counters:
         if len(counter.partial) == counter.span.count:
             words = struct.pack(f">{counter.span.count}H", *(counter.partial[k] for k in range(counter.span.count)))
             self._context.add(counter.command, Recorded(t_s, RECORDING(words)))
-            self._context.set_policies({counter.command.data: WhenUsedUp.HOLD})
+            self._context.set_policies({counter.command.data: EndOfRecording.HOLD})
             counter.partial.clear()
         return True
 

@@ -19,7 +19,7 @@ from fieldtwin.emulators.replay.columns import BESIDE, CellValues, Column, Merge
 from fieldtwin.emulators.replay.counters import Counters
 from fieldtwin.emulators.replay.requests import CellRequest
 from fieldtwin.emulators.replay.situation import Cell, Situations
-from fieldtwin.gateway.core.files.recording import Exchange
+from fieldtwin.gateway.core.files.recording import RecordedExchange
 from fieldtwin.gateway.core.values import COMMAND, RECORDING
 
 TABLE_CODES: dict[Table, int] = {"coil": 0, "discrete": 1, "holding": 3, "input": 4}
@@ -84,7 +84,7 @@ class Learner:
     """Fills `context` and `units` from `exchanges`; `counters.misfits` counts replies that fit no request."""
 
     def __init__(
-        self, exchanges: Iterable[Exchange], context: VirtualContext, spans: Counters, counters: ReplayCounters
+        self, exchanges: Iterable[RecordedExchange], context: VirtualContext, spans: Counters, counters: ReplayCounters
     ) -> None:
         self.context = context
         self.units: dict[int, LearntUnit] = {}
@@ -97,7 +97,7 @@ class Learner:
             self._spread(unit_id, unit)
             unit.situations.rewind()
 
-    def _learn_all(self, exchanges: Iterable[Exchange]) -> None:
+    def _learn_all(self, exchanges: Iterable[RecordedExchange]) -> None:
         """Learn all exchanges: reads go into columns, which is fast for known requests; all others are learned one by one."""
         units, size = self.units, 0
         for order, exchange in enumerate(exchanges):
@@ -130,7 +130,7 @@ class Learner:
             for unit in self.units.values():
                 unit.write(request, request.values)
 
-    def _learn_odd(self, unit: LearntUnit, request: CellRequest, exchange: Exchange) -> None:
+    def _learn_odd(self, unit: LearntUnit, request: CellRequest, exchange: RecordedExchange) -> None:
         """Learn a read whose reply is not a normal one."""
         reply = exchange.reply or b""
         if requests.is_exception(exchange.request, reply):
@@ -138,7 +138,7 @@ class Learner:
         else:
             self._counters.misfits += 1
 
-    def _learn(self, exchange: Exchange) -> Column | None:
+    def _learn(self, exchange: RecordedExchange) -> Column | None:
         """Learn an exchange; return the new column for a read."""
         request = requests.parse_request(exchange.request)
         if exchange.unit == 0 and exchange.reply == b"":  # on TCP, unit 0 can be a device that answers

@@ -18,7 +18,7 @@ from fieldtwin.emulators.canopen.error_control import ERROR_CONTROL
 from fieldtwin.emulators.canopen.node_data import COMMUNICATION, NodeData
 from fieldtwin.emulators.canopen.pdo import PdoParameters, pdo_indices
 from fieldtwin.emulators.canopen.sdo_channels import REQUEST, RESPONSE
-from fieldtwin.emulators.context import UsedUp, WhenUsedUp
+from fieldtwin.emulators.context import EndOfRecording, UsedUp
 from fieldtwin.emulators.replay.can_log import CanLog
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.clock import NS_PER_S
@@ -83,7 +83,7 @@ class RecordedObjects:
         frames: Iterable[tuple[float, CanFrame]],
         dictionary: Dictionary,
         node_id: int,
-        when_used_up: WhenUsedUp = WhenUsedUp.HOLD,
+        when_used_up: EndOfRecording = EndOfRecording.HOLD,
         speed: float = 1.0,
     ) -> None:
         self.initial: dict[Key, bytes] = {}
@@ -110,9 +110,9 @@ class RecordedObjects:
     def __call__(self, now_ns: int) -> dict[Key, bytes]:
         self._began_ns = now_ns if self._began_ns is None else self._began_ns
         at_s = (now_ns - self._began_ns) / NS_PER_S * self._speed
-        if at_s > self.duration_s and self._when_used_up is WhenUsedUp.ERROR:
+        if at_s > self.duration_s and self._when_used_up is EndOfRecording.ERROR:
             raise UsedUp(f"the log of node {self._node_id} ends after {self.duration_s:.3f} s")
-        if self._when_used_up is WhenUsedUp.LOOP and self.duration_s:
+        if self._when_used_up is EndOfRecording.LOOP and self.duration_s:
             at_s %= self.duration_s
         return {key: self._values[key][max(bisect_right(times, at_s) - 1, 0)] for key, times in self._times.items()}
 
@@ -122,9 +122,9 @@ class RecordedObjects:
         if answers is None:
             return None
         at = self._next.get(key, 0)
-        if at >= len(answers) and self._when_used_up is WhenUsedUp.ERROR:
+        if at >= len(answers) and self._when_used_up is EndOfRecording.ERROR:
             raise UsedUp(f"nothing is left of what node {self._node_id} held in {key[0]:04X}h:{key[1]:02X}")
-        if at >= len(answers) and self._when_used_up is WhenUsedUp.LOOP:
+        if at >= len(answers) and self._when_used_up is EndOfRecording.LOOP:
             at = 0
         self._next[key] = at + 1
         return answers[min(at, len(answers) - 1)]

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from pathlib import Path
 
-from fieldtwin.emulators.context import MAX_ENTRIES, Recorded, UsedUp, VirtualContext, WhenUsedUp
+from fieldtwin.emulators.context import MAX_ENTRIES, EndOfRecording, Recorded, UsedUp, VirtualContext
 from fieldtwin.emulators.modbus.bank import Table
 from fieldtwin.emulators.replay import requests
 from fieldtwin.emulators.replay.counters import Counters, CounterSpan
@@ -34,7 +34,7 @@ from fieldtwin.emulators.replay.learning import (
 from fieldtwin.emulators.replay.requests import CellRequest
 from fieldtwin.emulators.replay.situation import Cell
 from fieldtwin.gateway.core.errors import Bug
-from fieldtwin.gateway.core.files.recording import Exchange, RecordingReader
+from fieldtwin.gateway.core.files.recording import RecordedExchange, RecordingReader
 from fieldtwin.gateway.core.values import COMMAND
 
 
@@ -69,9 +69,9 @@ class ExchangeReplay:
 
     def __init__(
         self,
-        exchanges: Iterable[Exchange],
+        exchanges: Iterable[RecordedExchange],
         *,
-        when_used_up: WhenUsedUp = WhenUsedUp.HOLD,
+        when_used_up: EndOfRecording = EndOfRecording.HOLD,
         never_recorded: NeverRecorded = NeverRecorded.EXCEPTION,
         counters: Iterable[CounterSpan] = (),
         max_entries: int = MAX_ENTRIES,
@@ -90,7 +90,7 @@ class ExchangeReplay:
         cls,
         path: Path,
         *,
-        when_used_up: WhenUsedUp = WhenUsedUp.HOLD,
+        when_used_up: EndOfRecording = EndOfRecording.HOLD,
         never_recorded: NeverRecorded = NeverRecorded.EXCEPTION,
         counters: Iterable[CounterSpan] = (),
     ) -> ExchangeReplay:
@@ -249,7 +249,7 @@ class ExchangeReplay:
         outcome = self.context.take_recorded(command)
         if outcome.response.data:
             self._last_answers[command.data] = outcome
-        elif used_up and self.when_used_up is WhenUsedUp.HOLD:
+        elif used_up and self.when_used_up is EndOfRecording.HOLD:
             return self._last_answers.get(command.data, outcome)
         return outcome
 

@@ -9,7 +9,14 @@ import asyncio
 
 from fieldtwin.emulators.virtual.loop import VirtualLoop
 from fieldtwin.emulators.wires.serial_line import SerialPacer
-from fieldtwin.gateway.core.connection import Client, Connection, Direction, RS232Connection, TCPConnection, closed_here
+from fieldtwin.gateway.core.connection import (
+    Client,
+    Connection,
+    Direction,
+    RS232Connection,
+    TCPConnection,
+    closed_locally,
+)
 from fieldtwin.gateway.core.endpoint import Endpoint, SerialSettings
 from fieldtwin.gateway.core.errors import ConnectionLost, FieldtwinError
 
@@ -114,5 +121,5 @@ class MemoryEnd(Client):
         """Close the end. On a serial line the peer is not notified."""
         if self.lost is None and not self.wire.serial:
             self.wire.ended(self.direction)
-        self.cut(closed_here(self.endpoint))
+        self.cut(closed_locally(self.endpoint))
         self.inbound.data_stream.clear()

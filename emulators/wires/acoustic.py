@@ -30,7 +30,7 @@ PAUSE_NS = 200 * NS_PER_MS
 
 
 @dataclass(frozen=True, slots=True)
-class Water:
+class AcousticProperties:
     """Properties of the medium that all packets share.
 
     `overhead_bytes`: preamble, addresses and checksum of each packet. `loss`: the share of the packets that each
@@ -104,7 +104,11 @@ class AcousticMedium:
     """
 
     def __init__(
-        self, water: Water, places: Mapping[str, tuple[float, ...]], seed: int, spoils: Spoils | None = None
+        self,
+        water: AcousticProperties,
+        places: Mapping[str, tuple[float, ...]],
+        seed: int,
+        spoils: Spoils | None = None,
     ) -> None:
         self.water = water
         self.spoils = spoils

@@ -12,13 +12,13 @@ from collections.abc import Callable, Sequence
 from functools import partial
 
 from fieldtwin.emulators.wires import can_verdict
-from fieldtwin.emulators.wires.can_events import Delivery, Notice, WireFault
+from fieldtwin.emulators.wires.can_events import Delivery, ErrorFrame, Notice
 from fieldtwin.emulators.wires.can_faults import SUSPEND_BITS, Disturbance, Rule
 from fieldtwin.emulators.wires.can_fd_timing import data_phase
 from fieldtwin.emulators.wires.can_load import BusLoad
 from fieldtwin.emulators.wires.can_nodes import BusOff, Node, Start
 from fieldtwin.emulators.wires.can_timing import INTERFRAME_BITS, bits_to_end
-from fieldtwin.emulators.wires.can_verdict import Verdict
+from fieldtwin.emulators.wires.can_verdict import FailedAttempt
 from fieldtwin.gateway.core.can_error import CanErrorState
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.clock import NS_PER_S
@@ -51,7 +51,7 @@ class Attempts:
         self.rules: list[Rule] = []
         self.done: list[Delivery] = []
         self.notices: deque[Notice] = deque(maxlen=MAX_NOTICES)
-        self.faults: deque[WireFault] = deque(maxlen=MAX_NOTICES)
+        self.faults: deque[ErrorFrame] = deque(maxlen=MAX_NOTICES)
         self._others: dict[int, tuple[int, ...]] = {}
         """Receivers of the frames of each node, while no node joins, leaves or is in bus-off."""
         self._joined_ns = 0
@@ -194,7 +194,7 @@ class Attempts:
                 self.forget_if_done(number)
 
     def _fail(
-        self, verdict: Verdict, frame: CanFrame, start: Start, senders: Sequence[int], receivers: Sequence[int]
+        self, verdict: FailedAttempt, frame: CanFrame, start: Start, senders: Sequence[int], receivers: Sequence[int]
     ) -> None:
         """Send an error frame, which all participants count; the frame stays at the head of its queue."""
         at_ns = start.start_ns + self.frame_ns(frame, verdict.flag_at)
@@ -213,7 +213,9 @@ class Attempts:
             node = self.nodes[number]
             node.errors += 1
             counters.append((number, node.faults.tec, node.faults.rec))
-        self.faults.append(WireFault(at_ns, verdict.kind, frame, start.start_ns, bits, tuple(senders), tuple(counters)))
+        self.faults.append(
+            ErrorFrame(at_ns, verdict.kind, frame, start.start_ns, bits, tuple(senders), tuple(counters))
+        )
 
     def _deliver(self, frame: CanFrame, start: Start, senders: Sequence[int], receivers: Sequence[int]) -> None:
         length = start.bits if len(start.rivals) == 1 else bits_to_end(frame)  # already known for a single sender

@@ -26,7 +26,7 @@ from typing import Any
 
 from fieldtwin.emulators.wires import can_verdict
 from fieldtwin.emulators.wires.can_attempts import Attempts
-from fieldtwin.emulators.wires.can_events import Delivery, Notice, WireFault
+from fieldtwin.emulators.wires.can_events import Delivery, ErrorFrame, Notice
 from fieldtwin.emulators.wires.can_faults import SUSPEND_BITS, Rule
 from fieldtwin.emulators.wires.can_nodes import Node, Pending, Start
 from fieldtwin.emulators.wires.can_timing import arbitration_key, bits_to_end
@@ -193,7 +193,7 @@ class CanBus:
         self._wire.notices.clear()
         return notices
 
-    def take_faults(self) -> list[WireFault]:
+    def take_faults(self) -> list[ErrorFrame]:
         """Return the error frames up to the last `advance`, in order; each is returned once."""
         faults = list(self._wire.faults)
         self._wire.faults.clear()

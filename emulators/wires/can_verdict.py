@@ -26,7 +26,7 @@ from fieldtwin.gateway.core.canframe import CanFrame
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class CollisionOutcome:
     """The outcome of a collision: `senders` remain, all with one frame. With `error_bit` it is destroyed, by an error
     in that bit.
 
@@ -40,7 +40,7 @@ class Outcome:
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class FailedAttempt:
     """An error frame. `kind` as in `WireFault`; the first flag begins at bit `flag_at`, and the attempt takes `bits` of
     the bus.
 
@@ -53,7 +53,7 @@ class Verdict:
     first: frozenset[int] = frozenset()
 
 
-def collide(frames: Mapping[int, CanFrame], destroys: Callable[[int], bool]) -> Outcome:
+def collide(frames: Mapping[int, CanFrame], destroys: Callable[[int], bool]) -> CollisionOutcome:
     """Resolve a collision of `frames` by node, with one arbitration field; `destroys`: whether a node's error flag is
     dominant.
     """
@@ -67,28 +67,28 @@ def collide(frames: Mapping[int, CanFrame], destroys: Callable[[int], bool]) -> 
         in_error = [number for number, wire in left.items() if wire[at] == "1"]
         left = {number: wire for number, wire in left.items() if wire[at] == "0"}
         if any(destroys(number) for number in in_error):
-            return Outcome(tuple(left), tuple(losers), at, lost_bit)
+            return CollisionOutcome(tuple(left), tuple(losers), at, lost_bit)
         losers += in_error
         lost_bit = at
         if len(set(left.values())) == 1:
             break
-    return Outcome(tuple(left), tuple(losers), None, lost_bit)
+    return CollisionOutcome(tuple(left), tuple(losers), None, lost_bit)
 
 
-def collided(frame: CanFrame, error_bit: int) -> Verdict:
+def collided(frame: CanFrame, error_bit: int) -> FailedAttempt:
     """Return the verdict if a sender of a different frame read a dominant bit at `error_bit`, where it sent a recessive
     one.
     """
     return _flagged("bit", frame, wire_bits(frame)[: error_bit + 1])
 
 
-def unacknowledged(frame: CanFrame) -> Verdict:
+def unacknowledged(frame: CanFrame) -> FailedAttempt:
     """Return the verdict without an acknowledgement: the sender's flag follows the acknowledge slot, and overlaps no other."""
     at = acknowledge_bit(frame) + 1
-    return Verdict("ack", at, at + ERROR_FLAG_BITS + ERROR_DELIMITER_BITS + INTERFRAME_BITS)
+    return FailedAttempt("ack", at, at + ERROR_FLAG_BITS + ERROR_DELIMITER_BITS + INTERFRAME_BITS)
 
 
-def disturbed(what: Disturbance, frame: CanFrame, victims: Collection[int], *, at_sender: bool) -> Verdict:
+def disturbed(what: Disturbance, frame: CanFrame, victims: Collection[int], *, at_sender: bool) -> FailedAttempt:
     """Return the verdict if `what` destroys the frame: at the sender (and all nodes), or by flags of `victims` among
     receivers.
     """
@@ -102,6 +102,6 @@ def disturbed(what: Disturbance, frame: CanFrame, victims: Collection[int], *, a
     return _flagged("bit", frame, wire[:at] + ("0" if wire[at] == "1" else "1"), first)
 
 
-def _flagged(kind: str, frame: CanFrame, seen: str, first: frozenset[int] = frozenset()) -> Verdict:
+def _flagged(kind: str, frame: CanFrame, seen: str, first: frozenset[int] = frozenset()) -> FailedAttempt:
     flags = error_flag_bits(frame, seen)
-    return Verdict(kind, len(seen), len(seen) + flags + ERROR_DELIMITER_BITS + INTERFRAME_BITS, first)
+    return FailedAttempt(kind, len(seen), len(seen) + flags + ERROR_DELIMITER_BITS + INTERFRAME_BITS, first)

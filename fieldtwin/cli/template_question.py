@@ -7,8 +7,8 @@ import sys
 import click
 from rich.markup import escape
 
-from fieldtwin.console import talk
-from fieldtwin.run.template import Ask, Stranger
+from fieldtwin.console import stderr
+from fieldtwin.run.template import Ask, ForeignParts
 
 SHOWN = 5
 
@@ -28,17 +28,17 @@ def consent(*, trust: bool) -> Ask:
     return lambda template: trust or ask_about(template)
 
 
-def ask_about(template: Stranger) -> bool:
+def ask_about(template: ForeignParts) -> bool:
     """Print what a template contains and ask whether it may run. Without a terminal the answer is no."""
     if template.code:
-        talk.print(
+        stderr.print(
             f"{escape(str(template.path))} contains control logic in Python: {shown(template.code)}.\n"
             "When run, this program can do everything on this computer that you can do.",
             soft_wrap=True,
         )
     if template.reach:
         lines = shown(template.reach, "\n  ")
-        talk.print(
+        stderr.print(
             f"{escape(str(template.path))} affects more than its run directory as a prototype:\n  {lines}",
             soft_wrap=True,
         )

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from fieldtwin.__about__ import __version__
 from fieldtwin.doctor import host as here
-from fieldtwin.doctor.verdicts import Check, Verdict, judged_can, judged_clock, judged_processor, judged_watches
+from fieldtwin.doctor.verdicts import Check, HostVerdict, judged_can, judged_clock, judged_processor, judged_watches
 from fieldtwin.gateway.core.errors import FieldtwinError
 from fieldtwin.twin.plant.instance import runtime_root
 from fieldtwin.twin.site.data_files import data_root
@@ -43,7 +43,7 @@ def examine() -> list[Check]:
 
 def _python() -> Check:
     found = f"fieldtwin {__version__}, Python {platform.python_version()}, {platform.system()} {platform.machine()}"
-    return Check("python", Verdict.OK, found)
+    return Check("python", HostVerdict.OK, found)
 
 
 def _data() -> Check:
@@ -51,11 +51,11 @@ def _data() -> Check:
         root = data_root()
         system = load_system(str(root / "profiles" / "systems" / "observatory.yaml"))
     except FieldtwinError as e:
-        return Check("shipped data", Verdict.BAD, str(e), "reinstall fieldtwin")
+        return Check("shipped data", HostVerdict.BAD, str(e), "reinstall fieldtwin")
     profiles = len(list((root / "profiles" / "devices").glob("*.yaml")))
     recordings = len(list((root / "recordings").glob("*.jsonl")))
     return Check(
-        "shipped data", Verdict.OK, f"system {system.name}, {profiles} profiles, {recordings} recordings in {root}"
+        "shipped data", HostVerdict.OK, f"system {system.name}, {profiles} profiles, {recordings} recordings in {root}"
     )
 
 
@@ -67,13 +67,17 @@ def _run_directory() -> Check:
         probe.write_bytes(b"")
         probe.unlink()
     except OSError as e:
-        return Check("run directory", Verdict.BAD, f"{root}: {e.strerror}", "set FIELDTWIN_RUN to a folder of yours")
-    return Check("run directory", Verdict.OK, str(root))
+        return Check(
+            "run directory", HostVerdict.BAD, f"{root}: {e.strerror}", "set FIELDTWIN_RUN to a folder of yours"
+        )
+    return Check("run directory", HostVerdict.OK, str(root))
 
 
 def _pty() -> Check:
     if not hasattr(os, "openpty"):
-        return Check("virtual serial", Verdict.NOTE, "this system has none", "emulate on tcp, or on real serial ports")
+        return Check(
+            "virtual serial", HostVerdict.NOTE, "this system has none", "emulate on tcp, or on real serial ports"
+        )
     import tty
 
     try:
@@ -86,31 +90,36 @@ def _pty() -> Check:
             os.close(master)
             os.close(slave)
     except OSError as e:
-        return Check("virtual serial", Verdict.BAD, f"no pseudo-terminal: {e.strerror}", "mount devpts on /dev/pts")
+        return Check("virtual serial", HostVerdict.BAD, f"no pseudo-terminal: {e.strerror}", "mount devpts on /dev/pts")
     if not whole:
-        return Check("virtual serial", Verdict.BAD, "a raw pty changes bytes", "report this")
-    return Check("virtual serial", Verdict.OK, "ptys work")
+        return Check("virtual serial", HostVerdict.BAD, "a raw pty changes bytes", "report this")
+    return Check("virtual serial", HostVerdict.OK, "ptys work")
 
 
 def _serial() -> Check:
-    from fieldtwin.gateway.connections.serial_port import ports_here
+    from fieldtwin.gateway.connections.serial_port import local_ports
 
-    ports = ports_here()
+    ports = local_ports()
     closed = [p for p in ports if not os.access(p, os.R_OK | os.W_OK)]
     if closed:
-        return Check("serial ports", Verdict.NOTE, f"no access to {', '.join(closed)}", here.join_advice(closed))
-    return Check("serial ports", Verdict.OK, ", ".join(ports) or "none (prototypes need none)")
+        return Check("serial ports", HostVerdict.NOTE, f"no access to {', '.join(closed)}", here.join_advice(closed))
+    return Check("serial ports", HostVerdict.OK, ", ".join(ports) or "none (prototypes need none)")
 
 
 def _can() -> Check:
     if not hasattr(socket, "PF_CAN"):
-        return Check("kernel CAN", Verdict.NOTE, "this Python has no SocketCAN", "prototypes use the software CAN bus")
+        return Check(
+            "kernel CAN", HostVerdict.NOTE, "this Python has no SocketCAN", "prototypes use the software CAN bus"
+        )
     try:
         socket.socket(socket.PF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
     except OSError as e:
         reason = "no CAN in this kernel" if e.errno in (errno.EAFNOSUPPORT, errno.EPROTONOSUPPORT) else str(e.strerror)
         return Check(
-            "kernel CAN", Verdict.NOTE, reason, "prototypes use the software CAN bus; a plant needs `modprobe can-raw`"
+            "kernel CAN",
+            HostVerdict.NOTE,
+            reason,
+            "prototypes use the software CAN bus; a plant needs `modprobe can-raw`",
         )
     return judged_can(here.can_interfaces())
 
@@ -121,18 +130,18 @@ def _realtime() -> Check:
         advice = (
             "for a steadier scan: rtprio and memlock in /etc/security/limits.d, or CAP_SYS_NICE (systemd: LimitRTPRIO)"
         )
-        return Check("real time", Verdict.NOTE, found, advice)
-    return Check("real time", Verdict.OK, found)
+        return Check("real time", HostVerdict.NOTE, found, advice)
+    return Check("real time", HostVerdict.OK, found)
 
 
 def _files() -> Check:
     """Check the hard limit: a process that serves many devices raises its own limit up to it."""
     hard = here.most_open_files()
     if hard is None:
-        return Check("open files", Verdict.OK, "no limit")
+        return Check("open files", HostVerdict.OK, "no limit")
     if hard < MIN_OPEN_FILES:
-        return Check("open files", Verdict.NOTE, f"limit {hard}", f"ulimit -Hn {MIN_OPEN_FILES} for many devices")
-    return Check("open files", Verdict.OK, f"limit {hard}")
+        return Check("open files", HostVerdict.NOTE, f"limit {hard}", f"ulimit -Hn {MIN_OPEN_FILES} for many devices")
+    return Check("open files", HostVerdict.OK, f"limit {hard}")
 
 
 def _watches() -> Check:
@@ -154,5 +163,5 @@ def _disk() -> Check:
     free = shutil.disk_usage(existing).free
     found = f"{free // (1024 * 1024)} MiB free at {existing}"
     if free < MIN_FREE_BYTES:
-        return Check("disk", Verdict.BAD, found, "logs and stores need space")
-    return Check("disk", Verdict.OK, found)
+        return Check("disk", HostVerdict.BAD, found, "logs and stores need space")
+    return Check("disk", HostVerdict.OK, found)

@@ -11,7 +11,7 @@ MIN_CPUS = 1.0
 """Gateway, PLC and the run's own process share the processors; fewer than one makes scans late."""
 
 
-class Verdict(Enum):
+class HostVerdict(Enum):
     """The verdict of a check. NOTE: something optional is missing, and everything else works."""
 
     OK = "ok"
@@ -24,7 +24,7 @@ class Check:
     """One check: its name, the verdict, the finding and, where something is missing, the remedy."""
 
     name: str
-    verdict: Verdict
+    verdict: HostVerdict
     found: str
     advice: str = ""
 
@@ -44,15 +44,17 @@ def judged_clock(state: ClockState | None) -> Check:
     Scans and polls use the monotonic clock; a wrong time of day spoils logs and recordings and makes TLS fail.
     """
     if state is None:
-        return Check("clock", Verdict.NOTE, "this system does not report whether it is synchronised", "use NTP or PTP")
+        return Check(
+            "clock", HostVerdict.NOTE, "this system does not report whether it is synchronised", "use NTP or PTP"
+        )
     if state.year < 2024:
         return Check(
-            "clock", Verdict.BAD, f"the year is {state.year}", "set the clock, and use a backup battery or NTP"
+            "clock", HostVerdict.BAD, f"the year is {state.year}", "set the clock, and use a backup battery or NTP"
         )
     if not state.synchronised:
         advice = "start chrony or systemd-timesyncd: time stamps of logs and certificates depend on it"
-        return Check("clock", Verdict.NOTE, "the kernel's clock is not synchronised", advice)
-    return Check("clock", Verdict.OK, f"synchronised, at most {state.error_s * 1000:.0f} ms off")
+        return Check("clock", HostVerdict.NOTE, "the kernel's clock is not synchronised", advice)
+    return Check("clock", HostVerdict.OK, f"synchronised, at most {state.error_s * 1000:.0f} ms off")
 
 
 def judged_can(interfaces: Mapping[str, bool]) -> Check:
@@ -64,8 +66,8 @@ def judged_can(interfaces: Mapping[str, bool]) -> Check:
     down = [name for name, up in interfaces.items() if not up]
     if down:
         rate = "" if down[0].startswith("v") else " type can bitrate 125000 restart-ms 100"
-        return Check("kernel CAN", Verdict.NOTE, found, f"sudo ip link set {down[0]} up{rate}")
-    return Check("kernel CAN", Verdict.OK, found or "available, no interface (`ip link add vcan0 type vcan`)")
+        return Check("kernel CAN", HostVerdict.NOTE, found, f"sudo ip link set {down[0]} up{rate}")
+    return Check("kernel CAN", HostVerdict.OK, found or "available, no interface (`ip link add vcan0 type vcan`)")
 
 
 def judged_watches(instances: int | None) -> Check:
@@ -74,11 +76,11 @@ def judged_watches(instances: int | None) -> Check:
     fieldtwin does not use inotify; udev, journald and systemd need it to announce ports and start services.
     """
     if instances is None:
-        return Check("inotify", Verdict.OK, "not on this system")
+        return Check("inotify", HostVerdict.OK, "not on this system")
     if instances < MIN_INOTIFY:
         advice = "sysctl fs.inotify.max_user_instances=128"
-        return Check("inotify", Verdict.NOTE, f"{instances} instances per user", advice)
-    return Check("inotify", Verdict.OK, f"{instances} instances per user")
+        return Check("inotify", HostVerdict.NOTE, f"{instances} instances per user", advice)
+    return Check("inotify", HostVerdict.OK, f"{instances} instances per user")
 
 
 def judged_processor(cpus: int, quota: float | None) -> Check:
@@ -87,12 +89,12 @@ def judged_processor(cpus: int, quota: float | None) -> Check:
     A quota stops all processes until its period is over.
     """
     if quota is None:
-        return Check("processors", Verdict.OK, f"{cpus}, no quota")
+        return Check("processors", HostVerdict.OK, f"{cpus}, no quota")
     found = f"{cpus}, of which a cgroup grants {quota:g} at most"
     if quota < MIN_CPUS:
         advice = "scans are late whenever the quota is used up: grant at least one (docker --cpus, systemd CPUQuota)"
-        return Check("processors", Verdict.NOTE, found, advice)
-    return Check("processors", Verdict.OK, found)
+        return Check("processors", HostVerdict.NOTE, found, advice)
+    return Check("processors", HostVerdict.OK, found)
 
 
 def quota_of(text: str) -> float | None:

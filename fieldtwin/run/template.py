@@ -16,7 +16,7 @@ from fieldtwin.twin.template.template import MANIFEST, MAX_MANIFEST_BYTES, is_co
 
 
 @dataclass(frozen=True, slots=True)
-class Stranger:
+class ForeignParts:
     """The parts of a template that need the user's consent.
 
     `code` are files that Python would run, `reach` lists the resources of this computer that its prototype uses
@@ -28,7 +28,7 @@ class Stranger:
     reach: tuple[str, ...] = ()
 
 
-Ask = Callable[[Stranger], bool]
+Ask = Callable[[ForeignParts], bool]
 """Asks the user whether it may be run, showing the template's contents."""
 
 
@@ -102,7 +102,7 @@ def agree(
             reaches |= dict.fromkeys(() if virtual else uses)
     if beside is not None and _templates_above(beside):
         reaches |= dict.fromkeys(opens)
-    if (code or reaches) and not ask(Stranger(shown, tuple(code), tuple(reaches))):
+    if (code or reaches) and not ask(ForeignParts(shown, tuple(code), tuple(reaches))):
         raise NotAllowed("nothing of this template was run", where=str(shown), hint="--trust says yes beforehand")
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Any, Literal, Protocol
 
-from fieldtwin.conformance.core.case import Danger
+from fieldtwin.conformance.core.case import Impact
 from fieldtwin.gateway.core.errors import FieldtwinError
 from fieldtwin.results.model import Struck
 from fieldtwin.results.trace import Trace
@@ -40,7 +40,7 @@ Part = Literal["plc", "gateway", "field"]
 
 
 @dataclass(frozen=True, slots=True)
-class Reading:
+class TagReading:
     """The current value of a tag or of a program's variable.
 
     `quality` is good, uncertain, bad, substituted or simulated; `age_s` is the value's age, and `updates` how often it
@@ -54,9 +54,9 @@ class Reading:
     updates: int
 
 
-def variable(value: Any, *, runs: bool) -> Reading:
+def variable(value: Any, *, runs: bool) -> TagReading:
     """Return the reading of a program's variable. If the PLC does not run, it is bad: the value must not be used."""
-    return Reading(value, "good" if runs else "bad", "" if runs else "not_operational", 0.0, 0)
+    return TagReading(value, "good" if runs else "bad", "" if runs else "not_operational", 0.0, 0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +91,7 @@ class Bench(Protocol):
     def can(self) -> frozenset[Can]: ...
 
     @property
-    def allowed(self) -> Danger:
+    def allowed(self) -> Impact:
         """The highest impact level that steps may have: `expect`, `wait` and `pause` observe, probes read, `send` and
         `set` write, `fault` and `clear` disrupt."""
         ...
@@ -111,7 +111,7 @@ class Bench(Protocol):
         """Return the names that `reading` accepts: DEVICE.TAG and PROGRAM.VARIABLE."""
         ...
 
-    def reading(self, name: str) -> Reading | None:
+    def reading(self, name: str) -> TagReading | None:
         """Return the reading as of the last return of `sleep_until_s`.
 
         None: never published. Raises `UsageError` for an unknown name.

@@ -18,7 +18,7 @@ VERDICTS = ("passed", "failed", "error", "inconclusive", "skipped")
 
 
 @dataclass(frozen=True)
-class Outcome:
+class ScenarioOutcome:
     """The result of a scenario.
 
     `verdict` is one of `VERDICTS`; only the first is a pass. `case` is its ID, `role` the tested part, `danger` its
@@ -76,7 +76,7 @@ def run_scenario(
     target: str = "",
     profiles: Sequence[str] = (),
     trust: bool = False,
-) -> Outcome:
+) -> ScenarioOutcome:
     """Run one scenario. Raises `FieldtwinRefused` for an invalid file, `FieldtwinUnavailable` if fieldtwin cannot be run."""
     argv = [*command, "test", str(path), "--json"]
     argv += ["--seed", str(seed)] if seed is not None else []
@@ -98,6 +98,6 @@ def run_scenario(
         plain = json.loads(done.stdout)[0]
     except (ValueError, LookupError, TypeError):
         raise FieldtwinUnavailable(f"no results: {done.stdout[:200]!r} {said}") from None
-    known = {key: plain[key] for key in Outcome.__dataclass_fields__ if key in plain}
+    known = {key: plain[key] for key in ScenarioOutcome.__dataclass_fields__ if key in plain}
     known |= {key: tuple(plain.get(key, ())) for key in ("requirements", "checks", "on_the_wire")}
-    return Outcome(**known)
+    return ScenarioOutcome(**known)

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from fieldtwin.testing.outcome import Outcome, run_scenario
+from fieldtwin.testing.outcome import ScenarioOutcome, run_scenario
 from fieldtwin.testing.runner import FieldtwinRefused, FieldtwinUnavailable, command_of
 
 SUFFIX = ".scenario.yaml"
@@ -22,7 +22,7 @@ ABOUT = ("case", "role", "danger")
 class NotPassed(Exception):
     """Raised for a scenario that did not pass."""
 
-    def __init__(self, outcome: Outcome) -> None:
+    def __init__(self, outcome: ScenarioOutcome) -> None:
         super().__init__(outcome.verdict)
         self.outcome = outcome
 

@@ -19,7 +19,7 @@ import can
 
 from fieldtwin.gateway.connections.can_message import message_of
 from fieldtwin.gateway.core.canframe import CanFrame
-from fieldtwin.gateway.core.connection import CANConnection, CanConnection, closed_here
+from fieldtwin.gateway.core.connection import CANConnection, CanConnection, closed_locally
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import ConnectionLost, Desync, EndpointBusy, Unreachable, UsageError, WireError
 from fieldtwin.gateway.wallclock import WallClock
@@ -94,7 +94,7 @@ class AdapterConnection(CanConnection):
 
     async def aclose(self) -> None:
         """Close the adapter. Closing twice does nothing."""
-        self.feed_lost(closed_here(self.endpoint))
+        self.feed_lost(closed_locally(self.endpoint))
         if not self._stopping.is_set():
             self._stopping.set()
             await self._loop.run_in_executor(None, self._shut)

@@ -17,7 +17,7 @@ from fieldtwin.gateway.connections.can_link import query_link
 from fieldtwin.gateway.connections.can_message import message_of
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.clock import NS_PER_S
-from fieldtwin.gateway.core.connection import CANConnection, CanConnection, closed_here
+from fieldtwin.gateway.core.connection import CANConnection, CanConnection, closed_locally
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import ConnectionLost, Desync, Unreachable, UsageError, WireError
 from fieldtwin.gateway.wallclock import WallClock
@@ -101,7 +101,7 @@ class SocketCanConnection(CanConnection):
 
     async def aclose(self) -> None:
         """Close the socket; the kernel still sends the frames that it has taken."""
-        self._stop(closed_here(self.endpoint))
+        self._stop(closed_locally(self.endpoint))
         self.inbound.data_stream.clear()
 
     def _on_readable(self) -> None:

@@ -16,7 +16,7 @@ from typing import cast
 
 from fieldtwin.gateway.connections.line_counters import LineCounters, read_control_lines, read_counters
 from fieldtwin.gateway.connections.serial_port import CHUNK, Port, close_unwanted, lost, open_port
-from fieldtwin.gateway.core.connection import ByteConnection, RS232Connection, closed_here
+from fieldtwin.gateway.core.connection import ByteConnection, RS232Connection, closed_locally
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import FieldtwinError
 
@@ -91,7 +91,7 @@ class SerialConnection(ByteConnection):
         """Wait until written bytes have been sent (at most `DRAIN_LIMIT_S`), then close. Closing twice does nothing."""
         if self._lost is None:
             await self._drain()
-            self._fail(closed_here(self.endpoint))
+            self._fail(closed_locally(self.endpoint))
         self.inbound.data_stream.clear()
 
     def counters(self) -> LineCounters | None:

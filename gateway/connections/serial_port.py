@@ -123,13 +123,13 @@ def lost(endpoint: Endpoint, why: str) -> ConnectionLost:
     return ConnectionLost(f"the serial port is gone: {why}", where=str(endpoint))
 
 
-def ports_here() -> list[str]:
+def local_ports() -> list[str]:
     """Return the names of the serial ports that this computer has now."""
     return sorted(port.device for port in list_ports.comports())
 
 
 def _ports_hint() -> str:
-    names = ports_here()
+    names = local_ports()
     return f"ports here: {', '.join(names[:8])}" if names else "this computer has no serial port"
 
 

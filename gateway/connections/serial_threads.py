@@ -14,7 +14,7 @@ from typing import Any
 
 from fieldtwin.gateway.connections.line_counters import LineCounters
 from fieldtwin.gateway.connections.serial_port import CHUNK, Port, close_unwanted, lost, open_port
-from fieldtwin.gateway.core.connection import ByteConnection, RS232Connection, closed_here
+from fieldtwin.gateway.core.connection import ByteConnection, RS232Connection, closed_locally
 from fieldtwin.gateway.core.endpoint import Endpoint
 
 POLL_S = 0.05
@@ -67,7 +67,7 @@ class ThreadedSerialConnection(ByteConnection):
 
     async def aclose(self) -> None:
         """Wait until written bytes have been sent, then close. Closing twice does nothing."""
-        self.feed_lost(closed_here(self.endpoint))
+        self.feed_lost(closed_locally(self.endpoint))
         if not self._stopping.is_set():
             self._stopping.set()
             self._room.set()

@@ -23,7 +23,7 @@ from fieldtwin.gateway.connections.addresses import address_of
 from fieldtwin.gateway.connections.soft_bus_hello import Welcome, ask, read_answer
 from fieldtwin.gateway.core.canframe import FD_RECORD_SIZE, RECORD_SIZE, CanFrame, pack_record, unpack_record
 from fieldtwin.gateway.core.clock import NS_PER_S
-from fieldtwin.gateway.core.connection import CANConnection, CanConnection, closed_here
+from fieldtwin.gateway.core.connection import CANConnection, CanConnection, closed_locally
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import ConnectionLost, Desync, FieldtwinError, Unreachable, UsageError, os_reason
 from fieldtwin.gateway.wallclock import WallClock
@@ -117,7 +117,7 @@ class SoftBusConnection(CanConnection):
                     await self._progress.wait()
         except TimeoutError:
             pass  # a slow bus: it sends the rest later
-        self.feed_lost(closed_here(self.endpoint))
+        self.feed_lost(closed_locally(self.endpoint))
         self._progress.set()
         self.inbound.data_stream.clear()
         if self._wire is not None:

@@ -11,7 +11,7 @@ import ssl
 from typing import Self, cast
 
 from fieldtwin.gateway.connections.addresses import address_of
-from fieldtwin.gateway.core.connection import ByteConnection, TCPConnection, closed_here
+from fieldtwin.gateway.core.connection import ByteConnection, TCPConnection, closed_locally
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import ConnectionLost, Unreachable
 
@@ -102,7 +102,7 @@ class TcpConnection(ByteConnection):
 
     async def aclose(self) -> None:
         """Send the data written (waiting at most `CLOSE_LIMIT_S`), then close. Closing twice does nothing."""
-        self.feed_lost(closed_here(self.endpoint))
+        self.feed_lost(closed_locally(self.endpoint))
         self.inbound.data_stream.clear()
         self._wire.transport.close()
         try:

@@ -13,7 +13,7 @@ from typing import cast
 
 from fieldtwin.gateway.connections.addresses import address_of
 from fieldtwin.gateway.connections.tcp import resolve
-from fieldtwin.gateway.core.connection import ByteConnection, TCPConnection, closed_here
+from fieldtwin.gateway.core.connection import ByteConnection, TCPConnection, closed_locally
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import ConnectionLost, FieldtwinError, Unreachable
 
@@ -65,7 +65,7 @@ class UdpConnection(ByteConnection):
 
     async def aclose(self) -> None:
         """Close the socket. Closing twice does nothing."""
-        self.end(closed_here(self.endpoint))
+        self.end(closed_locally(self.endpoint))
         self.inbound.data_stream.clear()
         await self._wire.gone.wait()
 

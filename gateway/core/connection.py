@@ -20,7 +20,7 @@ from enum import Enum
 from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 from fieldtwin.gateway.core.canframe import CanFrame
-from fieldtwin.gateway.core.concurrency.timeout import alarm, ring
+from fieldtwin.gateway.core.concurrency.timeout import ring, start_timeout
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import Bug, ConnectionLost, FieldtwinError
 
@@ -137,7 +137,7 @@ class _End(Generic[T]):
         """Return a new error with the reason for each `raise`: an error that is raised again collects tracebacks and
         `at`s.
         """
-        kept = self._lost or closed_here(self.endpoint)
+        kept = self._lost or closed_locally(self.endpoint)
         fresh = type(kept).__new__(type(kept))
         fresh.args = kept.args
         fresh.__dict__.update(kept.__dict__)
@@ -159,7 +159,7 @@ class _End(Generic[T]):
     async def _next_within(self, timeout_s: float, nothing: T) -> T:
         """Return the next item like `_next`, or `nothing` if none arrives within `timeout_s`."""
         if not self._stream:
-            waiter, end = alarm(asyncio.get_running_loop(), timeout_s)
+            waiter, end = start_timeout(asyncio.get_running_loop(), timeout_s)
             try:
                 self._waits(waiter)
                 await waiter
@@ -344,6 +344,6 @@ class Tap(Protocol):
     def on_frame(self, endpoint: Endpoint, direction: Direction, t_ns: int, frame: CanFrame) -> None: ...
 
 
-def closed_here(endpoint: Endpoint) -> ConnectionLost:
+def closed_locally(endpoint: Endpoint) -> ConnectionLost:
     """Return the reason that `read` gives after a local `aclose`."""
     return ConnectionLost("the connection was closed on this side", where=str(endpoint))

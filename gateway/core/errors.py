@@ -15,7 +15,7 @@ import re
 from enum import Enum
 from typing import ClassVar
 
-from fieldtwin.gateway.core.escaping import visible
+from fieldtwin.gateway.core.escaping import escape_controls
 
 
 class Blame(Enum):
@@ -56,7 +56,7 @@ class FieldtwinError(Exception):
             text += f"; expected {self.expected}"
         if self.got:
             text += f"; got {self.got}"
-        return visible(f"{text} ({self.hint})" if self.hint else text)
+        return escape_controls(f"{text} ({self.hint})" if self.hint else text)
 
     def at(self, where: str) -> FieldtwinError:
         """Put `where` in front of the location that is already known. Return the error itself, for ``raise e.at(...)``."""

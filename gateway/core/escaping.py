@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 
-def visible(text: str) -> str:
+def escape_controls(text: str) -> str:
     """Return `text` with its line breaks and tabs unchanged, and every other unprintable character escaped as Python does."""
     if text.isprintable():
         return text

@@ -35,7 +35,7 @@ NOTHING_READ = 1 << 16
 """More registers or bits than a device can have."""
 
 
-class Reading:
+class GroupReading:
     """A poll group that is being read, transaction by transaction. `items` holds what occurred, once the reading is
     complete."""
 
@@ -163,11 +163,11 @@ class RegisterDriver(DeviceDriver):
         plan = self.plans.get(what)
         return plan.reads[0].range.count if plan is not None and plan.reads else NOTHING_READ
 
-    def begin(self, what: str) -> Reading:
+    def begin(self, what: str) -> GroupReading:
         """Start to read the poll group `what`. Nothing is sent yet."""
-        return Reading(what, self.plans[what].reads)
+        return GroupReading(what, self.plans[what].reads)
 
-    async def read_next(self, reading: Reading) -> bool:
+    async def read_next(self, reading: GroupReading) -> bool:
         """Carry out one transaction of `reading`. Return True when it was the last one and all values are published.
 
         When it raises an error, the same transaction is next, so it may be tried again.
@@ -180,7 +180,7 @@ class RegisterDriver(DeviceDriver):
         reading.items = self._complete(reading)
         return True
 
-    def finish(self, reading: Reading) -> None:
+    def finish(self, reading: GroupReading) -> None:
         """Emit what occurred."""
         for item in reading.items:
             self.emitter.emit(item)
@@ -191,7 +191,7 @@ class RegisterDriver(DeviceDriver):
             pass
         return reading.items
 
-    async def _read_block(self, reading: Reading) -> None:
+    async def _read_block(self, reading: GroupReading) -> None:
         plan, read = self.plans[reading.what], reading.todo[0]
         try:
             reply = await self._transaction(read.range)
@@ -219,7 +219,7 @@ class RegisterDriver(DeviceDriver):
         value = self._decoded[tag.name] = decode(tag, raw, t_ns)
         return value
 
-    def _complete(self, reading: Reading) -> list[DATA]:
+    def _complete(self, reading: GroupReading) -> list[DATA]:
         """Publish the values of a group that was read, and return what occurred."""
         values, what = reading.values, reading.what
         for name, value in values.items() if self._scales else ():

@@ -19,7 +19,7 @@ from fieldtwin.gateway.core.files.profile import Box
 from fieldtwin.gateway.core.values import COMMAND, DATA
 from fieldtwin.gateway.devices.config import DeviceConfig
 from fieldtwin.gateway.devices.driver import TagSink
-from fieldtwin.gateway.devices.register_device import Reading, RegisterDriver
+from fieldtwin.gateway.devices.register_device import GroupReading, RegisterDriver
 
 LAST_SEQUENCE = 0xFFFF
 _SEQUENCE_AND_LENGTH = struct.Struct(">HH").unpack_from
@@ -97,10 +97,10 @@ class TransmitterDriver(RegisterDriver):
         reply = await self.client.read_registers(self.config.address, "holding", address, 1)
         return reply.registers[0]
 
-    def begin(self, what: str) -> Reading:
-        return Reading(what) if what == "inbox" else super().begin(what)
+    def begin(self, what: str) -> GroupReading:
+        return GroupReading(what) if what == "inbox" else super().begin(what)
 
-    async def read_next(self, reading: Reading) -> bool:
+    async def read_next(self, reading: GroupReading) -> bool:
         if reading.what != "inbox":
             return await super().read_next(reading)
         reading.items = await self._read_inbox()

@@ -25,7 +25,7 @@ from fieldtwin.gateway.runtime.buses.bus import Bus
 from fieldtwin.gateway.runtime.buses.canopen_bus import CanopenBus
 from fieldtwin.gateway.runtime.buses.modbus_bus import ModbusBus
 from fieldtwin.gateway.runtime.image_io import ImageExchange
-from fieldtwin.gateway.runtime.mailboxes.acked_commands import TakenFile
+from fieldtwin.gateway.runtime.mailboxes.acked_commands import AckedCommandStore
 from fieldtwin.gateway.runtime.mailboxes.pump import MailboxPump
 from fieldtwin.gateway.runtime.outputs.output import Output
 from fieldtwin.gateway.runtime.outputs.outputs import OutputWriter
@@ -53,7 +53,7 @@ class GatewayConfig:
     remote: bool = False
     serve: tuple[ServeConfig, ...] = ()
     bridges: tuple[BridgeConfig, ...] = ()
-    lent: frozenset[str] = frozenset()
+    delegated: frozenset[str] = frozenset()
     """Transmitters whose mailboxes belong to a digital thread."""
 
 
@@ -93,7 +93,7 @@ class Gateway:
         audit: AuditLog,
         log: ExchangeLog,
         listen: Listen = TcpListener.open,
-        taken: TakenFile | None = None,
+        taken: AckedCommandStore | None = None,
     ) -> None:
         self.config = config
         self.clock = clock
@@ -121,7 +121,7 @@ class Gateway:
                 audit,
                 allow_writes=config.allow_writes,
                 remote=config.remote,
-                lent=d.config.name in config.lent,
+                delegated=d.config.name in config.delegated,
                 taken=taken,
                 journal=self.outputs.journal,
             )
@@ -226,9 +226,9 @@ class Gateway:
         """Exchange data with the PLC once and act on it. Never waits."""
         for pump in self.pumps:
             pump.refuse_when_local()
-            self.exchange.untaken[pump.driver.outbox_tag] = pump.untaken
+            self.exchange.undelivered[pump.driver.outbox_tag] = pump.undelivered
         for tag in self.config.log_tags:
-            self.exchange.untaken[tag] = self.log.pending(tag)
+            self.exchange.undelivered[tag] = self.log.pending(tag)
         self.exchange.exchange(now_ns)
         for tag, messages in self.exchange.new_messages.items():
             for pump in self.pumps:

@@ -32,7 +32,7 @@ class ImageExchange:
     """Publishes INPUTS from the tag table and the message queues, and reads OUTPUTS.
 
     `sources` are the queues of input messages by tag. The caller reads `outputs` (values by tag) and `new_messages` (by
-    tag, in order) after each `exchange`, and sets `untaken` to how many of the output messages it has not handled yet.
+    tag, in order) after each `exchange`, and sets `undelivered` to how many of the output messages it has not handled yet.
     """
 
     def __init__(self, image: Image, tags: TagTable, sources: Mapping[str, Consumer[DATA]]) -> None:
@@ -47,7 +47,7 @@ class ImageExchange:
         self._output_names = [t.name for t in outputs.tags if t.kind is not TagKind.MESSAGE]
         self._message_outputs = [t.name for t in outputs.tags if t.kind is TagKind.MESSAGE]
         self._consumed: dict[str, int] = {}
-        self.untaken: dict[str, int] = {}
+        self.undelivered: dict[str, int] = {}
         """By output message tag: how many messages that were read have not been handled yet."""
         self.outputs: dict[str, TagValue] = {}
         """Built anew when a value or quality changes; its times are those of that change."""
@@ -124,8 +124,8 @@ class ImageExchange:
         columns.refresh(now_ns)
         for at, tag in self._taken:
             taken = self._reader.seen(tag)
-            if tag in self.untaken:  # messages that were read just now are handled later
-                taken -= self.untaken[tag] + len(self.new_messages.get(tag, ()))
+            if tag in self.undelivered:  # messages that were read just now are handled later
+                taken -= self.undelivered[tag] + len(self.new_messages.get(tag, ()))
             columns.put(at, taken, now_ns)
         self._writer.publish_mixed(
             columns.values,
@@ -158,7 +158,7 @@ class _Columns:
 
     def refresh(self, now_ns: int) -> None:
         """Take over what is new in the table, and what became stale by `now_ns`."""
-        news = self._tags.take_news()
+        news = self._tags.take_changes()
         if now_ns > self._earliest_ns:
             self._earliest_ns = FOREVER_NS
             for name, at in self._index.items():

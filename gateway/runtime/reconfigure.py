@@ -15,7 +15,7 @@ import msgspec
 
 from fieldtwin.gateway.core.files.profile import DeviceProfile
 from fieldtwin.gateway.core.values import Quality, Reason, TagValue
-from fieldtwin.gateway.runtime.buses.pending_config import AnyDriver, Coming
+from fieldtwin.gateway.runtime.buses.pending_config import AnyDriver, PendingConfig
 from fieldtwin.gateway.runtime.gateway import Gateway, GatewayConfig, stale_limits
 
 OF_DECODING = frozenset({Reason.NONE, Reason.OUT_OF_RANGE, Reason.NOT_A_NUMBER, Reason.SENTINEL})
@@ -30,7 +30,7 @@ async def reconfigure(gateway: Gateway, config: GatewayConfig) -> None:
     coming = []
     for name, bus in gateway.buses.items():
         on_it = {d.name: d for d in config.devices.values() if d.bus == name}
-        coming.append(Coming(config.buses[name], on_it, _Taking(gateway, on_it)))
+        coming.append(PendingConfig(config.buses[name], on_it, _Taking(gateway, on_it)))
         bus.reconfigure(coming[-1])
     for each in coming:
         await each.done.wait()

@@ -175,7 +175,7 @@ class TagTable:
         held = self._held.get(name)
         return FOREVER_NS if held is None else held.fresh_until_ns
 
-    def take_news(self) -> Collection[Held]:
+    def take_changes(self) -> Collection[Held]:
         """Return the tags that were stored since the last call, for the one reader that mirrors the table."""
         if not self._news:
             return ()

@@ -14,17 +14,20 @@ from fieldtwin.capture.recordings.comparing import Comparer, Comparison, Rules, 
 from fieldtwin.capture.recordings.comparing_can import compare_logs
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.files.profile import DeviceProfile, load_profile
-from fieldtwin.gateway.core.files.recording import Exchange
+from fieldtwin.gateway.core.files.recording import RecordedExchange
 
 MS = 1_000_000
 
 
-def asked(request: bytes, reply: bytes | None, latency_s: float = 0.01) -> Exchange:
-    return Exchange(0.0, 1, request, reply, latency_s, None if reply is not None else "timeout")
+def asked(request: bytes, reply: bytes | None, latency_s: float = 0.01) -> RecordedExchange:
+    return RecordedExchange(0.0, 1, request, reply, latency_s, None if reply is not None else "timeout")
 
 
 def compared(
-    one: list[Exchange], two: list[Exchange], rules: Rules | None = None, profile: DeviceProfile | None = None
+    one: list[RecordedExchange],
+    two: list[RecordedExchange],
+    rules: Rules | None = None,
+    profile: DeviceProfile | None = None,
 ) -> Comparison:
     comparer = Comparer(rules, profile)
     for a, b in pairs_of(one, two, request_of):
@@ -56,7 +59,7 @@ def test_tags_have_separate_tolerances_and_counters_may_have_increased(tmp_path:
     )
     profile = load_profile(path)
 
-    def meter(volts: float, energy: int, name: bytes, other: int = 0) -> list[Exchange]:
+    def meter(volts: float, energy: int, name: bytes, other: int = 0) -> list[RecordedExchange]:
         return [asked(read(0, 7), b"\x03\x0e" + struct.pack(">fI4sH", volts, energy, name, other))]
 
     rules = Rules(tags={"volts": Tolerance(0.5)})

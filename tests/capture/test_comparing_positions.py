@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 from fieldtwin.capture.recordings.aligning import _overlaps
 from fieldtwin.capture.recordings.comparing import Comparer, Comparison, Rules, Tolerance
 from fieldtwin.commissioning.record.comparing import compare_device
-from fieldtwin.emulators.context import WhenUsedUp
+from fieldtwin.emulators.context import EndOfRecording
 from fieldtwin.emulators.replay.replay import ExchangeReplay
-from fieldtwin.gateway.core.files.recording import Exchange
+from fieldtwin.gateway.core.files.recording import RecordedExchange
 
 READ = bytes.fromhex("03 0000 0002")
 ONE = bytes.fromhex("03 0000 0001")
@@ -29,8 +29,8 @@ def registers(*values: int) -> bytes:
     return bytes((3, 2 * len(values))) + b"".join(value.to_bytes(2) for value in values)
 
 
-def talk(request: bytes, replies: Iterable[bytes]) -> list[Exchange]:
-    return [Exchange(float(at), 1, request, reply, 0.01) for at, reply in enumerate(replies)]
+def talk(request: bytes, replies: Iterable[bytes]) -> list[RecordedExchange]:
+    return [RecordedExchange(float(at), 1, request, reply, 0.01) for at, reply in enumerate(replies)]
 
 
 RAMP = talk(READ, [registers(7, value) for value in (10, 20, 30, 40, 50, 60)])
@@ -42,18 +42,23 @@ class Replayed:
     def __init__(self, respond: Callable[[int, bytes], bytes | None]) -> None:
         self.respond = respond
 
-    async def ask(self, unit: int, pdu: bytes) -> Exchange | None:
+    async def ask(self, unit: int, pdu: bytes) -> RecordedExchange | None:
         reply = self.respond(unit, pdu)
-        return Exchange(0.0, unit, pdu, reply, 0.01, None if reply is not None else "timeout")
+        return RecordedExchange(0.0, unit, pdu, reply, 0.01, None if reply is not None else "timeout")
 
 
-def emulator(recorded: list[Exchange], policy: WhenUsedUp = WhenUsedUp.HOLD) -> Callable[[int, bytes], bytes | None]:
+def emulator(
+    recorded: list[RecordedExchange], policy: EndOfRecording = EndOfRecording.HOLD
+) -> Callable[[int, bytes], bytes | None]:
     replay = ExchangeReplay(recorded, when_used_up=policy)
     return lambda unit, pdu: replay.respond(unit, pdu).reply
 
 
 def compared(
-    recorded: list[Exchange], device: Callable[[int, bytes], bytes | None], rules: Rules | None = None, most: int = 0
+    recorded: list[RecordedExchange],
+    device: Callable[[int, bytes], bytes | None],
+    rules: Rules | None = None,
+    most: int = 0,
 ) -> Comparison:
     comparer = Comparer(rules or Rules(latency=None))
     asyncio.run(compare_device(recorded, Replayed(device), comparer, most=most))  # type: ignore[arg-type]
@@ -62,7 +67,7 @@ def compared(
 
 def test_an_emulator_that_loops_is_equal_whatever_was_read_before() -> None:
     for before in range(14):
-        device = emulator(RAMP, WhenUsedUp.LOOP)
+        device = emulator(RAMP, EndOfRecording.LOOP)
         for _ in range(before):
             device(1, READ)
         result = compared(RAMP, device)
@@ -83,7 +88,7 @@ def test_the_remaining_values_of_a_holding_emulator_are_compared_and_the_rest_is
 
 def test_a_part_that_was_read_before_moves_only_its_own_registers() -> None:
     recorded = talk(READ, [registers(value, 100 - value) for value in (10, 20, 30, 40, 50, 60)])
-    device = emulator(recorded, WhenUsedUp.LOOP)
+    device = emulator(recorded, EndOfRecording.LOOP)
     for _ in range(2):
         device(1, ONE)
     result = compared(recorded, device)
@@ -92,7 +97,7 @@ def test_a_part_that_was_read_before_moves_only_its_own_registers() -> None:
 
 def test_bits_are_aligned_too() -> None:
     recorded = talk(BITS, [bytes((1, 1, value)) for value in (0, 1, 3, 7, 0, 2)])
-    device = emulator(recorded, WhenUsedUp.LOOP)
+    device = emulator(recorded, EndOfRecording.LOOP)
     device(1, BITS)
     assert compared(recorded, device).met
 

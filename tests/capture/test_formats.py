@@ -23,7 +23,7 @@ from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid, UsageError
 from fieldtwin.gateway.core.files.profile import load_profile
 from fieldtwin.gateway.core.files.recording import (
-    Exchange,
+    RecordedExchange,
     RecordingHeader,
     RecordingReader,
     encode_exchange,
@@ -202,9 +202,10 @@ def test_a_poll_session_becomes_a_recording_with_a_draft(tmp_path: Path) -> None
 
 def recording(folder: Path) -> Path:
     exchanges = [
-        Exchange(0.0, 1, bytes.fromhex("0300000002"), bytes.fromhex("030400070008"), 0.012),
-        Exchange(1.0, 1, b"\x11", None, error="timeout"),
-        Exchange(2.0, 2, bytes.fromhex("0300000002"), b"\x83\x02", 0.01), Exchange(3.0, 0, bytes.fromhex("0600010005"), b""),
+        RecordedExchange(0.0, 1, bytes.fromhex("0300000002"), bytes.fromhex("030400070008"), 0.012),
+        RecordedExchange(1.0, 1, b"\x11", None, error="timeout"),
+        RecordedExchange(2.0, 2, bytes.fromhex("0300000002"), b"\x83\x02", 0.01),
+        RecordedExchange(3.0, 0, bytes.fromhex("0600010005"), b""),
     ]  # fmt: skip
     path = folder / "r.jsonl"
     path.write_bytes(encode_header(HEADER) + b"".join(map(encode_exchange, exchanges)))

@@ -11,21 +11,21 @@ from click.testing import CliRunner
 from fieldtwin.cli.device.infer_command import command
 from fieldtwin.commissioning.infer.recorded_passes import dump_of_recording
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
-from fieldtwin.gateway.core.files.recording import Exchange, RecordingHeader, encode_exchange, encode_header
+from fieldtwin.gateway.core.files.recording import RecordedExchange, RecordingHeader, encode_exchange, encode_header
 
 HEADER = RecordingHeader(version=1, device="sniffed/line", kind="exchanges", source="measured")
 FAST, SLOW = bytes.fromhex("0300000002"), bytes.fromhex("0400100001")
 
 
-def polled(rounds: int, unit: int = 7) -> list[Exchange]:
+def polled(rounds: int, unit: int = 7) -> list[RecordedExchange]:
     """A counter of two words each second, its low word first, and a temperature every five seconds."""
     found = []
     for n in range(rounds):
         count = 65_400 + 37 * n
         reply = bytes([3, 4]) + (count & 0xFFFF).to_bytes(2) + (count >> 16).to_bytes(2)
-        found.append(Exchange(float(n), unit, FAST, reply, 0.01))
+        found.append(RecordedExchange(float(n), unit, FAST, reply, 0.01))
         if n % 5 == 0:
-            found.append(Exchange(n + 0.1, unit, SLOW, bytes([4, 2]) + (200 + n % 7).to_bytes(2), 0.01))
+            found.append(RecordedExchange(n + 0.1, unit, SLOW, bytes([4, 2]) + (200 + n % 7).to_bytes(2), 0.01))
     return found
 
 
@@ -37,7 +37,7 @@ def test_a_pass_is_a_round_of_requests_with_the_newest_value_of_slower_ones() ->
 
 
 def test_exceptions_and_replies_of_the_wrong_size_bring_no_values() -> None:
-    bad = [Exchange(0.5, 7, FAST, b"\x83\x02", 0.01), Exchange(0.6, 7, FAST, b"\x03\x02\xff\xff", 0.01)]
+    bad = [RecordedExchange(0.5, 7, FAST, b"\x83\x02", 0.01), RecordedExchange(0.6, 7, FAST, b"\x03\x02\xff\xff", 0.01)]
     dump = dump_of_recording("r.jsonl", HEADER, [*polled(3)[:1], *bad, *polled(3)[1:]])
     assert b"\xff\xff" not in {value for p in dump.passes for value in p.cells.values()}
 

@@ -17,15 +17,15 @@ from fieldtwin.capture.formats.pcap import read_capture
 from fieldtwin.capture.recordings.from_packets import PacketImport, PacketSummary
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.core.files.profile import load_profile
-from fieldtwin.gateway.core.files.recording import Exchange, RecordingReader
+from fieldtwin.gateway.core.files.recording import RecordedExchange, RecordingReader
 
 
-def exchanges(path: Path) -> list[Exchange]:
+def exchanges(path: Path) -> list[RecordedExchange]:
     with RecordingReader(path) as reader:
         return list(reader.exchanges())
 
 
-def imported(folder: Path, capture: bytes, ports: tuple[int, ...] = ()) -> tuple[PacketSummary, list[Exchange]]:
+def imported(folder: Path, capture: bytes, ports: tuple[int, ...] = ()) -> tuple[PacketSummary, list[RecordedExchange]]:
     """Return the summary, and the exchanges of the only recording."""
     summary = PacketImport(write(folder / "c.pcap", capture), folder / "r.jsonl", ports).run()
     assert len(summary.made) == 1, summary
@@ -44,7 +44,7 @@ def polls(port: int = 502, *, opened: bool = True) -> list[bytes]:
 WANTED = [(1, read(10 * i, 2), values(i, 500 + i)) for i in range(4)]
 
 
-def told(found: list[Exchange]) -> list[tuple[int, bytes, bytes | None]]:
+def told(found: list[RecordedExchange]) -> list[tuple[int, bytes, bytes | None]]:
     return [(e.unit, e.request, e.reply) for e in found]
 
 

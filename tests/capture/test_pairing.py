@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from packets import mbap, read, values
 
-from fieldtwin.capture.recordings.pairing import Bad, MbapPairer, OneWirePairer, Pairer, SerialPairer
-from fieldtwin.gateway.core.files.recording import Exchange
+from fieldtwin.capture.recordings.pairing import Bad, HalfDuplexPairer, MbapPairer, Pairer, SerialPairer
+from fieldtwin.gateway.core.files.recording import RecordedExchange
 
 MS = 1_000_000
 
@@ -24,13 +24,13 @@ def crc(data: bytes) -> bytes:
     return data + struct.pack("<H", value)
 
 
-def run(wire: Pairer, *steps: tuple[bool, bytes]) -> list[Exchange]:
+def run(wire: Pairer, *steps: tuple[bool, bytes]) -> list[RecordedExchange]:
     """Return the exchanges of chunks that are a millisecond apart."""
     found = [e for i, (sent, data) in enumerate(steps) for e in wire.feed(sent, data, i * MS)]
     return found + wire.finish()
 
 
-def told(exchanges: list[Exchange]) -> list[tuple[int, bytes, bytes | None, str | None]]:
+def told(exchanges: list[RecordedExchange]) -> list[tuple[int, bytes, bytes | None, str | None]]:
     return [(e.unit, e.request, e.reply, e.error) for e in exchanges]
 
 
@@ -137,7 +137,7 @@ def test_ascii_and_half_duplex_in_both_directions() -> None:
         b"\x02" + read(0),
         b"\x01" + read(0),
     ]
-    found = run(OneWirePairer("rtu", 0), *((True, crc(f)) for f in frames))
+    found = run(HalfDuplexPairer("rtu", 0), *((True, crc(f)) for f in frames))
     assert told(found) == [
         (1, read(0), values(7), None), (1, write, write, None), (2, read(0), None, "timeout"),
         (1, read(0), None, "timeout"),
@@ -147,7 +147,7 @@ def test_ascii_and_half_duplex_in_both_directions() -> None:
 @settings(max_examples=60)
 @given(st.lists(st.tuples(st.booleans(), st.binary(max_size=300)), max_size=12))
 def test_any_bytes_are_counted_and_nothing_is_raised(steps: list[tuple[bool, bytes]]) -> None:
-    for wire in (MbapPairer(0), SerialPairer("rtu", 0), SerialPairer("ascii", 0), OneWirePairer("rtu", 0)):
+    for wire in (MbapPairer(0), SerialPairer("rtu", 0), SerialPairer("ascii", 0), HalfDuplexPairer("rtu", 0)):
         for exchange in run(wire, *steps):
             assert exchange.request
             assert (exchange.reply is None) == (exchange.error is not None)

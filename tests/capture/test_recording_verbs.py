@@ -20,7 +20,7 @@ from fieldtwin.cli.recordings.export_command import command as export
 from fieldtwin.cli.recordings.record_command import command as record
 from fieldtwin.gateway.core.errors import FileInvalid, NotAllowed, Unreachable, UsageError
 from fieldtwin.gateway.core.files.recording import (
-    Exchange,
+    RecordedExchange,
     RecordingHeader,
     RecordingReader,
     encode_exchange,
@@ -106,7 +106,7 @@ def test_unrecordable_items_are_reported(
 
 def _write(path: Path, *requests: str) -> Path:
     header = RecordingHeader(version=1, device="a/b", kind="exchanges", source="measured")
-    lines = [encode_exchange(Exchange(0.0, 1, bytes.fromhex(r), bytes.fromhex(r))) for r in requests]
+    lines = [encode_exchange(RecordedExchange(0.0, 1, bytes.fromhex(r), bytes.fromhex(r))) for r in requests]
     path.write_bytes(encode_header(header) + b"".join(lines))
     return path
 

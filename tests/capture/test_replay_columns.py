@@ -9,14 +9,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from packets import read, values
 
-from fieldtwin.emulators.context import WhenUsedUp
+from fieldtwin.emulators.context import EndOfRecording
 from fieldtwin.emulators.replay import learning
 from fieldtwin.emulators.replay.replay import ExchangeReplay, NeverRecorded
-from fieldtwin.gateway.core.files.recording import Exchange
+from fieldtwin.gateway.core.files.recording import RecordedExchange
 
 
-def asked(request: bytes, reply: bytes | None, t_s: float = 0.0, unit: int = 1) -> Exchange:
-    return Exchange(t_s, unit, request, reply, 0.01, None if reply is not None else "timeout")
+def asked(request: bytes, reply: bytes | None, t_s: float = 0.0, unit: int = 1) -> RecordedExchange:
+    return RecordedExchange(t_s, unit, request, reply, 0.01, None if reply is not None else "timeout")
 
 
 def words(replay: ExchangeReplay, address: int, count: int = 1) -> tuple[int, ...]:
@@ -63,7 +63,7 @@ def test_every_cell_continues_in_recorded_order_whatever_it_was_read_with(
 def test_outcomes_of_a_read_keep_their_order_and_latency() -> None:
     replies = [values(1), b"\x83\x06", None, values(2)]
     replay = ExchangeReplay(
-        Exchange(n, 1, read(0), r, n / 100, None if r else "timeout") for n, r in enumerate(replies)
+        RecordedExchange(n, 1, read(0), r, n / 100, None if r else "timeout") for n, r in enumerate(replies)
     )
     assert [(replay.respond(1, read(0)).reply) for _ in range(5)] == [*replies, values(2)]
     assert replay.respond(1, read(0)).latency_s == 0.03
@@ -71,7 +71,7 @@ def test_outcomes_of_a_read_keep_their_order_and_latency() -> None:
 
 
 def test_copies_share_the_recording_and_each_starts_at_its_beginning() -> None:
-    replay = ExchangeReplay([asked(read(0, 2), values(n, n + 50)) for n in range(3)], when_used_up=WhenUsedUp.LOOP)
+    replay = ExchangeReplay([asked(read(0, 2), values(n, n + 50)) for n in range(3)], when_used_up=EndOfRecording.LOOP)
     one, two = replay.copy(), replay.copy()
     assert [words(one, 0)[0] for _ in range(5)] == [0, 1, 2, 0, 1]
     assert [words(two, 1)[0] for _ in range(2)] == [50, 51]

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from report_rig import MS, can, note, observatory
 
 from fieldtwin.capture.decoding.decoder import Decoder, exchanges
-from fieldtwin.capture.decoding.exchange import Exchange, Span
+from fieldtwin.capture.decoding.exchange import DecodedExchange, Span
 from fieldtwin.capture.decoding.sdo import SdoWatch, Transfer
 from fieldtwin.emulators.canopen.sdo_server import SdoServer
 from fieldtwin.gateway.core.canframe import CanFrame
@@ -21,7 +21,7 @@ from fieldtwin.gateway.protocols.canopen.sdo_block import SdoBlockDownload, SdoB
 from fieldtwin.results.trace import Event, Kind
 
 
-def only(events: list[Event]) -> Exchange:
+def only(events: list[Event]) -> DecodedExchange:
     (found,) = exchanges(observatory(), events)
     return found
 
@@ -254,7 +254,7 @@ def test_secrets_have_no_value_in_text_nor_in_json() -> None:
     system = replace(system, devices={**system.devices, "inclinometer": device})
     decoder, told = Decoder(system), []
     frames = ["605#4018100400000000", "585#43181004ED030000", "605#2318100477000000", "185#9E013599", "185#9E01FF"]
-    found: list[Exchange] = []
+    found: list[DecodedExchange] = []
     for ms, frame in enumerate(frames):
         decoded = decoder.decode(can(ms, frame))
         told.append(decoded.text)

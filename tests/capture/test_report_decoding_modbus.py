@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from report_rig import CTD_VALUES, MS, READ_CTD, adu, answer, ask, chunk, observatory
 
 from fieldtwin.capture.decoding.decoder import Decoder, exchanges
-from fieldtwin.capture.decoding.exchange import Exchange, Span
-from fieldtwin.capture.decoding.modbus_connection import ModbusWire, Unit
+from fieldtwin.capture.decoding.exchange import DecodedExchange, Span
+from fieldtwin.capture.decoding.modbus_connection import ModbusConnectionDecoder, Unit
 from fieldtwin.capture.decoding.modbus_frames import splitter
 from fieldtwin.capture.decoding.modbus_pdu import parse_request
 from fieldtwin.capture.decoding.tags import TagMap
@@ -24,7 +24,7 @@ from fieldtwin.results.trace import Event
 METER = Path(__file__).parents[2] / "profiles" / "devices" / "eastron-sdm630.yaml"
 
 
-def only(events: list[Event]) -> Exchange:
+def only(events: list[Event]) -> DecodedExchange:
     (found,) = exchanges(observatory(), events)
     return found
 
@@ -141,7 +141,9 @@ def test_a_header_that_cannot_be_right_is_noise() -> None:
 
 
 def test_an_echo_is_not_a_reply() -> None:
-    wire = ModbusWire("line1", "rtu", {1: Unit("ctd", TagMap(observatory().devices["ctd"].profile))}, echo=True)
+    wire = ModbusConnectionDecoder(
+        "line1", "rtu", {1: Unit("ctd", TagMap(observatory().devices["ctd"].profile))}, echo=True
+    )
     asked = with_crc(bytes.fromhex("01 06 0001 0005"))  # a write's reply looks like its echo
     assert wire.feed(True, asked, 0)[1] == []
     assert wire.feed(False, asked[:5], 1) == (["echo"], [])
@@ -151,7 +153,7 @@ def test_an_echo_is_not_a_reply() -> None:
 
 
 def test_a_served_wire_is_requested_by_the_remote_side() -> None:
-    wire = ModbusWire("hmi", "mbap", {}, served=True)
+    wire = ModbusConnectionDecoder("hmi", "mbap", {}, served=True)
     request = adu(5, "04 0000 0002", unit=255)
     assert wire.feed(False, request[:4], 0) == (["4 bytes of a request"], [])
     assert wire.feed(False, request[4:], 1)[0] == ["unit 255: read input registers 30001 (input:0) x 2"]
@@ -164,7 +166,7 @@ def test_ascii() -> None:
         raw = bytes.fromhex(body)
         return b":" + (raw + bytes([lrc(raw)])).hex().upper().encode() + b"\r\n"
 
-    wire = ModbusWire("line1", "ascii", {})
+    wire = ModbusConnectionDecoder("line1", "ascii", {})
     wire.feed(True, frame("01 03 0000 0001"), 0)
     said, done = wire.feed(False, b"xx:0103" + frame("01 03 02 00FF"), 7)
     assert done[0].registers == (255,)
@@ -194,7 +196,7 @@ def test_the_addresses_of_requests(pdu: str, spans: list[Span]) -> None:
 
 
 def test_bits() -> None:
-    wire = ModbusWire("line1", "rtu", {})
+    wire = ModbusConnectionDecoder("line1", "rtu", {})
     wire.feed(True, with_crc(bytes.fromhex("01 0F 0007 000A 02 CD01")), 0)
     (done,) = wire.feed(False, with_crc(bytes.fromhex("01 0F 0007 000A")), 1)[1]
     assert done.registers == (1, 0, 1, 1, 0, 0, 1, 1, 1, 0)
@@ -233,7 +235,7 @@ def test_chunk_borders_mean_nothing(data: st.DataObject) -> None:
 )
 @settings(max_examples=60)
 def test_any_bytes_are_described_completely(framing: str, chunks: list[tuple[bool, bytes]]) -> None:
-    wire = ModbusWire("line1", framing, {1: Unit("ctd", TagMap(observatory().devices["ctd"].profile))})
+    wire = ModbusConnectionDecoder("line1", framing, {1: Unit("ctd", TagMap(observatory().devices["ctd"].profile))})
     for t_ns, (sent, data) in enumerate(chunks):
         said, _ = wire.feed(sent, data, t_ns)
         assert all(said)
@@ -282,7 +284,7 @@ def test_an_answer_in_pieces_over_the_next_request_is_whole() -> None:
 
 
 def test_secrets_have_no_value_in_text() -> None:
-    wire = ModbusWire("line1", "rtu", {1: Unit("meter", TagMap(load_profile(METER)))})
+    wire = ModbusConnectionDecoder("line1", "rtu", {1: Unit("meter", TagMap(load_profile(METER)))})
     words = wire.feed(True, with_crc(bytes.fromhex("01 10 000E 0002 04 447A0000")), 0)[0]
     assert words == ["meter: write registers 40015 (holding:14) x 2: password (secret)"]
     wire.feed(True, with_crc(bytes.fromhex("01 03 000F 0001")), 1)

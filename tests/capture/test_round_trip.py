@@ -38,7 +38,7 @@ from fieldtwin.commissioning.record.polling import (
 )
 from fieldtwin.commissioning.record.tapping import LineTap
 from fieldtwin.emulators.canopen.serve import serve_node
-from fieldtwin.emulators.context import WhenUsedUp
+from fieldtwin.emulators.context import EndOfRecording
 from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
 from fieldtwin.emulators.models.emulated_node import emulated_node
 from fieldtwin.emulators.replay.can_log import CanLog
@@ -51,7 +51,7 @@ from fieldtwin.gateway.core.connection import Direction
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import Unreachable, UsageError
 from fieldtwin.gateway.core.files.profile import load_profile
-from fieldtwin.gateway.core.files.recording import Exchange, RecordingHeader, encode_exchange, encode_header
+from fieldtwin.gateway.core.files.recording import RecordedExchange, RecordingHeader, encode_exchange, encode_header
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient
 from fieldtwin.gateway.protocols.modbus.requests import ReadRegisters
 from fieldtwin.gateway.wallclock import WallClock
@@ -62,7 +62,7 @@ HEADER = RecordingHeader(version=1, device="a/b", kind="exchanges", source="meas
 UNTIMED = Rules(latency=None)
 
 
-def write(path: Path, exchanges: Iterable[Exchange]) -> Path:
+def write(path: Path, exchanges: Iterable[RecordedExchange]) -> Path:
     path.write_bytes(encode_header(HEADER) + b"".join(map(encode_exchange, exchanges)))
     return path
 
@@ -70,14 +70,16 @@ def write(path: Path, exchanges: Iterable[Exchange]) -> Path:
 def shipped(folder: Path) -> Path:
     """The shipped recording of a drive, followed by results of all kinds; shortened, and without its latencies."""
     drive = [
-        Exchange(e.t_s, e.unit, e.request, e.reply) for e in exchanges_of(ROOT / "recordings" / "delta-vfd-e.jsonl")
+        RecordedExchange(e.t_s, e.unit, e.request, e.reply)
+        for e in exchanges_of(ROOT / "recordings" / "delta-vfd-e.jsonl")
     ][:44]
     more = [
-        Exchange(9.0, 1, bytes.fromhex("0300070001"), b"\x83\x02"), Exchange(9.1, 1, bytes.fromhex("0300080001"), b"\x83\x06"),
-        Exchange(9.2, 1, bytes.fromhex("0300080001"), bytes.fromhex("03020005")),
-        Exchange(9.3, 1, b"\x11", bytes.fromhex("110401ff4142")),
-        Exchange(9.4, 1, bytes.fromhex("0100000009"), bytes.fromhex("0102ff01")),
-        Exchange(9.5, 1, bytes.fromhex("0300000000"), b"\x83\x03"),
+        RecordedExchange(9.0, 1, bytes.fromhex("0300070001"), b"\x83\x02"),
+        RecordedExchange(9.1, 1, bytes.fromhex("0300080001"), b"\x83\x06"),
+        RecordedExchange(9.2, 1, bytes.fromhex("0300080001"), bytes.fromhex("03020005")),
+        RecordedExchange(9.3, 1, b"\x11", bytes.fromhex("110401ff4142")),
+        RecordedExchange(9.4, 1, bytes.fromhex("0100000009"), bytes.fromhex("0102ff01")),
+        RecordedExchange(9.5, 1, bytes.fromhex("0300000000"), b"\x83\x03"),
     ]  # fmt: skip
     return write(folder / "original.jsonl", drive + more)
 
@@ -88,7 +90,7 @@ async def played(recording: Path, wire: str) -> AsyncIterator[None]:
     host = DeviceHost(1.0)
     try:
         async with Nursery() as nursery:
-            units = host.replayed(recording, None, NeverRecorded.EXCEPTION, WhenUsedUp.HOLD)
+            units = host.replayed(recording, None, NeverRecorded.EXCEPTION, EndOfRecording.HOLD)
             await host.serve(nursery, units, Endpoint.parse(wire))
             yield
     finally:
@@ -167,7 +169,7 @@ def _free_port() -> int:
 def test_a_third_party_server_is_recorded_and_its_emulator_is_equivalent(tmp_path: Path) -> None:
     """A pymodbus server: 100 registers that count, then exception 02."""
     requests = ["0300000064", "0300000001", "0300630001", "0300640001", "03005f000a"]
-    wanted = write(tmp_path / "wanted.jsonl", [Exchange(0, 1, bytes.fromhex(r), b"\x83\x01") for r in requests])
+    wanted = write(tmp_path / "wanted.jsonl", [RecordedExchange(0, 1, bytes.fromhex(r), b"\x83\x01") for r in requests])
     theirs, ours = _free_port(), _free_port()
 
     async def main() -> Comparison:
@@ -192,10 +194,10 @@ def test_a_planted_difference_of_each_kind_is_found(tmp_path: Path) -> None:
     original = shipped(tmp_path)
     exchanges = list(exchanges_of(original))
     planted = [
-        (4, Exchange(0, 1, exchanges[4].request, bytes.fromhex("0302ffff")), "value"),
-        (44, Exchange(0, 1, exchanges[44].request, b"\x83\x04"), "exception"),
-        (0, Exchange(0, 1, exchanges[0].request, None, error="timeout"), "silence"),
-        (47, Exchange(0, 1, exchanges[47].request, exchanges[47].reply + b"\0"), "reply"),
+        (4, RecordedExchange(0, 1, exchanges[4].request, bytes.fromhex("0302ffff")), "value"),
+        (44, RecordedExchange(0, 1, exchanges[44].request, b"\x83\x04"), "exception"),
+        (0, RecordedExchange(0, 1, exchanges[0].request, None, error="timeout"), "silence"),
+        (47, RecordedExchange(0, 1, exchanges[47].request, exchanges[47].reply + b"\0"), "reply"),
     ]  # fmt: skip
     for at, other, what in planted:
         changed = write(tmp_path / f"{what}.jsonl", [*exchanges[:at], other, *exchanges[at + 1 :]])
@@ -213,9 +215,9 @@ def test_a_profile_is_polled_in_few_reads_and_refused_reads_are_split(tmp_path: 
         'device: a/b\nsource: ""\nprotocol: modbus\ntags:\n  one: {at: "holding:0"}\n  two: {at: "holding:4"}\n'
     )
     gap = write(tmp_path / "gap.jsonl", [
-        Exchange(0, 1, bytes.fromhex("0300000005"), b"\x83\x02"),
-        Exchange(0, 1, bytes.fromhex("0300000001"), bytes.fromhex("03020001")),
-        Exchange(0, 1, bytes.fromhex("0300040001"), bytes.fromhex("03020002")),
+        RecordedExchange(0, 1, bytes.fromhex("0300000005"), b"\x83\x02"),
+        RecordedExchange(0, 1, bytes.fromhex("0300000001"), bytes.fromhex("03020001")),
+        RecordedExchange(0, 1, bytes.fromhex("0300040001"), bytes.fromhex("03020002")),
     ])  # fmt: skip
     url = f"tcp://127.0.0.1:{_free_port()}"
 
@@ -234,7 +236,7 @@ def test_a_profile_is_polled_in_few_reads_and_refused_reads_are_split(tmp_path: 
 def test_only_reads_are_asked_again(tmp_path: Path) -> None:
     reads = ["0300000001", "08000b0000", "2b0e0100", "11"]
     requests = [*reads, "0600010005", "0f000000010101", "64", "160004000000ff", "0800010000"]
-    source = [Exchange(0, 1, bytes.fromhex(r), b"\x83\x01") for r in requests]
+    source = [RecordedExchange(0, 1, bytes.fromhex(r), b"\x83\x01") for r in requests]
     same = SameRequests([*source, *source])
     assert [pdu.hex() for _, pdu in same.requests] == reads
     assert same.left_out == 2 * 5
@@ -242,8 +244,10 @@ def test_only_reads_are_asked_again(tmp_path: Path) -> None:
 
 def test_writes_are_repeated_only_on_request_and_to_wearing_memory_once(tmp_path: Path) -> None:
     write_hex, other_hex, read_hex = "0600010005", "0600020006", "0300010002"
-    exchanges = [Exchange(n, 1, bytes.fromhex(h), bytes.fromhex(h)) for n, h in enumerate([write_hex, other_hex] * 3)]
-    exchanges.append(Exchange(9, 1, bytes.fromhex(read_hex), bytes.fromhex("030400050006")))
+    exchanges = [
+        RecordedExchange(n, 1, bytes.fromhex(h), bytes.fromhex(h)) for n, h in enumerate([write_hex, other_hex] * 3)
+    ]
+    exchanges.append(RecordedExchange(9, 1, bytes.fromhex(read_hex), bytes.fromhex("030400050006")))
     original = write(tmp_path / "w.jsonl", exchanges)
     url = f"tcp://127.0.0.1:{_free_port()}"
 
@@ -262,7 +266,9 @@ def test_writes_are_repeated_only_on_request_and_to_wearing_memory_once(tmp_path
 
 
 def test_a_device_that_is_disconnected_for_a_while_is_recorded_again_when_it_returns(tmp_path: Path) -> None:
-    one = write(tmp_path / "one.jsonl", [Exchange(0, 1, bytes.fromhex("0300000001"), bytes.fromhex("03020001"))])
+    one = write(
+        tmp_path / "one.jsonl", [RecordedExchange(0, 1, bytes.fromhex("0300000001"), bytes.fromhex("03020001"))]
+    )
     url = f"tcp://127.0.0.1:{_free_port()}"
     counters, stop = PollCounters(), asyncio.Event()
 
@@ -436,7 +442,7 @@ def test_a_killed_recorder_loses_the_last_record_at_most(tmp_path: Path) -> None
 def test_parts_are_bounded_and_the_oldest_go(tmp_path: Path) -> None:
     out = tmp_path / "r.jsonl"
     head = encode_header(HEADER)
-    lines = [encode_exchange(Exchange(float(n), 1, b"\x11", b"\x91\x01")) for n in range(200)]
+    lines = [encode_exchange(RecordedExchange(float(n), 1, b"\x11", b"\x91\x01")) for n in range(200)]
     with RotatingFile(out, head, max_bytes=1000, keep=3) as file:
         for n, line in enumerate(lines):
             file.line(float(n), line)

@@ -15,8 +15,8 @@ from collections.abc import Iterator
 import pytest
 from device_rig import emulated, started_runner
 
-from fieldtwin.capture.decoding.canopen_bus import CanopenWire
-from fieldtwin.capture.decoding.exchange import Exchange as Decoded
+from fieldtwin.capture.decoding.canopen_bus import CanopenBusDecoder
+from fieldtwin.capture.decoding.exchange import DecodedExchange as Decoded
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.scenarios.judging.expectation import wire_matches
 from fieldtwin.scenarios.language.form import Expect
@@ -171,7 +171,7 @@ def test_an_asynchronous_driver_can_be_awaited_during_expect(device: Device) -> 
 
 
 def test_an_sdo_transfer_that_is_read_between_its_segments_stays_complete() -> None:
-    wire = CanopenWire("can0", [])
+    wire = CanopenBusDecoder("can0", [])
     frames = [
         (0x605, "4000200000000000"), (0x585, "410020000a000000"), (0x605, "6000000000000000"),
         (0x585, "0031323334353637"), (0x605, "7000000000000000"), (0x585, "1938393000000000"),

@@ -13,9 +13,9 @@ from collections.abc import Iterator
 
 import pytest
 
-from fieldtwin.capture.decoding.canopen_bus import CanopenWire
-from fieldtwin.capture.decoding.exchange import Exchange
-from fieldtwin.capture.decoding.modbus_connection import ModbusWire
+from fieldtwin.capture.decoding.canopen_bus import CanopenBusDecoder
+from fieldtwin.capture.decoding.exchange import DecodedExchange
+from fieldtwin.capture.decoding.modbus_connection import ModbusConnectionDecoder
 from fieldtwin.emulators.modbus.rtu_receiver import with_crc
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.testing.handles import Device
@@ -87,7 +87,7 @@ def test_bounds_that_no_number_meets_are_refused(device: Device) -> None:
 
 def _answers(*replies: str) -> list[tuple[str, str]]:
     """Return problem and reply of each exchange if one RTU request for two registers is answered by `replies`, in hex."""
-    wire = ModbusWire("line1", "rtu", {})
+    wire = ModbusConnectionDecoder("line1", "rtu", {})
     wire.feed(True, with_crc(bytes((1,)) + READ), 0)
     done = [e for n, reply in enumerate(replies) for e in wire.feed(False, bytes.fromhex(reply), n)[1]]
     return [(e.problem, e.reply_text) for e in [*done, *wire.pending()]]
@@ -116,8 +116,8 @@ OTHER = CanFrame(0x585, bytes.fromhex("4301100091010000"))
 ABORT = CanFrame(0x605, bytes.fromhex("8000100000000405"))
 
 
-def _decode(*frames: CanFrame) -> list[Exchange]:
-    wire = CanopenWire("can0", [])
+def _decode(*frames: CanFrame) -> list[DecodedExchange]:
+    wire = CanopenBusDecoder("can0", [])
     found = [e for n, frame in enumerate(frames) for e in wire.feed(frame, n * 1_000_000)[1]]
     return found + wire.finish()
 

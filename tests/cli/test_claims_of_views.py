@@ -20,7 +20,7 @@ from rich.table import Table
 from support import eventually, run
 
 from fieldtwin.cli.run.run_command import command as run_system
-from fieldtwin.console import data, talk
+from fieldtwin.console import stderr, stdout
 from fieldtwin.gateway.core.files.recording import looks_like_another_file
 from fieldtwin.gateway.devices.config import Heartbeat
 from fieldtwin.run.processes import plc_client
@@ -62,7 +62,7 @@ def test_a_dump_is_not_taken_for_the_recording_of_the_profile_in_its_folder(tmp_
     assert not looks_like_another_file(recording)
 
 
-@pytest.mark.parametrize("console", [talk, data])
+@pytest.mark.parametrize("console", [stderr, stdout])
 def test_a_name_between_colons_stays_a_name(console: Console) -> None:
     """Defect: `boom.py💥 step() failed` for the class `Boom` of a model."""
     with console.capture() as seen:
@@ -70,7 +70,7 @@ def test_a_name_between_colons_stays_a_name(console: Console) -> None:
     assert seen.get() == "boom.py:Boom: step() failed\n"
 
 
-@pytest.mark.parametrize("console", [talk, data])
+@pytest.mark.parametrize("console", [stderr, stdout])
 def test_control_characters_of_a_name_are_shown_and_not_sent(console: Console) -> None:
     """Defect: the name of a scenario with ESC [31m made the rest of the terminal red."""
     table = Table("name")

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from test_scan_canopen import URL, scan
 
 from fieldtwin.commissioning.identify.canopen import identify_canopen
-from fieldtwin.commissioning.scan.can_listener import BusEar
+from fieldtwin.commissioning.scan.can_listener import BusListener
 from fieldtwin.emulators.canopen.dictionary import parse_eds
 from fieldtwin.emulators.canopen.node import CanopenNode
 from fieldtwin.gateway.core.canframe import CanFrame
@@ -137,7 +137,7 @@ def test_one_producer_is_not_taken_for_two(period_ms: int, jitter: list[float]) 
 
 @given(st.integers(2, 1000), st.floats(0.05, 0.3), st.booleans())
 def test_two_producers_of_one_period_are_noticed(period_ms: int, apart: float, counted: bool) -> None:
-    ear = BusEar()
+    ear = BusListener()
     for number in range(40):
         for shift in (0.0, apart):
             counter = bytes([number % 240 + 1]) if counted else b""

@@ -25,7 +25,7 @@ from fieldtwin.commissioning.dump.file import load_dump
 from fieldtwin.commissioning.dump.session import dump, register_spans
 from fieldtwin.commissioning.infer.costs import NUMBERS, cost, orders_of
 from fieldtwin.commissioning.infer.draft import checked, draft_profile
-from fieldtwin.commissioning.infer.fields import Level, Reading, infer_run, run_of
+from fieldtwin.commissioning.infer.fields import Interpretation, Level, infer_run, run_of
 from fieldtwin.commissioning.infer.infer import Series, infer, series_of, without_repetitions
 from fieldtwin.emulators.modbus.bank import Span
 from fieldtwin.gateway.core.errors import FileInvalid
@@ -58,7 +58,7 @@ class Hidden:
     def moves(self) -> bool:
         return len({tuple(row) for row in self.rows}) >= 6
 
-    def is_read_by(self, reading: Reading) -> bool:
+    def is_read_by(self, reading: Interpretation) -> bool:
         kinds = {reading.type, reading.type[1:]} if reading.sign_open else {reading.type}
         single = len(self.rows[0]) == 1
         here = (reading.address, reading.registers) == (self.address, len(self.rows[0]))
@@ -180,7 +180,7 @@ def test_smooth_waves_and_ramps_cause_no_false_claims(order: str, passes: int) -
             assert any(f.is_read_by(reading) for f in fields) or reading.level is not Level.CERTAIN, reading
 
 
-def one(kind: str, values: list[float], *, times_s: list[float] | None = None) -> Reading:
+def one(kind: str, values: list[float], *, times_s: list[float] | None = None) -> Interpretation:
     field = Hidden(0, kind, "ABCD", [words(kind, "ABCD", v) for v in values])
     series = series_of_fields([field])
     if times_s is not None:

@@ -26,7 +26,7 @@ from infer_corpus import START_S, corpus, packed
 from fieldtwin.commissioning.dump.file import load_dump
 from fieldtwin.commissioning.infer.calibration import CURVES, calibrated, fitted
 from fieldtwin.commissioning.infer.draft import checked, draft_profile
-from fieldtwin.commissioning.infer.fields import Level, Reading
+from fieldtwin.commissioning.infer.fields import Interpretation, Level
 from fieldtwin.commissioning.infer.infer import Inference, Series, infer, series_of
 from fieldtwin.commissioning.infer.joint import carry_evidence, toggled_bits
 
@@ -44,7 +44,7 @@ def columns_of(order: str, values: list[int], at: int = 0) -> dict[int, list[int
     return {at + i: [row[i] for row in rows] for i in range(2)}
 
 
-def at(found: Inference, address: int) -> Reading:
+def at(found: Inference, address: int) -> Interpretation:
     return next(r for r in found.readings if r.address <= address < r.address + r.registers)
 
 
@@ -225,6 +225,6 @@ def test_a_fitted_curve_rises_and_claims_no_certainty(samples: list[tuple[float,
 
 
 def test_the_level_below_half_is_called_unknown() -> None:
-    reading = Reading("holding", 0, 1, "uint16", "ABCD", 0.49, (1.0, 2.0))
+    reading = Interpretation("holding", 0, 1, "uint16", "ABCD", 0.49, (1.0, 2.0))
     assert reading.level is Level.UNKNOWN
     assert re.fullmatch("unknown", str(reading.level))

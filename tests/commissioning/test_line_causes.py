@@ -16,7 +16,7 @@ from uart_line import UartLine
 from fieldtwin.commissioning.scan.can_listener import BusHeard
 from fieldtwin.commissioning.scan.causes import Probe, SerialEvidence, can_causes, serial_causes, tcp_causes
 from fieldtwin.commissioning.scan.line import LineLook, LineReport, look_at_line, probe_of
-from fieldtwin.commissioning.scan.traffic import Heard, LineEar
+from fieldtwin.commissioning.scan.traffic import Heard, LineListener
 from fieldtwin.gateway.connections.can_facts import CanFacts
 from fieldtwin.gateway.connections.line_counters import LineCounters, unpack_counters
 from fieldtwin.gateway.core.endpoint import SerialSettings
@@ -131,7 +131,7 @@ def test_a_bus_with_traffic_and_one_with_errors() -> None:
 
 
 def heard_of(data: bytes) -> Heard:
-    ear = LineEar("rtu")
+    ear = LineListener("rtu")
     for i in range(0, len(data), 16):
         ear.feed(data[i : i + 16], i * 10_000_000)
     ear.settle(1 << 60)

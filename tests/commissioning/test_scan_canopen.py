@@ -12,7 +12,7 @@ from commissioning_rig import can_bus, loop, run_virtually
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fieldtwin.commissioning.scan.can_listener import BusEar
+from fieldtwin.commissioning.scan.can_listener import BusListener
 from fieldtwin.commissioning.scan.canopen import CanScan, CanScanner, CanScanOptions
 from fieldtwin.gateway.connections.can_facts import CanFacts
 from fieldtwin.gateway.core.canframe import CanFrame
@@ -178,7 +178,7 @@ FRAMES = st.builds(CanFrame, st.integers(0, 0x7FF), st.binary(max_size=8), remot
 @given(st.lists(FRAMES, max_size=50))
 @settings(max_examples=60, deadline=None)
 def test_listening_to_anything_never_fails(frames: list[CanFrame]) -> None:
-    ear = BusEar()
+    ear = BusListener()
     for i, frame in enumerate(frames):
         ear.feed(frame, i * 1_000_000)
     assert ear.heard.frames == len(frames)

@@ -11,7 +11,7 @@ from uart_line import UartLine, levels, sampled
 from fieldtwin.commissioning.access.progress import Progress
 from fieldtwin.commissioning.scan.modbus import ModbusScan, ModbusScanner, ScanOptions
 from fieldtwin.commissioning.scan.settings import LIKELY, name_of
-from fieldtwin.commissioning.scan.traffic import LineEar
+from fieldtwin.commissioning.scan.traffic import LineListener
 from fieldtwin.emulators.modbus.bank import Span
 from fieldtwin.emulators.modbus.rtu_receiver import with_crc
 from fieldtwin.emulators.modbus.unit import ModbusUnit
@@ -204,7 +204,7 @@ def test_ascii_lines_are_found_as_well() -> None:
 @given(st.lists(st.binary(max_size=40), max_size=20))
 @settings(max_examples=60, deadline=None)
 def test_listening_to_anything_counts_it_and_never_fails(chunks: list[bytes]) -> None:
-    ear = LineEar("rtu")
+    ear = LineListener("rtu")
     for i, chunk in enumerate(chunks):
         ear.feed(chunk, i * 20_000_000)
     ear.settle(10**12)

@@ -12,7 +12,7 @@ from fieldtwin.doctor.checks import _disk, _run_directory, examine
 from fieldtwin.doctor.host import cgroup_quota, clock_state, cpu_count, join_advice, kernel_number
 from fieldtwin.doctor.verdicts import (
     ClockState,
-    Verdict,
+    HostVerdict,
     judged_can,
     judged_clock,
     judged_processor,
@@ -24,16 +24,16 @@ from fieldtwin.doctor.verdicts import (
 @pytest.mark.parametrize(
     ("state", "verdict"),
     [
-        (None, Verdict.NOTE),
-        (ClockState(True, 0.004, 2026), Verdict.OK),
-        (ClockState(False, 16.0, 2026), Verdict.NOTE),
-        (ClockState(True, 0.004, 1970), Verdict.BAD),
+        (None, HostVerdict.NOTE),
+        (ClockState(True, 0.004, 2026), HostVerdict.OK),
+        (ClockState(False, 16.0, 2026), HostVerdict.NOTE),
+        (ClockState(True, 0.004, 1970), HostVerdict.BAD),
     ],
 )
-def test_clock(state: ClockState | None, verdict: Verdict) -> None:
+def test_clock(state: ClockState | None, verdict: HostVerdict) -> None:
     check = judged_clock(state)
     assert check.verdict is verdict
-    assert bool(check.advice) is (verdict is not Verdict.OK)
+    assert bool(check.advice) is (verdict is not HostVerdict.OK)
 
 
 @pytest.mark.parametrize(("text", "quota"), [("max 100000\n", None), ("150000 100000", 1.5), ("", None), ("1 0", None)])
@@ -42,17 +42,17 @@ def test_quota_of_a_cgroup(text: str, quota: float | None) -> None:
 
 
 def test_less_than_a_processor_is_reported() -> None:
-    assert judged_processor(8, None).verdict is Verdict.OK
-    assert judged_processor(8, 2.0).verdict is Verdict.OK
+    assert judged_processor(8, None).verdict is HostVerdict.OK
+    assert judged_processor(8, 2.0).verdict is HostVerdict.OK
     tight = judged_processor(8, 0.5)
-    assert tight.verdict is Verdict.NOTE
+    assert tight.verdict is HostVerdict.NOTE
     assert "0.5" in tight.found
 
 
 def test_inotify() -> None:
-    assert judged_watches(128).verdict is Verdict.OK
-    assert judged_watches(None).verdict is Verdict.OK
-    assert judged_watches(4).verdict is Verdict.NOTE
+    assert judged_watches(128).verdict is HostVerdict.OK
+    assert judged_watches(None).verdict is HostVerdict.OK
+    assert judged_watches(4).verdict is HostVerdict.NOTE
 
 
 def test_the_group_to_join_is_the_ports_own(tmp_path: Path) -> None:
@@ -80,14 +80,14 @@ def test_every_check_that_is_not_ok_names_the_remedy() -> None:
     assert {"python", "serial ports", "kernel CAN", "real time", "clock", "disk", "open files", "processors"} <= {
         c.name for c in checks
     }
-    assert [c.name for c in checks if c.verdict is not Verdict.OK and not c.advice] == []
+    assert [c.name for c in checks if c.verdict is not HostVerdict.OK and not c.advice] == []
 
 
 def test_a_run_directory_that_cannot_be_written_is_bad(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").write_bytes(b"")
     monkeypatch.setenv("FIELDTWIN_RUN", str(tmp_path / "file" / "below"))
     found = {c.name: c for c in examine()}["run directory"]
-    assert found.verdict is Verdict.BAD
+    assert found.verdict is HostVerdict.BAD
     assert os.fspath(tmp_path) in found.found
 
 
@@ -102,14 +102,14 @@ def test_an_unreadable_folder_is_not_an_internal_error(monkeypatch: pytest.Monke
         for name in ("mkdir", "exists", "stat"):
             patched.setattr(Path, name, refused)
         checks = _run_directory(), _disk()
-    assert checks[0].verdict is Verdict.BAD
+    assert checks[0].verdict is HostVerdict.BAD
     assert checks[1].found.endswith("at /")
 
 
 def test_a_can_interface_that_is_down_is_reported() -> None:
-    assert judged_can({}).verdict is Verdict.OK
+    assert judged_can({}).verdict is HostVerdict.OK
     assert judged_can({"can0": True, "vcan0": True}).found == "can0, vcan0"
     down = judged_can({"can0": True, "can1": False})
-    assert (down.verdict, down.found) == (Verdict.NOTE, "can0, can1 (down)")
+    assert (down.verdict, down.found) == (HostVerdict.NOTE, "can0, can1 (down)")
     assert down.advice == "sudo ip link set can1 up type can bitrate 125000 restart-ms 100"
     assert judged_can({"vcan0": False}).advice == "sudo ip link set vcan0 up"

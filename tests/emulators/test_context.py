@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fieldtwin.emulators.context import RELEASE_AT, Recorded, UsedUp, VirtualContext, WhenUsedUp
+from fieldtwin.emulators.context import RELEASE_AT, EndOfRecording, Recorded, UsedUp, VirtualContext
 from fieldtwin.gateway.core.errors import Bug, FileInvalid, UnknownCommand
 from fieldtwin.gateway.core.values import COMMAND, RECORDING, RESPONSE
 
@@ -20,7 +20,7 @@ def recorded(number: int) -> Recorded:
     return Recorded(float(number), RECORDING(bytes([number])), number / 1000)
 
 
-def context(numbers: Sequence[int], policy: WhenUsedUp = WhenUsedUp.HOLD) -> VirtualContext:
+def context(numbers: Sequence[int], policy: EndOfRecording = EndOfRecording.HOLD) -> VirtualContext:
     return VirtualContext([A, B], [(A, recorded(n)) for n in numbers], when_used_up=policy)
 
 
@@ -67,24 +67,24 @@ def test_time_and_latency_come_along() -> None:
 
 
 def test_used_up_it_holds_loops_or_is_an_error() -> None:
-    assert taken(context([1, 2], WhenUsedUp.HOLD), A, 5) == [1, 2, 2, 2, 2]
-    assert taken(context([1, 2], WhenUsedUp.LOOP), A, 5) == [1, 2, 1, 2, 1]
-    error = context([1, 2], WhenUsedUp.ERROR)
+    assert taken(context([1, 2], EndOfRecording.HOLD), A, 5) == [1, 2, 2, 2, 2]
+    assert taken(context([1, 2], EndOfRecording.LOOP), A, 5) == [1, 2, 1, 2, 1]
+    error = context([1, 2], EndOfRecording.ERROR)
     assert taken(error, A, 2) == [1, 2]
     with pytest.raises(UsedUp):
         error.take(A)
 
 
-@pytest.mark.parametrize("policy", WhenUsedUp)
-def test_a_command_without_any_recording_has_nothing_to_hold(policy: WhenUsedUp) -> None:
+@pytest.mark.parametrize("policy", EndOfRecording)
+def test_a_command_without_any_recording_has_nothing_to_hold(policy: EndOfRecording) -> None:
     with pytest.raises(UsedUp):
         context([1], policy).take(B)
 
 
 def test_a_single_command_may_have_another_policy() -> None:
-    subject = context([1, 2], WhenUsedUp.LOOP)
+    subject = context([1, 2], EndOfRecording.LOOP)
     subject.add(B, recorded(9))
-    subject.set_policies({B.data: WhenUsedUp.HOLD})
+    subject.set_policies({B.data: EndOfRecording.HOLD})
     assert (taken(subject, A, 3), taken(subject, B, 3)) == ([1, 2, 1], [9, 9, 9])
 
 
@@ -96,8 +96,8 @@ def test_a_full_context_drops_its_oldest_and_counts_it() -> None:
     assert (taken(subject, A, 2), taken(subject, B, 1)) == ([2, 3], [4])
 
 
-@given(st.lists(st.sampled_from(["add a", "add b", "take a", "take b"]), max_size=60), st.sampled_from(WhenUsedUp))
-def test_it_never_holds_more_than_its_bound(steps: list[str], policy: WhenUsedUp) -> None:
+@given(st.lists(st.sampled_from(["add a", "add b", "take a", "take b"]), max_size=60), st.sampled_from(EndOfRecording))
+def test_it_never_holds_more_than_its_bound(steps: list[str], policy: EndOfRecording) -> None:
     subject = VirtualContext([A, B], when_used_up=policy, max_entries=4)
     model: dict[str, list[int]] = {"a": [], "b": []}
     for number, step in enumerate(steps):
@@ -121,8 +121,8 @@ def test_endlessly_many_different_commands_are_refused() -> None:
         subject.add(COMMAND(b"\x02"), recorded(2))
 
 
-@pytest.mark.parametrize("policy", WhenUsedUp)
-def test_copies_begin_at_the_first_start_and_are_independent(policy: WhenUsedUp) -> None:
+@pytest.mark.parametrize("policy", EndOfRecording)
+def test_copies_begin_at_the_first_start_and_are_independent(policy: EndOfRecording) -> None:
     first = VirtualContext([A, B], [(A, recorded(1)), (B, recorded(9)), (A, recorded(2))], when_used_up=policy)
     second, third = first.copy(), first.copy().copy()
     assert taken(second, A, 2) == [1, 2]
@@ -131,8 +131,8 @@ def test_copies_begin_at_the_first_start_and_are_independent(policy: WhenUsedUp)
     for subject in (first, third):
         assert (taken(subject, A, 2), taken(subject, B, 1), len(subject)) == ([1, 2], [9], 0)
     assert second.left(B) == 1
-    if policy is not WhenUsedUp.ERROR:
-        assert taken(second, A, 2) == ([2, 2] if policy is WhenUsedUp.HOLD else [1, 2])
+    if policy is not EndOfRecording.ERROR:
+        assert taken(second, A, 2) == ([2, 2] if policy is EndOfRecording.HOLD else [1, 2])
     with pytest.raises(UnknownCommand):
         second.take(COMMAND(b"c"))
 

@@ -9,13 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fieldtwin.emulators.context import WhenUsedUp
+from fieldtwin.emulators.context import EndOfRecording
 from fieldtwin.emulators.replay.counters import CounterSpan
 from fieldtwin.emulators.replay.replay import Answer, ExchangeReplay, NeverRecorded
 from fieldtwin.emulators.replay.situation import Situations
 from fieldtwin.emulators.replay.unit import ReplayUnit
 from fieldtwin.gateway.core.errors import UsageError
-from fieldtwin.gateway.core.files.recording import Exchange, RecordingHeader, RecordingWriter
+from fieldtwin.gateway.core.files.recording import RecordedExchange, RecordingHeader, RecordingWriter
 
 
 def read(address: int, count: int = 1, function: int = 4) -> bytes:
@@ -30,8 +30,8 @@ def reply(*values: int, function: int = 4) -> bytes:
     return struct.pack(f">BB{len(values)}H", function, 2 * len(values), *values)
 
 
-def ok(request: bytes, answer: bytes | None, unit: int = 1, latency_s: float = 0.01) -> Exchange:
-    return Exchange(0.0, unit, request, answer, latency_s, None if answer is not None else "timeout")
+def ok(request: bytes, answer: bytes | None, unit: int = 1, latency_s: float = 0.01) -> RecordedExchange:
+    return RecordedExchange(0.0, unit, request, answer, latency_s, None if answer is not None else "timeout")
 
 
 def words(replay: ExchangeReplay, address: int, count: int = 1, function: int = 4, unit: int = 1) -> tuple[int, ...]:
@@ -87,9 +87,9 @@ def test_bits_are_resolved_one_by_one_too() -> None:
 
 def test_loop_starts_over_and_error_is_a_device_failure() -> None:
     recorded = [ok(read(0), reply(n)) for n in (5, 6)]
-    loop = ExchangeReplay(recorded, when_used_up=WhenUsedUp.LOOP)
+    loop = ExchangeReplay(recorded, when_used_up=EndOfRecording.LOOP)
     assert [words(loop, 0)[0] for _ in range(5)] == [5, 6, 5, 6, 5]
-    error = ExchangeReplay(recorded, when_used_up=WhenUsedUp.ERROR)
+    error = ExchangeReplay(recorded, when_used_up=EndOfRecording.ERROR)
     assert replies(error, read(0), 3) == [reply(5), reply(6), b"\x84\x04"]
     assert error.counters.used_up == 1
 
@@ -314,10 +314,10 @@ def energy(replay: ExchangeReplay, split: bool = False) -> int:
 @given(
     st.lists(st.integers(0, 0xFFFFFFFF), min_size=1, max_size=6),
     st.lists(st.sampled_from(["whole", "high", "low", "write"]), max_size=20),
-    st.sampled_from([WhenUsedUp.HOLD, WhenUsedUp.LOOP]),
+    st.sampled_from([EndOfRecording.HOLD, EndOfRecording.LOOP]),
 )
 def test_a_counter_never_runs_backwards_and_is_never_torn(
-    values: list[int], reads: list[str], policy: WhenUsedUp
+    values: list[int], reads: list[str], policy: EndOfRecording
 ) -> None:
     values.sort()
     recorded = [ok(read(0, 2), reply(v >> 16, v & 0xFFFF)) for v in values]
@@ -340,7 +340,7 @@ def test_a_counter_read_in_parts_is_the_counter_read_whole() -> None:
     values = [0x0001_FFFF, 0x0002_0000, 0x0002_0001]
     recorded = [ok(read(0, 2), reply(v >> 16, v & 0xFFFF)) for v in values]
     for split in (False, True):
-        replay = ExchangeReplay(recorded, when_used_up=WhenUsedUp.LOOP, counters=[ENERGY])
+        replay = ExchangeReplay(recorded, when_used_up=EndOfRecording.LOOP, counters=[ENERGY])
         assert [energy(replay, split) for _ in range(5)] == [*values, values[-1], values[-1]]
 
 

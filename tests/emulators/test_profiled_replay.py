@@ -14,7 +14,7 @@ from fieldtwin.emulators.replay.profiled import ProfiledReplay
 from fieldtwin.emulators.replay.replay import ExchangeReplay
 from fieldtwin.gateway.core.connection import RS232Connection
 from fieldtwin.gateway.core.files.profile import load_profile
-from fieldtwin.gateway.core.files.recording import Exchange
+from fieldtwin.gateway.core.files.recording import RecordedExchange
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -73,7 +73,7 @@ def test_a_separate_identity() -> None:
 def test_recorded_answers_precede_the_profile() -> None:
     profile = load_profile(ROOT / "profiles" / "devices" / "eastron-sdm630.yaml")
     odd, reply = bytes.fromhex("04 0000 0001"), bytes.fromhex("04 02 4366")
-    replay = ExchangeReplay([Exchange(0.0, 1, odd, reply, 0.02)])
+    replay = ExchangeReplay([RecordedExchange(0.0, 1, odd, reply, 0.02)])
     unit = ProfiledReplay(profile, replay, 1)
     assert unit.respond(odd, 0) == reply
     assert unit.latency_s == 0.02

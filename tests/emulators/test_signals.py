@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldtwin.emulators.codec import NUMBERS, ORDERS, decode, encode, register_count
-from fieldtwin.emulators.context import UsedUp, WhenUsedUp
+from fieldtwin.emulators.context import EndOfRecording, UsedUp
 from fieldtwin.emulators.signals import SignalPlayer, SignalTrack
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.errors import Bug, FileInvalid, UsageError
@@ -63,7 +63,7 @@ def test_a_value_lies_between_its_neighbours(points: list[tuple[float, float]], 
 
 def test_hold_loop_and_error_after_the_end() -> None:
     ramp = track((0.0, 0.0), (10.0, 100.0))
-    hold, loop, error = (SignalPlayer(ramp, START_NS, at_end=policy) for policy in WhenUsedUp)
+    hold, loop, error = (SignalPlayer(ramp, START_NS, at_end=policy) for policy in EndOfRecording)
     assert [at(hold, t) for t in (-1, 5, 10, 11, 1e6)] == [0.0, 50.0, 100.0, 100.0, 100.0]
     assert [at(loop, t) for t in (5, 10, 12, 25, 1003)] == pytest.approx([50.0, 100.0, 20.0, 50.0, 30.0])
     assert at(error, 10) == 100.0
@@ -73,7 +73,7 @@ def test_hold_loop_and_error_after_the_end() -> None:
 
 
 def test_a_loop_that_starts_late_repeats_only_recorded_samples() -> None:
-    loop = SignalPlayer(track((3.0, 0.0), (10.0, 70.0)), START_NS, at_end=WhenUsedUp.LOOP)
+    loop = SignalPlayer(track((3.0, 0.0), (10.0, 70.0)), START_NS, at_end=EndOfRecording.LOOP)
     assert [at(loop, t) for t in (0, 3, 5, 12, 19)] == pytest.approx([0.0, 0.0, 20.0, 20.0, 20.0])
 
 
@@ -93,9 +93,9 @@ def test_all_signals_are_of_one_instant() -> None:
 
 
 def test_policies_have_names() -> None:
-    assert [WhenUsedUp.parse(text) for text in ("hold", "loop", "error")] == list(WhenUsedUp)
+    assert [EndOfRecording.parse(text) for text in ("hold", "loop", "error")] == list(EndOfRecording)
     with pytest.raises(UsageError, match="hold, loop, error"):
-        WhenUsedUp.parse("stop")
+        EndOfRecording.parse("stop")
 
 
 def test_loading_takes_signals_and_units_and_leaves_a_cut_line_out(tmp_path: Path) -> None:

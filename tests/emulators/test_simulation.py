@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fieldtwin.emulators.journal import HeldJournal
+from fieldtwin.emulators.journal import DeviceValueLog
 from fieldtwin.emulators.simulation.python_model import PythonModel
 from fieldtwin.emulators.simulation.signals import SimulatedSignals
 from fieldtwin.emulators.simulation.simulation import MAX_STEPS, Simulation, by_formulas, by_model
@@ -160,7 +160,7 @@ def test_a_file_that_is_not_python(tmp_path: Path) -> None:
 
 
 def test_a_journal_notifies_its_watcher_of_changes_only() -> None:
-    journal, seen = HeldJournal(), []
+    journal, seen = DeviceValueLog(), []
     journal.note("x", b"\0", 1)
     journal.watch("x", lambda raw, t_ns: seen.append((raw, t_ns)))
     for raw, t_ns in ((b"\0", 2), (b"\1", 3), (b"\1", 4)):

@@ -28,7 +28,7 @@ from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.run.processes.children import Child
-from fieldtwin.run.processes.topside import Shore
+from fieldtwin.run.processes.topside import TopsideController
 from fieldtwin.twin.plant.mapping import mapped_endpoint
 from fieldtwin.twin.prototype.field_process import FieldConfig
 from fieldtwin.twin.site.system import load_system
@@ -43,7 +43,7 @@ SYSTEM = ROOT / "profiles/systems/observatory.yaml"
 class EmulatedTarget:
     """Our emulators, as ``fieldtwin run --prototype`` starts them, with the remote client served by its own driver."""
 
-    def __init__(self, mapping: dict[Endpoint, Endpoint], shore: Shore) -> None:
+    def __init__(self, mapping: dict[Endpoint, Endpoint], shore: TopsideController) -> None:
         self.mapping = mapping
         self.shore = shore
 
@@ -76,7 +76,7 @@ async def emulated(run_dir: Path) -> AsyncIterator[EmulatedTarget]:
         for bus, url in status["listening"].items():
             plant = system.buses[bus].endpoint
             mapping[plant] = mapped_endpoint(plant, Endpoint.parse(url))
-        shore = Shore(system, "modem", Endpoint.parse(status["far"]["modem"]), WallClock())
+        shore = TopsideController(system, "modem", Endpoint.parse(status["far"]["modem"]), WallClock())
         async with Nursery() as nursery:
             nursery.start(shore.run([]), "far end")
             yield EmulatedTarget(mapping, shore)

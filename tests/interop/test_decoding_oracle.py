@@ -8,7 +8,7 @@ import pytest
 from tshark import dissect, needs_tshark
 
 from fieldtwin.capture.decoding.decoder import exchanges, frame_events
-from fieldtwin.capture.decoding.exchange import Exchange
+from fieldtwin.capture.decoding.exchange import DecodedExchange
 from fieldtwin.gateway.connections.tap import Captured
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.connection import Direction
@@ -28,7 +28,7 @@ SDOS = [
 ]  # fmt: skip
 
 
-def captured(bus: str, frames: list[tuple[bool, bytes | CanFrame]]) -> tuple[list[Captured], list[Exchange]]:
+def captured(bus: str, frames: list[tuple[bool, bytes | CanFrame]]) -> tuple[list[Captured], list[DecodedExchange]]:
     system = load_system("observatory")
     endpoint = system.buses[bus].endpoint
     seen = [

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from fieldtwin.emulators.wires.acoustic import AcousticMedium, Water
+from fieldtwin.emulators.wires.acoustic import AcousticMedium, AcousticProperties
 from fieldtwin.gateway.core.image.image import Message
 from fieldtwin.gateway.core.statemachine import encode_period
 from fieldtwin.gateway.core.values import Quality, Reason, TagValue
@@ -72,7 +72,7 @@ class Ocean:
     def __init__(self, loss: float, seed: int) -> None:
         self.deaf: set[int] = set()
         self.sea = AcousticMedium(
-            Water(4000.0, loss=loss), PLACES, seed, lambda t_ns, listener, payload: listener in self.deaf
+            AcousticProperties(4000.0, loss=loss), PLACES, seed, lambda t_ns, listener, payload: listener in self.deaf
         )
         self.stations = {name: Station(self.sea, name) for name in NAMES}
         self.now_s = 0.0

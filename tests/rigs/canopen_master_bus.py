@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 from msgspec.structs import replace
 
 from fieldtwin.gateway.core.canframe import CanFrame
-from fieldtwin.gateway.core.connection import CANConnection, CanConnection, closed_here
+from fieldtwin.gateway.core.connection import CANConnection, CanConnection, closed_locally
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.protocols.canopen.master import CanopenMaster
 
@@ -71,7 +71,7 @@ class MemoryEnd(CanConnection):
         self.peer.feed(replace(frame, t_ns=LoopClock().monotonic_ns()))
 
     async def aclose(self) -> None:
-        self.feed_lost(closed_here(self.endpoint))
+        self.feed_lost(closed_locally(self.endpoint))
 
 
 def bus() -> tuple[MemoryEnd, MemoryEnd]:

@@ -7,7 +7,7 @@ from collections.abc import Awaitable, Callable
 
 from support import run
 
-from fieldtwin.gateway.core.connection import ByteConnection, RS232Connection, TCPConnection, closed_here
+from fieldtwin.gateway.core.connection import ByteConnection, RS232Connection, TCPConnection, closed_locally
 from fieldtwin.gateway.core.endpoint import Endpoint, SerialSettings
 from fieldtwin.gateway.core.errors import (
     ConnectionLost,
@@ -34,7 +34,7 @@ class MemoryEnd(ByteConnection):
         self.peer.feed(data)
 
     async def aclose(self) -> None:
-        self.feed_lost(closed_here(self.endpoint))
+        self.feed_lost(closed_locally(self.endpoint))
         self.peer.feed_lost(ConnectionLost("the peer closed", where=str(self.endpoint)))
 
 

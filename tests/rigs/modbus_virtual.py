@@ -11,7 +11,7 @@ import selectors
 from collections.abc import Callable, Coroutine
 from typing import Any, TypeVar
 
-from fieldtwin.gateway.core.connection import ByteConnection, RS232Connection, TCPConnection, closed_here
+from fieldtwin.gateway.core.connection import ByteConnection, RS232Connection, TCPConnection, closed_locally
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import ConnectionLost
 
@@ -78,4 +78,4 @@ class VirtualWire(ByteConnection):
         self._on_write(data)
 
     async def aclose(self) -> None:
-        self.feed_lost(closed_here(self.endpoint))
+        self.feed_lost(closed_locally(self.endpoint))

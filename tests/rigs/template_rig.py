@@ -10,7 +10,7 @@ import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
-from fieldtwin.run.template import Stranger
+from fieldtwin.run.template import ForeignParts
 from fieldtwin.twin.site.system import load_system
 from fieldtwin.twin.template.pack import Extras, collect, pack
 from fieldtwin.twin.template.package import open_package, unpack
@@ -66,11 +66,11 @@ def packed(system: Path, target: Path, extras: Extras = Extras()) -> Manifest:  
     return pack(loaded, collect(loaded, (), system.with_name(f"{system.stem}.prototype.yaml")), extras, "9.9", target)
 
 
-def yes(template: Stranger) -> bool:
+def yes(template: ForeignParts) -> bool:
     return True
 
 
-def no(template: Stranger) -> bool:
+def no(template: ForeignParts) -> bool:
     return False
 
 

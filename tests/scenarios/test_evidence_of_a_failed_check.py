@@ -145,8 +145,8 @@ def test_a_failed_assertion_of_the_pytest_fixture_prints_the_exchanges_on_lines(
 
 
 def test_a_reason_of_several_lines_is_on_one_line_in_the_assertion(pytester: pytest.Pytester) -> None:
-    from fieldtwin.testing.outcome import Outcome
+    from fieldtwin.testing.outcome import ScenarioOutcome
 
-    assert repr(Outcome("x", "error", "the device is gone\nhint: look at it")) == (
+    assert repr(ScenarioOutcome("x", "error", "the device is gone\nhint: look at it")) == (
         "<error scenario 'x': the device is gone hint: look at it>"
     )

@@ -18,7 +18,7 @@ from fieldtwin.results.trace import Event, Kind
 from fieldtwin.run.targets.virtual_scenario import run_virtual
 from fieldtwin.scenarios.language.form import load_scenario
 from fieldtwin.scenarios.regression.as_scenario import Wanted, as_scenario
-from fieldtwin.scenarios.regression.comparing import Allowed, Verdict, compare
+from fieldtwin.scenarios.regression.comparing import Allowed, RunComparison, compare
 from fieldtwin.scenarios.regression.run_history import Story, story_of
 from fieldtwin.twin.site.system import load_system
 
@@ -51,11 +51,11 @@ def told(events: Iterable[Event]) -> Story:
     return story_of(SYSTEM, sorted([*events, *END], key=lambda e: e.t_ns))
 
 
-def judge(old: list[Event], new: list[Event], allowed: Allowed | None = None) -> Verdict:
+def judge(old: list[Event], new: list[Event], allowed: Allowed | None = None) -> RunComparison:
     return compare(told(old), told(new), allowed)
 
 
-def kinds(verdict: Verdict) -> list[tuple[str, str]]:
+def kinds(verdict: RunComparison) -> list[tuple[str, str]]:
     return [(d.what, d.where) for d in verdict.differences]
 
 

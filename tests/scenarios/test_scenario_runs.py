@@ -13,7 +13,7 @@ from fieldtwin.cli.test.test_command import command
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.results.model import ScenarioResult, Verdict
 from fieldtwin.run.targets.virtual_scenario import run_virtual
-from fieldtwin.scenarios.language.about import danger_of
+from fieldtwin.scenarios.language.about import impact_of
 from fieldtwin.scenarios.language.form import load_scenario
 
 SHIPPED = sorted((Path(__file__).resolve().parents[2] / "profiles" / "systems").glob("*.scenario.yaml"))
@@ -238,4 +238,4 @@ def test_reports_are_written(tmp_path: Path) -> None:
     ],
 )
 def test_a_scenario_is_as_dangerous_as_its_worst_step(tmp_path: Path, steps: str, danger: str) -> None:
-    assert danger_of(load_scenario(written(tmp_path, steps))).value == danger
+    assert impact_of(load_scenario(written(tmp_path, steps))).value == danger

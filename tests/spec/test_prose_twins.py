@@ -26,7 +26,7 @@ from fieldtwin.gateway.connections.listeners import TcpListener
 from fieldtwin.gateway.core.concurrency.events import Consumer, Producer
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.endpoint import Endpoint
-from fieldtwin.gateway.core.files.recording import Exchange, RecordingHeader, RecordingReader, RecordingWriter
+from fieldtwin.gateway.core.files.recording import RecordedExchange, RecordingHeader, RecordingReader, RecordingWriter
 from fieldtwin.gateway.core.statemachine import decode_period, encode_period
 from fieldtwin.gateway.core.values import COMMAND, MEASUREMENT, RESPONSE, STATUS, Quality, Reason
 from fieldtwin.gateway.devices.transmitter import TransmitterDriver
@@ -34,10 +34,10 @@ from fieldtwin.gateway.store.event import Event, Kind
 from fieldtwin.gateway.store.sqlite_knowledge import SqliteKnowledge, in_place
 from fieldtwin.run.shadow.shadow import Shadowing
 from fieldtwin.run.what_if.asked import objection
-from fieldtwin.run.what_if.asking import Asked
+from fieldtwin.run.what_if.asking import QuestionMessage
 from fieldtwin.run.what_if.fork import Fork, answer
 from fieldtwin.run.what_if.last_known import of_period
-from fieldtwin.run.what_if.plan import Plan
+from fieldtwin.run.what_if.plan import WhatIfPlan
 from fieldtwin.run.what_if.state import KnownState
 from fieldtwin.twin.model.mape.execute import Bounds
 from fieldtwin.twin.model.mape.messages import SeenMeasurement, SeenStatus
@@ -100,12 +100,12 @@ async def both_talks(folder: Path, spoilt: object = bytes) -> tuple[Crossed, Cro
     return emulator, stranger
 
 
-def exchanges(crossed: Crossed) -> list[Exchange]:
+def exchanges(crossed: Crossed) -> list[RecordedExchange]:
     """Return the exchanges of the conversation, one by one."""
     found = []
     for request, reply in zip(adus(crossed.there), adus(crossed.back), strict=True):
         assert request[:2] == reply[:2], "of one transaction"
-        found.append(Exchange(float(len(found)), request[6], request[7:], reply[7:]))
+        found.append(RecordedExchange(float(len(found)), request[6], request[7:], reply[7:]))
     return found
 
 
@@ -280,16 +280,20 @@ def test_prose_8_a_digital_twin_asks_a_prototype_what_if_with_the_full_software_
     """The gateway, the PLC and the emulators of a run, ahead in virtual time, from the twin's knowledge."""
     stays = ("relay.state == 'ACTIVE'", "quality(ctd.pressure) == 'good'")
     known = {"ctd.pressure": 50.0}
-    question = Asked("observatory", 8.0, (), stays, 1.0, period_s=1, values=known, programs={"relay": of_period(3)})
+    question = QuestionMessage(
+        "observatory", 8.0, (), stays, 1.0, period_s=1, values=known, programs={"relay": of_period(3)}
+    )
     assert objection(question) == ""
-    stops = Asked("observatory", 8.0, (), stays, 1.0, period_s=0, values=known, programs={"relay": of_period(3)})
+    stops = QuestionMessage(
+        "observatory", 8.0, (), stays, 1.0, period_s=0, values=known, programs={"relay": of_period(3)}
+    )
     assert "does not hold 8 s from now; at the end relay.state: 'STANDBY'" in objection(stops)
 
 
 def test_prose_8_a_prototype_can_serve_as_the_digital_twin_itself() -> None:
     """It continues from the plant's state and samples as the plant does. tests/system tests it with a digital twin in CI."""
     state = KnownState({"ctd.pressure": 50.0}, {"relay": of_period(2)})
-    outcome = answer(Fork("observatory", state, 10.0), Plan("goes on"))
+    outcome = answer(Fork("observatory", state, 10.0), WhatIfPlan("goes on"))
     assert outcome.error == ""
     assert [name for _, name in outcome.states["relay"]] == ["ACTIVE"]
     assert 3 <= outcome.variables["ctd.pressure"].good <= 6, "a sample each two seconds"
@@ -324,7 +328,7 @@ def test_prose_9_a_recording_from_the_field_goes_back_into_CI(tmp_path: Path) ->
     _, stranger = run(both_talks(tmp_path))
     seen = exchanges(stranger)
     changing = bytes.fromhex("0300320001")  # a register with a different value each time
-    seen += [Exchange(100.0 + n, seen[0].unit, changing, bytes([3, 2, 0, n])) for n in (7, 1, 9)]
+    seen += [RecordedExchange(100.0 + n, seen[0].unit, changing, bytes([3, 2, 0, n])) for n in (7, 1, 9)]
     header = RecordingHeader(version=1, device="x/modem", kind="exchanges", source="measured")
     with RecordingWriter(tmp_path / "field.jsonl", header) as writer:
         for exchange in seen:
@@ -343,7 +347,7 @@ def test_prose_10_fidelity_is_measured_and_printed(tmp_path: Path) -> None:
         header = RecordingHeader(version=1, device="x/y", kind="exchanges", source="measured")
         with RecordingWriter(tmp_path / f"{name}.jsonl", header) as writer:
             for i, word in enumerate((1, 2, 3, last)):
-                writer.exchange(Exchange(float(i), 1, read, bytes([3, 2, 0, word]), 0.01))
+                writer.exchange(RecordedExchange(float(i), 1, read, bytes([3, 2, 0, word]), 0.01))
     files = [str(tmp_path / "device.jsonl"), str(tmp_path / "emulator.jsonl")]
     told = CliRunner().invoke(compare_command, files, standalone_mode=False)
     assert "fidelity: values 75.0 %, timing" in told.output

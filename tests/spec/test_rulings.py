@@ -26,7 +26,7 @@ from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig
 from fieldtwin.gateway.runtime.gateway import make_driver
 from fieldtwin.gateway.runtime.tags import TagTable
 from fieldtwin.plc.runner import Runner
-from fieldtwin.run.processes.topside import Shore
+from fieldtwin.run.processes.topside import TopsideController
 from fieldtwin.twin.model.shadow import DigitalShadow
 from fieldtwin.twin.model.thread_process import ReceivingEnd
 from fieldtwin.twin.model.variables import Variable
@@ -115,7 +115,7 @@ def driver_of(path: Path) -> Any:
 class Watched:
     """The observatory in virtual time, with a shadow that receives the contents of its process image."""
 
-    def __init__(self, system: System, plant: VirtualPrototype, shore: Shore) -> None:
+    def __init__(self, system: System, plant: VirtualPrototype, shore: TopsideController) -> None:
         self.plant, self.shore = plant, shore
         self._image = ImageProcess(system, plant.twin.ecs.layout, plant.clock)
         self._readers = plant.image.reader(INPUTS), plant.image.reader(OUTPUTS)
@@ -150,7 +150,7 @@ def in_virtual_time(tmp_path: Path, main: Callable[[Watched], Coroutine[Any, Any
     @asynccontextmanager
     async def sampling() -> AsyncIterator[Watched]:
         async with VirtualPrototype(system, prototype, loop, tmp_path) as plant, Nursery() as nursery:
-            shore = Shore(system, "modem", plant.field.far["modem"], plant.clock, plant.net)
+            shore = TopsideController(system, "modem", plant.field.far["modem"], plant.clock, plant.net)
             nursery.start(shore.run([]), "far end")
             watched = Watched(system, plant, shore)
             await watched.pass_s(3)

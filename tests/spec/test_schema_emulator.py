@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from spec_rig import observatory
 
-from fieldtwin.emulators.context import Recorded, UsedUp, VirtualContext, WhenUsedUp
+from fieldtwin.emulators.context import EndOfRecording, Recorded, UsedUp, VirtualContext
 from fieldtwin.emulators.emulator import Emulator, SensorEmulator
 from fieldtwin.emulators.link import EmulatedConnection
 from fieldtwin.emulators.replay.replay import ExchangeReplay
@@ -18,7 +18,7 @@ from fieldtwin.emulators.replay.unit import ReplayUnit
 from fieldtwin.gateway.core.connection import PROTOCOL, Connection, RS232Connection, TCPConnection
 from fieldtwin.gateway.core.device import Device, End, Sensor, wire
 from fieldtwin.gateway.core.errors import Bug, UnknownCommand
-from fieldtwin.gateway.core.files.recording import Exchange
+from fieldtwin.gateway.core.files.recording import RecordedExchange
 from fieldtwin.gateway.core.values import COMMAND, RECORDING
 
 CTD = observatory()[0].devices["ctd"].profile
@@ -30,9 +30,9 @@ def reply(word: int) -> bytes:
     return b"\x03\x02" + struct.pack(">H", word)
 
 
-def recorded_ctd(words: list[int], policy: WhenUsedUp) -> tuple[SensorEmulator, End[bytes]]:
+def recorded_ctd(words: list[int], policy: EndOfRecording) -> tuple[SensorEmulator, End[bytes]]:
     """A ctd that is emulated from recorded exchanges, as `fieldtwin emulate RECORDING` serves them."""
-    exchanges = [Exchange(float(i), 1, READ_STATUS, reply(word), 0.01) for i, word in enumerate(words)]
+    exchanges = [RecordedExchange(float(i), 1, READ_STATUS, reply(word), 0.01) for i, word in enumerate(words)]
     replay = ExchangeReplay(exchanges, when_used_up=policy)
     end, drivers_end = wire(RS232Connection)
     return SensorEmulator(end, CTD, replay.context, ReplayUnit(replay, 1).respond), drivers_end
@@ -96,7 +96,7 @@ def test_Emulator_is_abstract_and_a_Device_and_not_a_Sensor() -> None:
 
 @given(words=WORDS)
 def test_Emulator_virtualContext_is_a_collection_of_RECORDINGs(words: list[int]) -> None:
-    emulator, _ = recorded_ctd(words, WhenUsedUp.ERROR)
+    emulator, _ = recorded_ctd(words, EndOfRecording.ERROR)
     context = emulator.virtual_context
     assert isinstance(context, VirtualContext)
     assert len(context) == 2 * len(words)  # each exchange: the result of the request, and the register read
@@ -119,7 +119,7 @@ def test_SensorEmulator_is_on_RS232() -> None:
 
 
 def test_SensorEmulator_ExecuteCommand_requires_the_command_to_be_in_the_list() -> None:
-    emulator, _ = recorded_ctd([1, 2], WhenUsedUp.ERROR)
+    emulator, _ = recorded_ctd([1, 2], EndOfRecording.ERROR)
     assert isinstance(emulator.virtual_context, VirtualContext)
     before = len(emulator.virtual_context)
     for command in (COMMAND(READ_STATUS, "melt_down"), COMMAND(READ_STATUS)):
@@ -132,7 +132,7 @@ def test_SensorEmulator_ExecuteCommand_requires_the_command_to_be_in_the_list() 
 @given(words=WORDS)
 def test_SensorEmulator_ExecuteCommand_returns_one_of_the_context_and_removes_it(words: list[int]) -> None:
     """Ruling 3: in recorded order; duplicates are two."""
-    emulator, drivers_end = recorded_ctd(words, WhenUsedUp.ERROR)
+    emulator, drivers_end = recorded_ctd(words, EndOfRecording.ERROR)
     assert isinstance(emulator.virtual_context, VirtualContext)
     for done, word in enumerate(words):
         assert len(emulator.virtual_context) == 2 * (len(words) - done)
@@ -147,13 +147,13 @@ def test_SensorEmulator_ExecuteCommand_returns_one_of_the_context_and_removes_it
 @pytest.mark.parametrize(
     ("policy", "then"),
     [
-        (WhenUsedUp.HOLD, [reply(3), reply(3)]),
-        (WhenUsedUp.LOOP, [reply(1), reply(2)]),
-        (WhenUsedUp.ERROR, [b"\x83\x04"] * 2),
+        (EndOfRecording.HOLD, [reply(3), reply(3)]),
+        (EndOfRecording.LOOP, [reply(1), reply(2)]),
+        (EndOfRecording.ERROR, [b"\x83\x04"] * 2),
     ],
 )
 def test_SensorEmulator_when_the_context_is_used_up_does_what_the_prototype_file_says(
-    policy: WhenUsedUp, then: list[bytes]
+    policy: EndOfRecording, then: list[bytes]
 ) -> None:
     """Ruling 3: hold, loop or error."""
     emulator, drivers_end = recorded_ctd([1, 2, 3], policy)
@@ -169,7 +169,7 @@ def test_SensorEmulator_context_is_bounded_ordered_and_counts_what_it_drops(word
     """Ruling 2."""
     command = COMMAND(READ_STATUS, "read_status")
     room = max(1, len(words) - extra)
-    context = VirtualContext([command], when_used_up=WhenUsedUp.ERROR, max_entries=room)
+    context = VirtualContext([command], when_used_up=EndOfRecording.ERROR, max_entries=room)
     for i, word in enumerate(words):
         context.add(command, Recorded(float(i), RECORDING(reply(word))))
     assert context.dropped == len(words) - len(context) == max(0, len(words) - room)

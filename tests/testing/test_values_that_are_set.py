@@ -12,7 +12,7 @@ import pytest
 from device_rig import emulated, started_runner
 
 from fieldtwin.testing.handles import Device
-from fieldtwin.testing.outcome import Outcome
+from fieldtwin.testing.outcome import ScenarioOutcome
 from fieldtwin.testing.runner import FieldtwinRefused, Runner
 
 
@@ -47,7 +47,7 @@ def test_held_gives_the_value_that_was_just_set(device: Device) -> None:
 
 
 def test_an_outcome_that_did_not_pass_is_one_line_for_pytest() -> None:
-    outcome = Outcome("a scenario", "failed", "the level was 2", reproduce="fieldtwin test x")
+    outcome = ScenarioOutcome("a scenario", "failed", "the level was 2", reproduce="fieldtwin test x")
     assert "\n" not in repr(outcome)
     assert "the level was 2" in repr(outcome)
     assert str(outcome).count("\n") >= 1

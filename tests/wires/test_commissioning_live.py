@@ -10,7 +10,7 @@ import pytest
 from support import eventually, run
 
 from fieldtwin.commissioning.access.connection import canopen_at, frame_of, modbus_at
-from fieldtwin.commissioning.access.frame_log import WireLog
+from fieldtwin.commissioning.access.frame_log import FrameLog
 from fieldtwin.emulators.endpoints.modbus_server import serve_mbap
 from fieldtwin.emulators.endpoints.socket_end import SocketListener
 from fieldtwin.emulators.modbus.bank import MapBank, Span
@@ -37,7 +37,7 @@ def test_a_request_is_in_the_log_when_the_reply_arrives(tmp_path: Path) -> None:
 
         listener = await SocketListener.open(Endpoint.parse("tcp://127.0.0.1:0"), serve)
         try:
-            with WireLog(tmp_path / "sent.jsonl", "fieldtwin read") as log:
+            with FrameLog(tmp_path / "sent.jsonl", "fieldtwin read") as log:
                 async with modbus_at(str(listener.bound), taps=[log]) as client:
                     reply = await client.read_registers(1, "holding", 2, 1)
                     assert list(reply.registers) == [7]
@@ -58,7 +58,7 @@ def test_a_request_is_in_the_log_when_the_reply_arrives(tmp_path: Path) -> None:
 def test_a_log_continues_and_reports_when_it_is_full(tmp_path: Path) -> None:
     path, endpoint = tmp_path / "sent.jsonl", Endpoint.parse("tcp://127.0.0.1:502")
     for _ in range(2):
-        with WireLog(path, "x", max_bytes=250) as log:
+        with FrameLog(path, "x", max_bytes=250) as log:
             for _ in range(4):
                 log.on_bytes(endpoint, Direction.SENT, 0, bytes(20))
             assert log.full
@@ -67,7 +67,7 @@ def test_a_log_continues_and_reports_when_it_is_full(tmp_path: Path) -> None:
     assert [("started" in line) for line in lines].count(True) == 2
     assert len(lines) == 4  # whole lines only
     with pytest.raises(FileInvalid, match="log of sent frames"):
-        WireLog(tmp_path / "no" / "folder", "x")
+        FrameLog(tmp_path / "no" / "folder", "x")
 
 
 def test_a_url_of_the_wrong_kind_is_a_users_error_and_a_missing_device_is_unreachable() -> None:

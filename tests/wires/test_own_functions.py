@@ -21,7 +21,7 @@ from fieldtwin.gateway.connections.serial_line import SerialConnection
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import FileInvalid, ModbusExceptionReply
 from fieldtwin.gateway.core.files.profile import DeviceProfile, load_profile
-from fieldtwin.gateway.core.files.recording import Exchange
+from fieldtwin.gateway.core.files.recording import RecordedExchange
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient
 from fieldtwin.gateway.protocols.modbus.user import FixedShape, UserFunction
 from fieldtwin.gateway.wallclock import WallClock
@@ -112,7 +112,9 @@ def test_a_device_specific_frame_that_looks_like_a_shorter_one_followed_by_a_zer
 
 def test_a_recording_defines_the_length_of_device_specific_functions() -> None:
     lengths = (("78 00 00 00 01", 5), ("78 01", 2), ("41 07", 2))
-    made = [Exchange(i / 10, 1, bytes.fromhex(pdu), bytes.fromhex(pdu), 0.01) for i, (pdu, _) in enumerate(lengths)]
+    made = [
+        RecordedExchange(i / 10, 1, bytes.fromhex(pdu), bytes.fromhex(pdu), 0.01) for i, (pdu, _) in enumerate(lengths)
+    ]
     unit = ReplayUnit(ExchangeReplay(made), 1)
     assert unit.request_lengths == {0x41: 2}  # 78h has two lengths
 

@@ -22,7 +22,7 @@ from fieldtwin.emulators.endpoints.tls_server import client_role
 from fieldtwin.emulators.endpoints.udp_end import UdpEnd
 from fieldtwin.emulators.modbus.ascii import AsciiSlave
 from fieldtwin.emulators.modbus.bank import MapBank, Span
-from fieldtwin.emulators.modbus.line import Exchange
+from fieldtwin.emulators.modbus.line import ServedFrame
 from fieldtwin.emulators.modbus.mbap import MbapSlave
 from fieldtwin.emulators.modbus.rtu import RtuSlave
 from fieldtwin.emulators.modbus.unit import ModbusUnit
@@ -379,7 +379,7 @@ def test_latency_is_asked_for_exchange_by_exchange() -> None:
         unit = make_unit()
         asked: list[bytes] = []
 
-        def latency(exchange: Exchange) -> float:
+        def latency(exchange: ServedFrame) -> float:
             asked.append(exchange.heard)
             return 0.05 if exchange.heard == WRITE else 0.0
 
@@ -399,7 +399,7 @@ def test_latency_is_asked_for_exchange_by_exchange() -> None:
 
 def test_a_recorded_latency_ends_with_the_last_byte() -> None:
     line = SerialSettings(9600, "8N1")  # a character takes 1/960 s
-    exchange = Exchange(RTU_READ, bytes(96), 0.25)
+    exchange = ServedFrame(RTU_READ, bytes(96), 0.25)
     assert as_recorded()(exchange) == 0.25
     assert as_recorded(line)(exchange) == pytest.approx(0.15)
-    assert as_recorded(line)(Exchange(RTU_READ, bytes(96), 0.05)) == 0.0
+    assert as_recorded(line)(ServedFrame(RTU_READ, bytes(96), 0.05)) == 0.0

@@ -10,12 +10,12 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from fieldtwin.emulators.wires.acoustic import AcousticMedium, Spoils, Water
+from fieldtwin.emulators.wires.acoustic import AcousticMedium, AcousticProperties, Spoils
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.core.files.nearest import did_you_mean
 from fieldtwin.gateway.core.files.profile import DeviceProfile
 from fieldtwin.gateway.core.files.yaml_file import Key, YamlFile, load, validate
-from fieldtwin.twin.network.schema import NetworkForm, ShipForm
+from fieldtwin.twin.network.schema import NetworkForm, TopsideForm
 from fieldtwin.twin.prototype.file import Prototype, load_prototype
 from fieldtwin.twin.site.data_files import find, search_path
 from fieldtwin.twin.site.schema import InputForm, PlcForm, ProgramForm
@@ -49,9 +49,9 @@ class Network:
     name: str
     path: Path
     seed: int
-    water: Water
+    water: AcousticProperties
     members: dict[str, Member]
-    ship: ShipForm | None
+    ship: TopsideForm | None
     file: YamlFile
 
     @property
@@ -128,7 +128,7 @@ def load_network(path: Path, profiles: Iterable[Path] = ()) -> Network:
     form = validate(file, NetworkForm)
     members = {name: _member(file, form, name, path, profiles) for name in form.systems}
     _check(file, form, members)
-    water = Water(
+    water = AcousticProperties(
         form.water.range_m,
         form.water.sound_m_per_s,
         form.water.bytes_per_s,

@@ -14,7 +14,7 @@ from fieldtwin.twin.site.schema import Name, Strict
 Place = Annotated[list[float], Field(min_length=2, max_length=3)]
 
 
-class WaterForm(Strict):
+class AcousticForm(Strict):
     """The acoustic channel: its range, propagation speed, data rate and losses."""
 
     range_m: float = Field(gt=0, le=1_000_000)
@@ -39,7 +39,7 @@ class MemberForm(Strict):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=False)
 
 
-class ShipForm(Strict):
+class TopsideForm(Strict):
     """The source of commands: a topside modem that sends each command several times, because none is acknowledged."""
 
     at_m: Place
@@ -55,6 +55,6 @@ class NetworkForm(Strict):
     fieldtwin: Literal[1]
     network: Name
     seed: int = 1
-    water: WaterForm
+    water: AcousticForm
     systems: dict[Name, MemberForm] = Field(min_length=2, max_length=100)
-    ship: ShipForm | None = None
+    ship: TopsideForm | None = None

@@ -17,7 +17,7 @@ from fieldtwin.twin.prototype.field import unit_limits
 MOST_CLIENTS = 4
 
 
-class Ship:
+class TopsideModem:
     """Serves the modem at the endpoint that ``await ship.open(ports)`` returns.
 
     The modem is of the same kind as that of the first system.

@@ -25,7 +25,7 @@ MOST = 1_000
 _AIMS = frozenset({"bus", "device", "nth", "every", "from_", "until", "probability", "optional"})
 
 
-class WaterFaults:
+class AcousticFaults:
     """The active faults. `start_ns` is when the run began; `from` and `until` count from then."""
 
     def __init__(self, network: Network, seed: int) -> None:

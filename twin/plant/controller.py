@@ -28,7 +28,7 @@ from fieldtwin.gateway.core.errors import Unreachable, UsageError
 from fieldtwin.gateway.devices.register_device import RegisterDriver
 from fieldtwin.gateway.runtime.audit_log import AuditLog
 from fieldtwin.gateway.runtime.buses.learnt_gaps import LearntFile, describe_learnt
-from fieldtwin.gateway.runtime.mailboxes.acked_commands import TakenFile
+from fieldtwin.gateway.runtime.mailboxes.acked_commands import AckedCommandStore
 from fieldtwin.gateway.runtime.reconfigure import reconfigure
 from fieldtwin.gateway.runtime.status import describe
 from fieldtwin.gateway.store.exchange_log import ExchangeLog
@@ -65,7 +65,7 @@ class ControllerConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     mapping: dict[str, str] | None = None
     profiles: tuple[str, ...] = ()
     capture: str = ""
-    lent: tuple[str, ...] = ()
+    delegated: tuple[str, ...] = ()
     """Transmitters whose mailboxes are used by the digital thread."""
 
 
@@ -113,8 +113,8 @@ class GatewayProcess:
                     log,
                     allow_writes=self._config.allow_writes,
                     free_ports=self._config.mapping is not None,
-                    lent=self._config.lent,
-                    taken=TakenFile(run_dir / f"taken{of}.json"),
+                    delegated=self._config.delegated,
+                    taken=AckedCommandStore(run_dir / f"taken{of}.json"),
                 )
                 drivers = [d for d in self._gateway.drivers.values() if isinstance(d, RegisterDriver)]
                 self._learnt = LearntFile(run_dir / f"learnt{of}.json", drivers, system.buses)
@@ -254,7 +254,8 @@ class GatewayProcess:
                 self._audit.note("reload", new.name, by=str(args.get("by", ""))[:64], result="asked", changes=texts)
                 writes, free = self._config.allow_writes, self._config.mapping is not None
                 await reconfigure(
-                    self._gateway, gateway_config(new, allow_writes=writes, free_ports=free, lent=self._config.lent)
+                    self._gateway,
+                    gateway_config(new, allow_writes=writes, free_ports=free, delegated=self._config.delegated),
                 )
                 self._reloads, self._changed = self._reloads + 1, texts[:MOST_CHANGES_TOLD]
             self._system = new

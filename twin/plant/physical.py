@@ -25,7 +25,7 @@ from fieldtwin.gateway.devices.config import DeviceConfig
 from fieldtwin.gateway.devices.register_device import RegisterDriver
 from fieldtwin.gateway.runtime.audit_log import AuditLog
 from fieldtwin.gateway.runtime.gateway import Gateway, GatewayConfig, make_driver
-from fieldtwin.gateway.runtime.mailboxes.acked_commands import TakenFile
+from fieldtwin.gateway.runtime.mailboxes.acked_commands import AckedCommandStore
 from fieldtwin.gateway.runtime.tags import TagTable
 from fieldtwin.gateway.store.exchange_log import ExchangeLog
 from fieldtwin.plc.binding import BoundProgram, InputBinding, image_for
@@ -165,7 +165,7 @@ def gateway_config(
     allow_writes: bool,
     free_ports: bool = False,
     true_silences: bool | None = None,
-    lent: Sequence[str] = (),
+    delegated: Sequence[str] = (),
 ) -> GatewayConfig:
     """Return the gateway's configuration.
 
@@ -178,7 +178,7 @@ def gateway_config(
     outputs = {tag for form in system.plc.programs.values() for tag in form.outputs.values()}
     return GatewayConfig(
         buses={name: replace(bus, strict=bus.strict and true_silences) for name, bus in system.buses.items()},
-        devices={n: _without_inbox(d) if n in lent else d for n, d in system.devices.items()},
+        devices={n: _without_inbox(d) if n in delegated else d for n, d in system.devices.items()},
         cycle_ms=fastest_ms(system),
         plc_lost_ms=plc_lost_ms(system),
         outputs=frozenset(outputs),
@@ -187,7 +187,7 @@ def gateway_config(
         remote=system.remote == "remote",
         serve=serving.serve,
         bridges=serving.bridges,
-        lent=frozenset(lent),
+        delegated=frozenset(delegated),
     )
 
 
@@ -277,8 +277,8 @@ class EmbeddedControlSystem:
         free_ports: bool = False,
         true_silences: bool | None = None,
         listen: Listen = TcpListener.open,
-        lent: Sequence[str] = (),
-        taken: TakenFile | None = None,
+        delegated: Sequence[str] = (),
+        taken: AckedCommandStore | None = None,
     ) -> Gateway:
         """Return the gateway with its drivers.
 
@@ -286,7 +286,11 @@ class EmbeddedControlSystem:
         records which commands need not be handed on again after a restart; None if there will be no restart.
         """
         config = gateway_config(
-            self.system, allow_writes=allow_writes, free_ports=free_ports, true_silences=true_silences, lent=lent
+            self.system,
+            allow_writes=allow_writes,
+            free_ports=free_ports,
+            true_silences=true_silences,
+            delegated=delegated,
         )
         return Gateway(config, connector, clock, image, audit, log, listen, taken)
 

@@ -13,13 +13,13 @@ from pathlib import Path
 from fieldtwin.emulators.canopen.node import CanopenNode
 from fieldtwin.emulators.canopen.remarks import Remark
 from fieldtwin.emulators.canopen.serve import serve_node
-from fieldtwin.emulators.client_counts import ClientCounts, Difference
-from fieldtwin.emulators.context import WhenUsedUp
+from fieldtwin.emulators.client_counts import ClientCounts, CountDifference
+from fieldtwin.emulators.context import EndOfRecording
 from fieldtwin.emulators.distorted_registers import DistortedRegisters
 from fieldtwin.emulators.emulator import EmulatedUnit
 from fieldtwin.emulators.endpoints.modbus_server import Latency, as_recorded, serve_mbap, serve_rtu, serve_udp
 from fieldtwin.emulators.endpoints.ports import CanPort, Listening, OnClient, OsPorts, Ports
-from fieldtwin.emulators.journal import HeldJournal, share_of
+from fieldtwin.emulators.journal import DeviceValueLog, share_of
 from fieldtwin.emulators.modbus.ascii import AsciiSlave
 from fieldtwin.emulators.modbus.bank import RegisterBank
 from fieldtwin.emulators.modbus.line import LineSlave
@@ -28,8 +28,8 @@ from fieldtwin.emulators.modbus.rtu import RtuSlave
 from fieldtwin.emulators.modbus.unit import ModbusUnit, UnitLimits
 from fieldtwin.emulators.models.emulated_node import NodeOptions, emulated_node
 from fieldtwin.emulators.models.mailbox_modem import MailboxModem, ModemPair
-from fieldtwin.emulators.models.packet_link import ModemEnd, Untamed
-from fieldtwin.emulators.models.register_device import StatedRegisters, add_own_functions
+from fieldtwin.emulators.models.packet_link import LinkImpairments, ModemEnd
+from fieldtwin.emulators.models.register_device import ProfileRegisters, add_own_functions
 from fieldtwin.emulators.models.sampled_sensor import SampledSensor
 from fieldtwin.emulators.models.simulated_registers import SimulatedRegisters
 from fieldtwin.emulators.recorded_device import RecordedDevice, load_replay
@@ -61,7 +61,7 @@ class FieldDevice:
         self.plays = emulated.plays
         self.unit = unit
         self.node = node
-        self.journal: HeldJournal = HeldJournal()
+        self.journal: DeviceValueLog = DeviceValueLog()
         self.remarks: list[str] = []
         """Remarks about values that do not fit a node's data sheet, with what to do about them."""
 
@@ -136,12 +136,12 @@ class FieldSide:
         self._buses: list[CanPort] = []
         self._can_ports: dict[str, CanPort] = {}
         self._clients: dict[str, ClientCounts] = {}
-        self._lines: list[Difference] = []
+        self._lines: list[CountDifference] = []
         self._connections: list[ByteConnection | CanConnection] = []
         self._pairs: dict[str, ModemPair] = {}
         self._water = water or {}
         self._tracks: dict[Path, SignalTrack] = {}
-        self._replays: dict[tuple[Path, str, str, WhenUsedUp], tuple[ExchangeReplay, int]] = {}
+        self._replays: dict[tuple[Path, str, str, EndOfRecording], tuple[ExchangeReplay, int]] = {}
 
     async def open(self) -> None:
         """Build and start listening. Raises `EndpointBusy`, `Unreachable` or `FileInvalid`; then nothing stays open."""
@@ -210,7 +210,7 @@ class FieldSide:
             serving = serve_udp(datagrams, MbapSlave(units), self._clock, latency_s, clients=self._counts(bus.name))
             self._nursery.start(serving, f"emulators on {bus.name}")
         elif plant.is_serial or plant.scheme == "rtu+tcp":
-            line, counted = line_of(plant, units), Difference(self._counts(bus.name), lambda: _taken(units))
+            line, counted = line_of(plant, units), CountDifference(self._counts(bus.name), lambda: _taken(units))
             self._lines.append(counted)
 
             async def serve_line(end: ByteConnection, client: str) -> None:
@@ -336,7 +336,7 @@ class FieldSide:
             latency_s=link.latency_ms / 1000,
             loss=link.loss,
             seed=self.prototype.seed,
-            untamed=Untamed(link.lost, link.repeated, link.overtakes),
+            untamed=LinkImpairments(link.lost, link.repeated, link.overtakes),
             identity=emulated.form.identity,
         )
         return pair.near
@@ -349,7 +349,7 @@ class FieldSide:
         now_ns = self._clock.monotonic_ns()
         try:
             if emulated.form.simulation is None:
-                bank = StatedRegisters(emulated.profile, values, now_ns)
+                bank = ProfileRegisters(emulated.profile, values, now_ns)
             else:
                 bank = SimulatedRegisters(emulated.profile, values, self._signals(emulated), now_ns)
         except FileInvalid as e:
@@ -367,7 +367,7 @@ class FieldSide:
     def _recorded_unit(self, config: DeviceConfig, emulated: EmulatedDevice) -> RecordedDevice:
         """Return a device that replays its recorded exchanges."""
         assert emulated.recording is not None
-        profile, at_end = emulated.profile, WhenUsedUp.parse(emulated.form.at_end)
+        profile, at_end = emulated.profile, EndOfRecording.parse(emulated.form.at_end)
         key = emulated.recording, profile.path, profile.hash, at_end
         if key not in self._replays:  # a recording shared by many devices is read and kept in memory once
             self._replays[key] = load_replay(profile, emulated.recording, at_end)
@@ -415,7 +415,7 @@ class FieldSide:
             return None if emulated.form.simulation is None else self._signals(emulated)
         if emulated.recording.suffix != SUFFIX:
             return self._signals(emulated)
-        return CanLog(emulated.recording, emulated.form.speed, WhenUsedUp.parse(emulated.form.at_end))
+        return CanLog(emulated.recording, emulated.form.speed, EndOfRecording.parse(emulated.form.at_end))
 
     def _signals(self, emulated: EmulatedDevice) -> Signals:
         """Return the signals that the device plays: of its simulation, or of its recording, starting now."""
@@ -433,7 +433,7 @@ class FieldSide:
             self._tracks[emulated.recording],
             self._clock.monotonic_ns(),
             speed=form.speed,
-            at_end=WhenUsedUp.parse(form.at_end),
+            at_end=EndOfRecording.parse(form.at_end),
         )
 
     def _clients_by_bus(self) -> dict[str, dict[str, dict[str, int]]]:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from random import Random
 
-from fieldtwin.emulators.journal import HeldJournal
+from fieldtwin.emulators.journal import DeviceValueLog
 from fieldtwin.emulators.simulation.formula import STEP, TIME, Formula
 from fieldtwin.emulators.simulation.inputs import number_of
 from fieldtwin.emulators.simulation.python_model import PythonModel
@@ -141,7 +141,7 @@ class Simulations:
             )
         return SimulatedSignals(simulation, plays, self._file.path)
 
-    def connect(self, journals: Mapping[str, HeldJournal]) -> None:
+    def connect(self, journals: Mapping[str, DeviceValueLog]) -> None:
         """Feed values that are written to devices into the simulations, from now on."""
         watchers: dict[tuple[str, str], list[Callable[[float, int], None]]] = {}
         for name, form in self._form.simulations.items():

@@ -17,7 +17,7 @@ from fieldtwin.emulators.virtual.clock import VirtualClock
 from fieldtwin.emulators.virtual.loop import VirtualLoop
 from fieldtwin.gateway.connections.tap import TappedConnector
 from fieldtwin.gateway.core.clock import NS_PER_S
-from fieldtwin.gateway.core.concurrency.async_resource import Started
+from fieldtwin.gateway.core.concurrency.async_resource import AsyncResource
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.connection import Connector, Tap
 from fieldtwin.gateway.core.endpoint import Endpoint
@@ -43,7 +43,7 @@ STARTING_NS = NS_PER_S // 20
 _IN_MEMORY = Path(":memory:")
 
 
-class VirtualPrototype(Started):
+class VirtualPrototype(AsyncResource):
     """``async with VirtualPrototype(system, prototype, loop, run_dir) as run`` inside `loop`. `run_dir` takes the audit
     log and retained values; the exchange log is in memory.
 

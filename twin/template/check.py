@@ -82,7 +82,7 @@ def put_together(manifest: Manifest, system: System, folder: Path, clock: Clock)
 
 
 @dataclass(frozen=True, slots=True)
-class Difference:
+class TemplateDifference:
     """A file that differs between two templates. `before` and `after` are hashes, empty for a missing file."""
 
     path: str
@@ -95,23 +95,23 @@ class Difference:
         return "added" if not self.before else "removed" if not self.after else "changed"
 
 
-def differences(old: Mapping[str, Content], new: Mapping[str, Content]) -> list[Difference]:
+def differences(old: Mapping[str, Content], new: Mapping[str, Content]) -> list[TemplateDifference]:
     """Return the files that differ, by path."""
     found = []
     for path in sorted({*old, *new}):
         before, after = (side[path].sha256 if path in side else "" for side in (old, new))
         if before != after:
             kind = (new[path].kind if path in new else "") or (old[path].kind if path in old else "")
-            found.append(Difference(path, kind, before, after))
+            found.append(TemplateDifference(path, kind, before, after))
     return found
 
 
-def software_difference(before: Software, after: Software) -> list[Difference]:
+def software_difference(before: Software, after: Software) -> list[TemplateDifference]:
     """Return the difference between the control software of two templates; an empty list if the modules are the same."""
     if before.modules_sha256 == after.modules_sha256:
         return []
     sides = (f"{software.version} {software.modules_sha256}" for software in (before, after))
-    return [Difference("fieldtwin", "software", *sides)]
+    return [TemplateDifference("fieldtwin", "software", *sides)]
 
 
 def unified(path: str, *sides: tuple[Package, Content | None]) -> Iterator[str]:

@@ -187,10 +187,10 @@ class PlantThread:
             store = await open_knowledge(c.store)
             stack.push_async_callback(store.aclose)
             origin = await store.own("plant", system=system.name, prototype=c.prototype, log=secrets.token_hex(4))
-            if lent := lent_transmitter(c.place, system):
+            if delegated := lent_transmitter(c.place, system):
                 audit = AuditLog(Path(c.run_dir) / "audit.jsonl", clock)
                 stack.callback(audit.close)
-                audit.note("lend", lent, by="digital thread", result="the thread uses its mailboxes")
+                audit.note("lend", delegated, by="digital thread", result="the thread uses its mailboxes")
             connector: Connector = OsConnector()
             if c.mapping is not None:
                 connector = MappedConnector(connector, mapping_from_json(c.mapping))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from random import Random
 
-from fieldtwin.emulators.faults.fault import Outcome, WireFault, passed
+from fieldtwin.emulators.faults.fault import FaultEffect, WireFault, passed
 from fieldtwin.emulators.faults.frames import Frame, Framing
 
 
@@ -12,7 +12,7 @@ class CorruptCrc(WireFault):
     name = "corrupt-crc"
     summary = "the check sum (CRC of RTU, LRC of ASCII) is wrong; no effect over TCP, which has none"
 
-    def strike(self, frame: Frame, random: Random) -> Outcome:
+    def strike(self, frame: Frame, random: Random) -> FaultEffect:
         data = frame.data
         if frame.framing is Framing.RTU and data:
             return passed(data[:-1] + bytes((data[-1] ^ 0x5A,)))

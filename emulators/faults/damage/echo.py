@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from random import Random
 
-from fieldtwin.emulators.faults.fault import Outcome, Piece, WireFault
+from fieldtwin.emulators.faults.fault import FaultEffect, Piece, WireFault
 from fieldtwin.emulators.faults.frames import Frame, Way
 
 
@@ -13,5 +13,5 @@ class Echo(WireFault):
     summary = "the sender receives its own frame before the reply"
     ways = frozenset((Way.REQUEST,))
 
-    def strike(self, frame: Frame, random: Random) -> Outcome:
-        return Outcome((Piece(frame.data, back=True), Piece(frame.data)))
+    def strike(self, frame: Frame, random: Random) -> FaultEffect:
+        return FaultEffect((Piece(frame.data, back=True), Piece(frame.data)))

@@ -6,7 +6,7 @@ from random import Random
 
 from pydantic import Field
 
-from fieldtwin.emulators.faults.fault import HEX, Outcome, Parameters, WireFault, passed
+from fieldtwin.emulators.faults.fault import HEX, FaultEffect, Parameters, WireFault, passed
 from fieldtwin.emulators.faults.frames import Frame
 
 
@@ -20,5 +20,5 @@ class Garbage(WireFault):
     summary = "`count` random bytes, or the bytes of `data` (hex), follow the frame immediately"
     form = Form
 
-    def strike(self, frame: Frame, random: Random) -> Outcome:
+    def strike(self, frame: Frame, random: Random) -> FaultEffect:
         return passed(frame.data + (bytes.fromhex(self.parameters.data) or random.randbytes(self.parameters.count)))

@@ -6,7 +6,7 @@ from random import Random
 
 from pydantic import Field
 
-from fieldtwin.emulators.faults.fault import HEX, Outcome, Parameters, Piece, WireFault, passed
+from fieldtwin.emulators.faults.fault import HEX, FaultEffect, Parameters, Piece, WireFault, passed
 from fieldtwin.emulators.faults.frames import Frame
 
 
@@ -21,9 +21,9 @@ class Noise(WireFault):
     summary = "`count` random bytes, or the bytes of `data` (hex), precede the frame by `lead_ms`"
     form = Form
 
-    def strike(self, frame: Frame, random: Random) -> Outcome:
+    def strike(self, frame: Frame, random: Random) -> FaultEffect:
         p = self.parameters
         before = bytes.fromhex(p.data) or random.randbytes(p.count)
         if not p.lead_ms:
             return passed(before + frame.data)
-        return Outcome((Piece(before), Piece(frame.data, p.lead_ms / 1000)))
+        return FaultEffect((Piece(before), Piece(frame.data, p.lead_ms / 1000)))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from random import Random
 
-from fieldtwin.emulators.faults.fault import LOST, Outcome, WireFault, passed
+from fieldtwin.emulators.faults.fault import LOST, FaultEffect, WireFault, passed
 from fieldtwin.emulators.faults.frames import Frame
 
 
@@ -12,6 +12,6 @@ class WrongParity(WireFault):
     name = "wrong-parity"
     summary = "bytes whose parity bit is wrong are dropped, which depends on their bits"
 
-    def strike(self, frame: Frame, random: Random) -> Outcome:
+    def strike(self, frame: Frame, random: Random) -> FaultEffect:
         heard = bytes(byte for byte in frame.data if byte.bit_count() % 2 == 0)
         return passed(heard) if heard else LOST

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from random import Random
 
-from fieldtwin.emulators.faults.fault import LOST, Hang, Outcome, WireFault
+from fieldtwin.emulators.faults.fault import LOST, FaultEffect, Hang, WireFault
 from fieldtwin.emulators.faults.frames import Frame, Way
 
 
@@ -16,7 +16,7 @@ class Disconnect(WireFault):
     ways = frozenset(Way)
     refuses = True
 
-    def strike(self, frame: Frame, random: Random) -> Outcome:
+    def strike(self, frame: Frame, random: Random) -> FaultEffect:
         return LOST
 
     def appears(self) -> Hang:

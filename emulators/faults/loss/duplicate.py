@@ -6,7 +6,7 @@ from random import Random
 
 from pydantic import Field
 
-from fieldtwin.emulators.faults.fault import Outcome, Parameters, Piece, WireFault
+from fieldtwin.emulators.faults.fault import FaultEffect, Parameters, Piece, WireFault
 from fieldtwin.emulators.faults.frames import Frame
 
 
@@ -20,6 +20,6 @@ class Duplicate(WireFault):
     summary = "the frame arrives again, `after_ms` later"
     form = Form
 
-    def strike(self, frame: Frame, random: Random) -> Outcome:
+    def strike(self, frame: Frame, random: Random) -> FaultEffect:
         again = Piece(frame.data, self.parameters.after_ms / 1000)
-        return Outcome((Piece(frame.data), *[again] * self.parameters.times))
+        return FaultEffect((Piece(frame.data), *[again] * self.parameters.times))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from random import Random
 
-from fieldtwin.emulators.faults.fault import Hang, Outcome, WireFault
+from fieldtwin.emulators.faults.fault import FaultEffect, Hang, WireFault
 from fieldtwin.emulators.faults.frames import Frame
 
 
@@ -12,5 +12,5 @@ class HalfOpen(WireFault):
     name = "half-open"
     summary = "from this frame on, the connection silently carries no data"
 
-    def strike(self, frame: Frame, random: Random) -> Outcome:
-        return Outcome(hang=Hang.HALF_OPEN)
+    def strike(self, frame: Frame, random: Random) -> FaultEffect:
+        return FaultEffect(hang=Hang.HALF_OPEN)

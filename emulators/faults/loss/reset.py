@@ -6,7 +6,7 @@ from random import Random
 
 from pydantic import Field
 
-from fieldtwin.emulators.faults.fault import Hang, Outcome, Parameters, Piece, WireFault
+from fieldtwin.emulators.faults.fault import FaultEffect, Hang, Parameters, Piece, WireFault
 from fieldtwin.emulators.faults.frames import Frame
 
 
@@ -19,5 +19,5 @@ class Reset(WireFault):
     summary = "the connection is reset after the first `at` bytes of the frame"
     form = Form
 
-    def strike(self, frame: Frame, random: Random) -> Outcome:
-        return Outcome((Piece(frame.data[: self.parameters.at]),) if self.parameters.at else (), Hang.RESET)
+    def strike(self, frame: Frame, random: Random) -> FaultEffect:
+        return FaultEffect((Piece(frame.data[: self.parameters.at]),) if self.parameters.at else (), Hang.RESET)

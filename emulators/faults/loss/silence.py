@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from random import Random
 
-from fieldtwin.emulators.faults.fault import LOST, Outcome, WireFault
+from fieldtwin.emulators.faults.fault import LOST, FaultEffect, WireFault
 from fieldtwin.emulators.faults.frames import Frame, Way
 
 
@@ -13,5 +13,5 @@ class Silence(WireFault):
     summary = "the device never answers: its requests do not reach it"
     ways = frozenset((Way.REQUEST,))
 
-    def strike(self, frame: Frame, random: Random) -> Outcome:
+    def strike(self, frame: Frame, random: Random) -> FaultEffect:
         return LOST

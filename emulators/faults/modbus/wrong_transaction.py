@@ -6,7 +6,7 @@ from random import Random
 
 from pydantic import Field
 
-from fieldtwin.emulators.faults.fault import Outcome, Parameters, WireFault, passed
+from fieldtwin.emulators.faults.fault import FaultEffect, Parameters, WireFault, passed
 from fieldtwin.emulators.faults.frames import Frame, Framing
 
 
@@ -24,7 +24,7 @@ class WrongTransaction(WireFault):
     )
     form = Form
 
-    def strike(self, frame: Frame, random: Random) -> Outcome:
+    def strike(self, frame: Frame, random: Random) -> FaultEffect:
         if frame.framing is not Framing.MBAP or len(frame.data) < 4:
             return passed(frame.data)
         p = self.parameters

@@ -6,7 +6,7 @@ from random import Random
 
 from pydantic import Field
 
-from fieldtwin.emulators.faults.fault import Outcome, Parameters, Piece, WireFault
+from fieldtwin.emulators.faults.fault import FaultEffect, Parameters, Piece, WireFault
 from fieldtwin.emulators.faults.frames import Frame
 
 
@@ -19,5 +19,5 @@ class LateReply(WireFault):
     summary = "the reply arrives `by_ms` late, and later replies may overtake it"
     form = Form
 
-    def strike(self, frame: Frame, random: Random) -> Outcome:
-        return Outcome((Piece(frame.data, self.parameters.by_ms / 1000, overtake=True),))
+    def strike(self, frame: Frame, random: Random) -> FaultEffect:
+        return FaultEffect((Piece(frame.data, self.parameters.by_ms / 1000, overtake=True),))

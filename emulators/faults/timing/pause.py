@@ -6,7 +6,7 @@ from random import Random
 
 from pydantic import Field
 
-from fieldtwin.emulators.faults.fault import Outcome, Parameters, Piece, WireFault
+from fieldtwin.emulators.faults.fault import FaultEffect, Parameters, Piece, WireFault
 from fieldtwin.emulators.faults.frames import Frame
 
 
@@ -20,6 +20,6 @@ class Pause(WireFault):
     form = Form
     divides = True
 
-    def strike(self, frame: Frame, random: Random) -> Outcome:
+    def strike(self, frame: Frame, random: Random) -> FaultEffect:
         half = len(frame.data) // 2
-        return Outcome((Piece(frame.data[:half]), Piece(frame.data[half:], self.parameters.pause_ms / 1000)))
+        return FaultEffect((Piece(frame.data[:half]), Piece(frame.data[half:], self.parameters.pause_ms / 1000)))

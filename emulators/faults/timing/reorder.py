@@ -6,7 +6,7 @@ from random import Random
 
 from pydantic import Field
 
-from fieldtwin.emulators.faults.fault import Outcome, Parameters, Piece, WireFault
+from fieldtwin.emulators.faults.fault import FaultEffect, Parameters, Piece, WireFault
 from fieldtwin.emulators.faults.frames import Frame
 
 
@@ -23,12 +23,12 @@ class Reorder(WireFault):
         super().__init__(parameters)
         self._held: Frame | None = None
 
-    def strike(self, frame: Frame, random: Random) -> Outcome:
+    def strike(self, frame: Frame, random: Random) -> FaultEffect:
         before, self._held = self._held, None
         if before is not None:
-            return Outcome((Piece(frame.data, overtake=True), Piece(before.data, overtake=True)))
+            return FaultEffect((Piece(frame.data, overtake=True), Piece(before.data, overtake=True)))
         self._held = frame
-        return Outcome(
+        return FaultEffect(
             (Piece(frame.data, self.parameters.most_ms / 1000, overtake=True, gone=lambda: self._went(frame)),)
         )
 

@@ -6,7 +6,7 @@ from random import Random
 
 from pydantic import Field
 
-from fieldtwin.emulators.faults.fault import Outcome, Parameters, Piece, WireFault
+from fieldtwin.emulators.faults.fault import FaultEffect, Parameters, Piece, WireFault
 from fieldtwin.emulators.faults.frames import Frame
 
 
@@ -22,9 +22,9 @@ class Split(WireFault):
     form = Form
     divides = True
 
-    def strike(self, frame: Frame, random: Random) -> Outcome:
+    def strike(self, frame: Frame, random: Random) -> FaultEffect:
         p, left, cut = self.parameters, frame.data, list[bytes]()
         while len(left) > p.at and len(cut) < p.times:
             cut.append(left[: p.at])
             left = left[p.at :]
-        return Outcome(tuple(Piece(data, n * p.pause_ms / 1000) for n, data in enumerate([*cut, left])))
+        return FaultEffect(tuple(Piece(data, n * p.pause_ms / 1000) for n, data in enumerate([*cut, left])))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from fieldtwin.capture.decoding.exchange import SECRET, Exchange, Span
+from fieldtwin.capture.decoding.exchange import SECRET, DecodedExchange, Span
 from fieldtwin.capture.decoding.lss import LssWatch
 from fieldtwin.capture.decoding.node_map import NodeMap, Pdo
 from fieldtwin.capture.decoding.sdo import SdoWatch, Seen, Transfer
@@ -27,7 +27,7 @@ _STATES = {s: s.name.replace("_", "-") for s in NmtState}
 _PDO_AREA = range(0x180, 0x580)
 
 
-class CanopenWire:
+class CanopenBusDecoder:
     """The nodes of one bus and the open transfers between them and their master."""
 
     def __init__(self, bus: str, devices: Iterable[DeviceConfig]) -> None:
@@ -38,7 +38,7 @@ class CanopenWire:
         self._pdos: dict[int, Pdo] = {}
         self._find_pdos()
 
-    def feed(self, frame: CanFrame, t_ns: int) -> tuple[str, list[Exchange]]:
+    def feed(self, frame: CanFrame, t_ns: int) -> tuple[str, list[DecodedExchange]]:
         """Add a frame, in the order of the trace."""
         if frame.error:
             return "error frame", []
@@ -72,12 +72,12 @@ class CanopenWire:
             )
         return f"{frame}: not a CANopen identifier", []
 
-    def finish(self) -> list[Exchange]:
+    def finish(self) -> list[DecodedExchange]:
         """Conclude the trace: requests that still wait have no answer."""
         dropped = [(node, watch.drop()) for node, watch in self._sdo.items()]
         return [self._transferred(node, t, t.t_ns, "no reply") for node, t in dropped if t] + self._lss.finish()
 
-    def pending(self) -> list[Exchange]:
+    def pending(self) -> list[DecodedExchange]:
         """Return the requests whose reply may still come. Changes nothing."""
         open_ = [(node, watch.open) for node, watch in self._sdo.items()]
         return [self._transferred(node, t, t.t_ns, "pending") for node, t in open_ if t] + self._lss.pending()
@@ -96,9 +96,9 @@ class CanopenWire:
         tags: dict[str, Scalar | None] | None = None,
         value: Scalar | None = None,
         problem: str = "",
-    ) -> tuple[str, list[Exchange]]:
+    ) -> tuple[str, list[DecodedExchange]]:
         return text, [
-            Exchange(
+            DecodedExchange(
                 t_ns, t_ns, self.bus, self._device(node), node, 0, service, spans, tags=tags or {}, request=data,
                 problem=problem, text=text, value=value, secrets=self._secrets(node, spans),
             )
@@ -113,14 +113,14 @@ class CanopenWire:
     def _called(self, node: int) -> str:
         return self._device(node) or f"node {node}"
 
-    def _nmt(self, data: bytes, t_ns: int) -> tuple[str, list[Exchange]]:
+    def _nmt(self, data: bytes, t_ns: int) -> tuple[str, list[DecodedExchange]]:
         if len(data) != 2:
             return self._message(t_ns, 0, "NMT", f"NMT of {len(data)} bytes", data, problem="malformed")
         command = _COMMANDS.get(data[0], f"command {data[0]:02X}h")
         whom = self._called(data[1]) if data[1] else "all nodes"
         return self._message(t_ns, data[1], f"NMT {command}", f"{whom}: NMT {command}", data)
 
-    def _emcy(self, node: int, data: bytes, t_ns: int) -> tuple[str, list[Exchange]]:
+    def _emcy(self, node: int, data: bytes, t_ns: int) -> tuple[str, list[DecodedExchange]]:
         try:
             emcy = parse_emcy(data)
         except FieldtwinError as e:
@@ -128,7 +128,7 @@ class CanopenWire:
         text = f"{self._called(node)}: EMCY {emcy.code:04X}h {emcy.meaning}"
         return self._message(t_ns, node, "EMCY", text, data, value=emcy.code)
 
-    def _heartbeat(self, node: int, data: bytes, t_ns: int) -> tuple[str, list[Exchange]]:
+    def _heartbeat(self, node: int, data: bytes, t_ns: int) -> tuple[str, list[DecodedExchange]]:
         state = heartbeat_state(data)
         if state is None:
             text = f"{self._called(node)}: error control {data.hex(' ')}"
@@ -137,7 +137,7 @@ class CanopenWire:
         text = f"{self._called(node)}: {'boot-up' if booted else _STATES[state]}"
         return self._message(t_ns, node, "boot-up" if booted else "heartbeat", text, data, value=_STATES[state])
 
-    def _pdo(self, pdo: Pdo, data: bytes, t_ns: int) -> tuple[str, list[Exchange]]:
+    def _pdo(self, pdo: Pdo, data: bytes, t_ns: int) -> tuple[str, list[DecodedExchange]]:
         head, node = f"{self._called(pdo.node)}: {pdo.name}", self._nodes.get(pdo.node)
         if pdo.mapping is None or node is None:
             return self._message(t_ns, pdo.node, pdo.name, f"{head} {data.hex(' ')}", data)
@@ -164,7 +164,7 @@ class CanopenWire:
 
     # -- SDO --------------------------------------------------------------------------------------------------------
 
-    def _on_sdo(self, node: int, reply: bool, data: bytes, t_ns: int) -> tuple[str, list[Exchange]]:
+    def _on_sdo(self, node: int, reply: bool, data: bytes, t_ns: int) -> tuple[str, list[DecodedExchange]]:
         watch = self._sdo.setdefault(node, SdoWatch())
         seen: Seen = watch.reply(data, t_ns) if reply else watch.request(data, t_ns)
         done = []
@@ -182,12 +182,12 @@ class CanopenWire:
         hidden = opened is not None and self._secrets(node, (_span(opened),))
         return f"{self._called(node)}: {seen.text}" + (f" {SECRET}" if hidden else ""), done
 
-    def _stray(self, node: int, text: str, data: bytes, t_ns: int) -> Exchange:
+    def _stray(self, node: int, text: str, data: bytes, t_ns: int) -> DecodedExchange:
         hidden = node in self._nodes and self._nodes[node].tags.has_secrets
         text = f"{self._called(node)}: {text}: " + (
             f"{SECRET}: the device has secret tags" if hidden else data.hex(" ")
         )
-        return Exchange(
+        return DecodedExchange(
             t_ns, t_ns, self.bus, self._device(node), node, 0, "stray", reply=data, problem="stray", text=text, reply_text=text,
             secrets=frozenset({""}) if hidden else frozenset(),
         )  # fmt: skip
@@ -205,7 +205,7 @@ class CanopenWire:
             return "nothing"
         return known.said(transfer.index, transfer.subindex, data, transfer.t_ns) if known else data.hex(" ")
 
-    def _transferred(self, node: int, transfer: Transfer, t_ns: int, problem: str) -> Exchange:
+    def _transferred(self, node: int, transfer: Transfer, t_ns: int, problem: str) -> DecodedExchange:
         tags, value = self._value(node, transfer, t_ns)
         text = self._asked(node, transfer)
         failed = transfer.abort is not None or bool(problem)
@@ -223,7 +223,7 @@ class CanopenWire:
             reply_text = f"{named} = {self._said(node, transfer)}" if transfer.upload else f"{named}: written"
         known = value is not None and not (failed and transfer.upload)
         span = _span(transfer)
-        return Exchange(
+        return DecodedExchange(
             transfer.t_ns, t_ns, self.bus, self._device(node), node, 0, transfer.service, (span,),
             tags=tags if known else dict.fromkeys(tags), abort=transfer.abort,
             latency_ns=t_ns - transfer.t_ns if ended else None, request=transfer.request,

@@ -13,9 +13,9 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
-from fieldtwin.capture.decoding.canopen_bus import CanopenWire
-from fieldtwin.capture.decoding.exchange import Decoded, Exchange
-from fieldtwin.capture.decoding.modbus_connection import ModbusWire, Unit
+from fieldtwin.capture.decoding.canopen_bus import CanopenBusDecoder
+from fieldtwin.capture.decoding.exchange import Decoded, DecodedExchange
+from fieldtwin.capture.decoding.modbus_connection import ModbusConnectionDecoder, Unit
 from fieldtwin.capture.decoding.tags import TagMap, show_value
 from fieldtwin.gateway.connections.tap import Captured
 from fieldtwin.gateway.core.canframe import CanFrame
@@ -40,8 +40,8 @@ class Decoder:
         self._system = system
         self._served = served
         self._framings = framings or {}
-        self._modbus: dict[str, ModbusWire] = {}
-        self._canopen: dict[str, CanopenWire] = {}
+        self._modbus: dict[str, ModbusConnectionDecoder] = {}
+        self._canopen: dict[str, CanopenBusDecoder] = {}
         self._maps: dict[str, TagMap] = {}
 
     def decode(self, event: Event) -> Decoded:
@@ -57,21 +57,21 @@ class Decoder:
             fields |= done[-1].describe()
         return Decoded(text, fields, tuple(done))
 
-    def feed(self, event: Event) -> list[Exchange]:
+    def feed(self, event: Event) -> list[DecodedExchange]:
         """Return the exchanges that an event ended: by an answer, by the next request, or as a message."""
         return self._frame(event)[1] if event.kind is Kind.FRAME else []
 
-    def finish(self) -> list[Exchange]:
+    def finish(self) -> list[DecodedExchange]:
         """Conclude the trace: requests that still wait have no answer."""
-        wires: list[ModbusWire | CanopenWire] = [*self._modbus.values(), *self._canopen.values()]
+        wires: list[ModbusConnectionDecoder | CanopenBusDecoder] = [*self._modbus.values(), *self._canopen.values()]
         return sorted((e for wire in wires for e in wire.finish()), key=lambda e: e.t_ns)
 
-    def pending(self) -> list[Exchange]:
+    def pending(self) -> list[DecodedExchange]:
         """Return the requests whose reply may still come, the oldest first. Changes nothing, so it may be called at any time."""
-        wires: list[ModbusWire | CanopenWire] = [*self._modbus.values(), *self._canopen.values()]
+        wires: list[ModbusConnectionDecoder | CanopenBusDecoder] = [*self._modbus.values(), *self._canopen.values()]
         return sorted((e for wire in wires for e in wire.pending()), key=lambda e: e.t_ns)
 
-    def _frame(self, event: Event) -> tuple[str, list[Exchange]]:
+    def _frame(self, event: Event) -> tuple[str, list[DecodedExchange]]:
         data = event.data
         try:
             raw = bytes.fromhex(data.get("bytes", ""))
@@ -89,7 +89,7 @@ class Decoder:
         texts, done = wire.feed(data.get("dir") == "sent", raw, event.t_ns)
         return "; ".join(texts), done
 
-    def _line(self, bus: str) -> ModbusWire | None:
+    def _line(self, bus: str) -> ModbusConnectionDecoder | None:
         if bus not in self._modbus:
             config = self._system.buses.get(bus) if self._system else None
             if config is not None and config.endpoint.is_can:
@@ -99,12 +99,12 @@ class Decoder:
                 return None
             units = {d.address: Unit(d.name, TagMap(d.profile)) for d in self._devices(bus)}
             echo = config.echo if config else False
-            self._modbus[bus] = ModbusWire(bus, framing, units, echo=echo, served=bus in self._served)
+            self._modbus[bus] = ModbusConnectionDecoder(bus, framing, units, echo=echo, served=bus in self._served)
         return self._modbus[bus]
 
-    def _can(self, bus: str) -> CanopenWire:
+    def _can(self, bus: str) -> CanopenBusDecoder:
         if bus not in self._canopen:
-            self._canopen[bus] = CanopenWire(bus, self._devices(bus))
+            self._canopen[bus] = CanopenBusDecoder(bus, self._devices(bus))
         return self._canopen[bus]
 
     def _devices(self, bus: str) -> list[DeviceConfig]:
@@ -139,7 +139,7 @@ class Decoder:
         return self._maps[device].show({name: value}).removeprefix(f"{name} ")
 
 
-def exchanges(system: System, events: Iterable[Event], served: Collection[str] = ()) -> list[Exchange]:
+def exchanges(system: System, events: Iterable[Event], served: Collection[str] = ()) -> list[DecodedExchange]:
     """Return all exchanges of a trace, in the order of their requests."""
     decoder = Decoder(system, served)
     found = [exchange for event in events for exchange in decoder.feed(event)]

@@ -42,7 +42,7 @@ class Span:
 
 
 @dataclass(frozen=True, slots=True)
-class Exchange:
+class DecodedExchange:
     """A request and its answer on a bus, or a message that has no answer (broadcast, heartbeat, PDO).
 
     `unit` is the Modbus unit ID or CANopen node ID (0: all), `device` the system's name of it, "" where it has none.
@@ -139,4 +139,4 @@ class Decoded:
 
     text: str
     fields: dict[str, Any] = field(default_factory=dict)
-    exchanges: tuple[Exchange, ...] = ()
+    exchanges: tuple[DecodedExchange, ...] = ()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from fieldtwin.capture.decoding.exchange import Exchange
+from fieldtwin.capture.decoding.exchange import DecodedExchange
 from fieldtwin.gateway.core.errors import FieldtwinError
 from fieldtwin.gateway.protocols.canopen import lss
 
@@ -34,19 +34,19 @@ class LssWatch:
 
     def __init__(self, bus: str) -> None:
         self.bus = bus
-        self._open: Exchange | None = None
+        self._open: DecodedExchange | None = None
 
-    def feed(self, data: bytes, reply: bool, t_ns: int) -> tuple[str, list[Exchange]]:
+    def feed(self, data: bytes, reply: bool, t_ns: int) -> tuple[str, list[DecodedExchange]]:
         """Add a frame of either identifier."""
         if not data:
             return "LSS without data", []
         return self._reply(data, t_ns) if reply else self._request(data, t_ns)
 
-    def pending(self) -> list[Exchange]:
+    def pending(self) -> list[DecodedExchange]:
         """Return the request whose reply may still come. Changes nothing."""
         return [] if self._open is None else [replace(self._open, problem="pending", reply_text="pending")]
 
-    def finish(self) -> list[Exchange]:
+    def finish(self) -> list[DecodedExchange]:
         """Conclude the trace: a request that still waits has no answer."""
         now, self._open = self._open, None
         if now is None:
@@ -54,17 +54,19 @@ class LssWatch:
         silent = now.request[0] in _MAY_BE_SILENT
         return [replace(now, problem="" if silent else "no reply", reply_text="no reply")]
 
-    def _request(self, data: bytes, t_ns: int) -> tuple[str, list[Exchange]]:
+    def _request(self, data: bytes, t_ns: int) -> tuple[str, list[DecodedExchange]]:
         done = self.finish()
         service, detail = _named(data)
-        now = Exchange(t_ns, t_ns, self.bus, "", 0, 0, f"LSS {service}", request=data, text=f"LSS {service}{detail}")
+        now = DecodedExchange(
+            t_ns, t_ns, self.bus, "", 0, 0, f"LSS {service}", request=data, text=f"LSS {service}{detail}"
+        )
         if data[0] in _ANSWERED:
             self._open = now
         else:
             done.append(now)
         return now.text, done
 
-    def _reply(self, data: bytes, t_ns: int) -> tuple[str, list[Exchange]]:
+    def _reply(self, data: bytes, t_ns: int) -> tuple[str, list[DecodedExchange]]:
         now = self._open
         if now is None or _ANSWERED[now.request[0]] != data[0]:
             return f"LSS {_named(data)[0]}, without a request", []

@@ -10,9 +10,9 @@ from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from fieldtwin.capture.decoding.exchange import SECRET, Exchange, Span
+from fieldtwin.capture.decoding.exchange import SECRET, DecodedExchange, Span
 from fieldtwin.capture.decoding.modbus_frames import Expected, Frame, splitter
-from fieldtwin.capture.decoding.modbus_pdu import Asked, parse_reply, parse_request, words
+from fieldtwin.capture.decoding.modbus_pdu import DecodedRequest, parse_reply, parse_request, words
 from fieldtwin.capture.decoding.tags import TagMap
 from fieldtwin.gateway.core.values import Scalar
 
@@ -34,13 +34,13 @@ class Unit:
 @dataclass(slots=True)
 class _Open:
     frame: Frame
-    asked: Asked
+    asked: DecodedRequest
     device: str
     tags: TagMap | None
     text: str = ""
 
 
-class ModbusWire:
+class ModbusConnectionDecoder:
     """One Modbus connection.
 
     `framing` is rtu, ascii, mbap or udp. `echo`: sent bytes come back first. `served`: the remote side is the client.
@@ -61,20 +61,20 @@ class ModbusWire:
         self._given_up: deque[int] = deque(maxlen=MAX_OPEN)
         self._cut_off = False
 
-    def feed(self, sent: bool, data: bytes, t_ns: int) -> tuple[list[str], list[Exchange]]:
+    def feed(self, sent: bool, data: bytes, t_ns: int) -> tuple[list[str], list[DecodedExchange]]:
         """Add a chunk, in the order of the trace. Each text describes a whole or partial frame."""
         return self._take_requests(data, t_ns) if sent != self._served else self._take_replies(data, t_ns)
 
-    def finish(self) -> list[Exchange]:
+    def finish(self) -> list[DecodedExchange]:
         """Conclude the trace: requests that still wait have no answer."""
         texts: list[str] = []
-        done: list[Exchange] = []
+        done: list[DecodedExchange] = []
         self._settle(texts, done)
         done += [self._unanswered(o) for o in self._open.values()]
         self._open.clear()
         return done
 
-    def pending(self) -> list[Exchange]:
+    def pending(self) -> list[DecodedExchange]:
         """Return the requests whose reply may still come, the oldest first. Changes nothing."""
         size = self._replies.pending
         text = f"pending, {_bytes(size)} of a reply so far" if size else "pending"
@@ -82,9 +82,9 @@ class ModbusWire:
 
     # -- requests -----------------------------------------------------------------------------------------------------
 
-    def _take_requests(self, data: bytes, t_ns: int) -> tuple[list[str], list[Exchange]]:
+    def _take_requests(self, data: bytes, t_ns: int) -> tuple[list[str], list[DecodedExchange]]:
         texts: list[str] = []
-        done: list[Exchange] = []
+        done: list[DecodedExchange] = []
         frames = self._requests.feed(data, t_ns)
         if not self._served:
             frames += self._requests.flush()  # each chunk that is sent is one whole frame
@@ -100,7 +100,7 @@ class ModbusWire:
             texts.append(self._request(frame, done))
         return texts or [f"{_bytes(self._requests.pending)} of a request"], done
 
-    def _request(self, frame: Frame, done: list[Exchange]) -> str:
+    def _request(self, frame: Frame, done: list[DecodedExchange]) -> str:
         unit, asked = self._units.get(frame.unit), parse_request(frame.pdu)
         opened = _Open(frame, asked, unit.name if unit else "", unit.tags if unit else None)
         text = opened.text = self._describe(opened)
@@ -131,9 +131,9 @@ class ModbusWire:
 
     # -- replies ------------------------------------------------------------------------------------------------------
 
-    def _take_replies(self, data: bytes, t_ns: int) -> tuple[list[str], list[Exchange]]:
+    def _take_replies(self, data: bytes, t_ns: int) -> tuple[list[str], list[DecodedExchange]]:
         texts: list[str] = []
-        done: list[Exchange] = []
+        done: list[DecodedExchange] = []
         if self._echo_due:
             echo = data[: len(self._echo_due)]
             if echo == self._echo_due[: len(echo)]:
@@ -164,11 +164,11 @@ class ModbusWire:
             return None
         return Expected(opened.frame.unit, opened.asked.function, opened.asked.reply_bytes)
 
-    def _settle(self, texts: list[str], done: list[Exchange]) -> None:
+    def _settle(self, texts: list[str], done: list[DecodedExchange]) -> None:
         """Conclude the reply at a new request: remaining bytes are a complete reply, or noise."""
         self._judge(self._replies.flush(self._expected()), texts, done)
 
-    def _judge(self, frames: Iterable[Frame], texts: list[str], done: list[Exchange]) -> None:
+    def _judge(self, frames: Iterable[Frame], texts: list[str], done: list[DecodedExchange]) -> None:
         for frame in frames:
             opened = self._open.get(frame.transaction)
             ours = opened is not None and frame.unit == opened.frame.unit and frame.pdu
@@ -184,13 +184,13 @@ class ModbusWire:
                 done.append(self._answered(opened, frame))
             texts.append(f"{opened.device or f'unit {frame.unit}'}: {done[-1].reply_text}")
 
-    def _older(self, answered: _Open) -> list[Exchange]:
+    def _older(self, answered: _Open) -> list[DecodedExchange]:
         """End older requests: the gateway sends one request at a time, so it gave them up."""
         older = [t for t, o in self._open.items() if o.frame.t_ns <= answered.frame.t_ns]
         self._given_up.extend(older)
         return [self._unanswered(self._open.pop(t)) for t in older]
 
-    def _stray(self, frame: Frame, done: list[Exchange]) -> str:
+    def _stray(self, frame: Frame, done: list[DecodedExchange]) -> str:
         if frame.bad:
             return f"{_bytes(len(frame.raw))} of noise ({frame.bad})"
         unit = self._units.get(frame.unit) or self._sender_of(frame)
@@ -202,7 +202,7 @@ class ModbusWire:
         text = f"{name or f'unit {frame.unit}'}: {why}: {_identified(frame.unit, transaction)}, "
         text += f"{SECRET}: the device has secret tags" if hidden else _shortened(frame.raw)
         done.append(
-            Exchange(
+            DecodedExchange(
                 frame.t_ns, frame.t_ns, self.bus, name, frame.unit, frame.pdu[0] & 0x7F if frame.pdu else 0, "stray",
                 reply=frame.raw, problem="stray", text=text, reply_text=text, secrets=frozenset({""}) if hidden else frozenset(),
                 transaction=transaction,
@@ -217,7 +217,7 @@ class ModbusWire:
             return self._units[opened.frame.unit]
         return next(iter(self._units.values())) if len(self._units) == 1 else None
 
-    def _answered(self, opened: _Open, frame: Frame) -> Exchange:
+    def _answered(self, opened: _Open, frame: Frame) -> DecodedExchange:
         answer = parse_reply(opened.asked, opened.frame.pdu, frame.pdu)
         span, text = opened.asked.read_span, answer.detail or "done"
         registers: tuple[int, ...] = ()
@@ -229,7 +229,7 @@ class ModbusWire:
             text = _shown(opened.tags, span, tags, registers)
         return self._exchange(opened, frame, answer.problem, text, registers, tags, answer.exception)
 
-    def _unanswered(self, opened: _Open) -> Exchange:
+    def _unanswered(self, opened: _Open) -> DecodedExchange:
         return self._exchange(opened, None, "no reply", "no reply")
 
     def _exchange(
@@ -241,7 +241,7 @@ class ModbusWire:
         registers: tuple[int, ...] = (),
         tags: dict[str, Scalar | None] | None = None,
         exception: int | None = None,
-    ) -> Exchange:
+    ) -> DecodedExchange:
         asked, frame, found = opened.asked, opened.frame, dict(tags or {})
         span = asked.write_span
         if span is not None and asked.written:
@@ -252,7 +252,7 @@ class ModbusWire:
             for touched in asked.spans:
                 for name in opened.tags.names(touched):
                     found.setdefault(name, None)
-        return Exchange(
+        return DecodedExchange(
             t_ns=frame.t_ns,
             end_ns=reply.t_ns if reply else frame.t_ns,
             bus=self.bus,

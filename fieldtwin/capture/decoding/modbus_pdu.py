@@ -29,7 +29,7 @@ assert set(_TABLES.values()) <= set(get_args(Table))
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class DecodedRequest:
     """A request. `written` is the data to write: register bytes, or a byte (0 or 1) for each bit.
 
     `reply_bytes` is the length of a normal reply PDU, 0 where the reply itself states it. `echoes` is the number of
@@ -55,7 +55,7 @@ class Asked:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """A reply, decoded with its request. `read`: as `Asked.written`. `detail` describes the rest of the reply."""
+    """A reply, decoded with its request. `read`: as `DecodedRequest.written`. `detail` describes the rest of the reply."""
 
     read: bytes = b""
     exception: int | None = None
@@ -73,14 +73,14 @@ def exception_text(code: int) -> str:
     return f"{code:02X} {ModbusExceptionReply.NAMES.get(code, 'vendor specific')}"
 
 
-def parse_request(pdu: bytes) -> Asked:
+def parse_request(pdu: bytes) -> DecodedRequest:
     """Decode a request PDU (function code first)."""
     function = pdu[0] if pdu else 0
-    malformed = Asked(function, service_of(function), problem="malformed")
+    malformed = DecodedRequest(function, service_of(function), problem="malformed")
     if function in (0x01, 0x02, 0x03, 0x04) and len(pdu) == 5:
         address, count = _words(pdu[1:5])
         size = (count + 7) // 8 if function < 3 else 2 * count
-        return Asked(
+        return DecodedRequest(
             function, service_of(function), (Span("read", _TABLES[function], address, count),), reply_bytes=2 + size
         )
     if function in (0x05, 0x06) and len(pdu) == 5:
@@ -99,16 +99,16 @@ def parse_request(pdu: bytes) -> Asked:
         if pdu[9] != 2 * many or len(pdu) != 10 + 2 * many:
             return malformed
         spans = (Span("read", "holding", at, count), Span("write", "holding", to, many))
-        return Asked(function, service_of(function), spans, pdu[10:], 2 + 2 * count)
+        return DecodedRequest(function, service_of(function), spans, pdu[10:], 2 + 2 * count)
     return malformed if (function in _TABLES and function != 0x18) or function == 0x17 else _other(function, pdu)
 
 
-def _write(function: int, address: int, count: int, written: bytes, echoes: int) -> Asked:
+def _write(function: int, address: int, count: int, written: bytes, echoes: int) -> DecodedRequest:
     span = Span("write", _TABLES[function], address, count)
-    return Asked(function, service_of(function), (span,), written, echoes, echoes)
+    return DecodedRequest(function, service_of(function), (span,), written, echoes, echoes)
 
 
-def _other(function: int, pdu: bytes) -> Asked:
+def _other(function: int, pdu: bytes) -> DecodedRequest:
     """Decode a request that addresses no register by number, or is not in the standard."""
     spans: tuple[Span, ...] = ()
     if function == 0x18 and len(pdu) == 3:
@@ -119,7 +119,7 @@ def _other(function: int, pdu: bytes) -> Asked:
     service = service_of(function)
     if function == 0x08 and len(pdu) >= 3:
         service = f"diagnostics {int.from_bytes(pdu[1:3]):02X}"
-    return Asked(function, service, spans, reply_bytes=fixed.get(function, 0))
+    return DecodedRequest(function, service, spans, reply_bytes=fixed.get(function, 0))
 
 
 def _file_spans(pdu: bytes) -> list[Span]:
@@ -133,7 +133,7 @@ def _file_spans(pdu: bytes) -> list[Span]:
     return spans
 
 
-def parse_reply(asked: Asked, request: bytes, pdu: bytes) -> Answer:
+def parse_reply(asked: DecodedRequest, request: bytes, pdu: bytes) -> Answer:
     """Decode a reply PDU to that request. A reply to another function, or of another size, is malformed."""
     if len(pdu) == 2 and pdu[0] == asked.function | 0x80:
         return Answer(exception=pdu[1], problem="exception", detail=f"exception {exception_text(pdu[1])}")
@@ -152,7 +152,7 @@ def parse_reply(asked: Asked, request: bytes, pdu: bytes) -> Answer:
 
 
 def words(span: Span, data: bytes) -> tuple[int, ...]:
-    """Return registers as numbers, bits as 0 and 1, from `Asked.written` or `Answer.read`."""
+    """Return registers as numbers, bits as 0 and 1, from `DecodedRequest.written` or `Answer.read`."""
     return tuple(data) if span.table in BIT_TABLES else _words(data)
 
 

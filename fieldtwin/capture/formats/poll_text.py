@@ -14,7 +14,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 from fieldtwin.gateway.core.errors import FileInvalid
-from fieldtwin.gateway.core.files.recording import Exchange
+from fieldtwin.gateway.core.files.recording import RecordedExchange
 
 _SLAVE = re.compile(r"Slave configuration\.*:\s*address = \[?(\d+)")
 _START = re.compile(r"start reference = (\d+)")
@@ -49,7 +49,7 @@ class _Asked:
         """Registers of a value."""
         return 2 if "32-bit" in self.kind else 1
 
-    def exchange(self, number: int, cells: dict[int, str], failed: str) -> Exchange:
+    def exchange(self, number: int, cells: dict[int, str], failed: str) -> RecordedExchange:
         """Return the poll with these values, or this failure."""
         registers = self.count * self.width
         address = self.start - 1 if self.start else 0
@@ -58,11 +58,11 @@ class _Asked:
         if failed or not cells:
             code = next((c for text, c in _EXCEPTIONS.items() if text in failed.lower()), 0)
             if not code:
-                return Exchange(t_s, self.unit, request, None, 0.0, "timeout")
-            return Exchange(t_s, self.unit, request, bytes((self.function | 0x80, code)))
+                return RecordedExchange(t_s, self.unit, request, None, 0.0, "timeout")
+            return RecordedExchange(t_s, self.unit, request, bytes((self.function | 0x80, code)))
         values = [cells[self.start + i * self.width] for i in range(self.count)]
         data = self._bits(values) if self.function <= 2 else b"".join(self._registers(v) for v in values)
-        return Exchange(t_s, self.unit, request, bytes((self.function, len(data))) + data)
+        return RecordedExchange(t_s, self.unit, request, bytes((self.function, len(data))) + data)
 
     @staticmethod
     def _bits(values: list[str]) -> bytes:
@@ -79,7 +79,7 @@ class _Asked:
         return raw if "big endian" in self.kind else raw[2:] + raw[:2]
 
 
-def read_polls(lines: Iterable[str], path: str = "") -> Iterator[Exchange]:
+def read_polls(lines: Iterable[str], path: str = "") -> Iterator[RecordedExchange]:
     """Yield the polls of one session or of several in sequence. Raises `FileInvalid` with the line."""
     asked, cells, failed, polls, number = _Asked(), dict[int, str](), "", 0, 0
     polling = False

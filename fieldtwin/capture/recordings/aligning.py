@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 
 from fieldtwin.capture.decoding.exchange import Span
 from fieldtwin.capture.decoding.modbus_pdu import parse_reply, parse_request, words
-from fieldtwin.gateway.core.files.recording import Exchange
+from fieldtwin.gateway.core.files.recording import RecordedExchange
 
 MOST_WORDS = 1_000_000
 """Maximum number of values of both sides that are kept; a longer dialogue is compared position by position."""
@@ -40,8 +40,8 @@ class Shift:
 class Aligned:
     """A pair to be compared. `recorded` None: not comparable, because the recording has no value at that position."""
 
-    recorded: Exchange | None
-    other: Exchange
+    recorded: RecordedExchange | None
+    other: RecordedExchange
 
 
 @dataclass(slots=True)
@@ -106,7 +106,7 @@ class Dialogue:
     """
 
     def __init__(self) -> None:
-        self._pairs: list[tuple[Exchange, Exchange]] = []
+        self._pairs: list[tuple[RecordedExchange, RecordedExchange]] = []
         self._cells: dict[Cell, _Series] = {}
         self._words = 0
         self.shifts: list[Shift] = []
@@ -116,7 +116,7 @@ class Dialogue:
         """Return whether the limit is reached: then everything is compared position by position."""
         return self._words >= MOST_WORDS
 
-    def add(self, recorded: Exchange, other: Exchange) -> None:
+    def add(self, recorded: RecordedExchange, other: RecordedExchange) -> None:
         """Take one pair."""
         self._pairs.append((recorded, other))
         both = _values(recorded), _values(other)
@@ -130,7 +130,7 @@ class Dialogue:
             series.asked.add(recorded.request)
         self._words += 2 * len(values)
 
-    def rest(self, recorded: Exchange) -> None:
+    def rest(self, recorded: RecordedExchange) -> None:
         """Take a recorded exchange that follows the last one that was asked again."""
         if (found := _values(recorded)) is None:
             return
@@ -140,7 +140,7 @@ class Dialogue:
                 series.recorded.append(value)
         self._words += len(values)
 
-    def aligned(self, alike: Callable[[Exchange, Exchange], bool]) -> list[Aligned]:
+    def aligned(self, alike: Callable[[RecordedExchange, RecordedExchange], bool]) -> list[Aligned]:
         """Return all pairs, each with the recorded exchange at the position that was found; fills `shifts`.
 
         Only exchanges that are not `alike` position by position are looked up elsewhere.
@@ -190,7 +190,9 @@ class Dialogue:
         for series in moved:
             series.wraps = any((request, series.shift) in certain for request in series.asked)
 
-    def _expected(self, recorded: Exchange, other: Exchange, seen: dict[Cell, int]) -> Exchange | None:
+    def _expected(
+        self, recorded: RecordedExchange, other: RecordedExchange, seen: dict[Cell, int]
+    ) -> RecordedExchange | None:
         """Return the recorded exchange with the values of the positions that were found."""
         both = _values(recorded), _values(other)
         if both[0] is None or both[1] is None or len(both[0][1]) != len(both[1][1]):
@@ -209,10 +211,10 @@ class Dialogue:
         if -1 in expected:
             return None
         reply = _reply(recorded.request[0], expected)
-        return Exchange(recorded.t_s, recorded.unit, recorded.request, reply, recorded.latency_s)
+        return RecordedExchange(recorded.t_s, recorded.unit, recorded.request, reply, recorded.latency_s)
 
 
-def _values(exchange: Exchange) -> tuple[Span, list[int]] | None:
+def _values(exchange: RecordedExchange) -> tuple[Span, list[int]] | None:
     """Return the values of the reply to a plain read (functions 01 to 04); None for anything else."""
     if not exchange.reply or not 1 <= exchange.request[0] <= 4:
         return None

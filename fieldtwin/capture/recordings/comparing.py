@@ -16,11 +16,11 @@ from dataclasses import dataclass, field
 from typing import TypeVar
 
 from fieldtwin.capture.decoding.exchange import Span
-from fieldtwin.capture.decoding.modbus_pdu import Answer, Asked, parse_reply, parse_request, words
+from fieldtwin.capture.decoding.modbus_pdu import Answer, DecodedRequest, parse_reply, parse_request, words
 from fieldtwin.capture.decoding.tags import TagMap
 from fieldtwin.capture.recordings.aligning import Shift
 from fieldtwin.gateway.core.files.profile import DeviceProfile
-from fieldtwin.gateway.core.files.recording import Exchange
+from fieldtwin.gateway.core.files.recording import RecordedExchange
 from fieldtwin.gateway.core.values import Scalar
 
 MAX_DIFFERENCES = 1000
@@ -66,7 +66,7 @@ class Rules:
 
 
 @dataclass(frozen=True, slots=True)
-class Difference:
+class ReplyDifference:
     """An exchange with a different outcome.
 
     `what` is value, exception, silence, reply or missing; `where` is a tag or register. `after_left_out`: an omitted
@@ -100,7 +100,7 @@ class Comparison:
 
     compared: int = 0
     alike: int = 0
-    differences: list[Difference] = field(default_factory=list)
+    differences: list[ReplyDifference] = field(default_factory=list)
     by_kind: dict[str, int] = field(default_factory=dict)
     left_out: int = 0
     left_out_writes: int = 0
@@ -143,10 +143,10 @@ class Comparer:
         self._counters = {t.name for t in profile.tags.values() if t.counter} if profile is not None else set()
         self._result = Comparison(least=self._rules.least)
         self._latencies: dict[int, tuple[array[float], array[float]]] = {}
-        self._requests: dict[bytes, Asked] = {}
+        self._requests: dict[bytes, DecodedRequest] = {}
         self._unwritten: set[tuple[int, str, int]] = set()
 
-    def add(self, recorded: Exchange | None, other: Exchange | None) -> None:
+    def add(self, recorded: RecordedExchange | None, other: RecordedExchange | None) -> None:
         """Compare one exchange of both sides; None if a side does not have it."""
         result = self._result
         if recorded is None:
@@ -165,7 +165,7 @@ class Comparer:
                 kept[0].append(recorded.latency_s)
                 kept[1].append(other.latency_s)
 
-    def is_alike(self, recorded: Exchange, other: Exchange) -> bool:
+    def is_alike(self, recorded: RecordedExchange, other: RecordedExchange) -> bool:
         """Return whether two exchanges are equal by the rules. Counts nothing."""
         if recorded.reply == other.reply and recorded.error == other.error:
             return True
@@ -173,7 +173,7 @@ class Comparer:
         trial.add(recorded, other)
         return not trial._result.by_kind
 
-    def left_out(self, exchange: Exchange) -> None:
+    def left_out(self, exchange: RecordedExchange) -> None:
         """Count an exchange that was not repeated. The effect of a write that was omitted may be missing later."""
         self._result.left_out += 1
         asked = self._asked(exchange.request)
@@ -196,7 +196,7 @@ class Comparer:
         judge_latencies(self._result, {_service(f): both for f, both in sorted(self._latencies.items())}, self._rules)
         return self._result
 
-    def _asked(self, request: bytes) -> Asked:
+    def _asked(self, request: bytes) -> DecodedRequest:
         asked = self._requests.get(request)
         if asked is None:
             if len(self._requests) > LOOK_AHEAD:
@@ -204,7 +204,7 @@ class Comparer:
             asked = self._requests[request] = parse_request(request)
         return asked
 
-    def _judge(self, recorded: Exchange, other: Exchange) -> None:
+    def _judge(self, recorded: RecordedExchange, other: RecordedExchange) -> None:
         if recorded.reply == other.reply and recorded.error == other.error:
             return
         if not recorded.reply or not other.reply:
@@ -222,7 +222,7 @@ class Comparer:
         else:
             self._judge_values(recorded, asked.read_span, one, two)
 
-    def _judge_values(self, recorded: Exchange, span: Span, one: Answer, two: Answer) -> None:
+    def _judge_values(self, recorded: RecordedExchange, span: Span, one: Answer, two: Answer) -> None:
         """Compare the values: tags known to the profile, else registers and bits. One difference per exchange is counted."""
         covered: set[int] = set()
         found: list[tuple[str, str, str]] = []
@@ -252,7 +252,7 @@ class Comparer:
 
     def _differ(
         self,
-        exchange: Exchange,
+        exchange: RecordedExchange,
         what: str,
         where: str,
         recorded: str,
@@ -270,7 +270,7 @@ class Comparer:
         for place, mine, theirs in ((where, recorded, other), *more):
             if len(self._result.differences) < MAX_DIFFERENCES:
                 self._result.differences.append(
-                    Difference(exchange.t_s, exchange.unit, text, what, place, mine, theirs, unwritten)
+                    ReplyDifference(exchange.t_s, exchange.unit, text, what, place, mine, theirs, unwritten)
                 )
 
 
@@ -316,7 +316,7 @@ def pairs_of(
     yield from ((None, exchange) for exchange in rest)
 
 
-def request_of(exchange: Exchange) -> Hashable:
+def request_of(exchange: RecordedExchange) -> Hashable:
     """Return the pairing key of an exchange: unit ID and request."""
     return exchange.unit, exchange.request
 
@@ -325,7 +325,7 @@ def _cells(span: Span) -> Iterator[tuple[str, int]]:
     return ((span.table, span.address + at) for at in range(span.count))
 
 
-def _outcome(exchange: Exchange | None) -> str:
+def _outcome(exchange: RecordedExchange | None) -> str:
     if exchange is None:
         return "not asked"
     if exchange.reply is None:

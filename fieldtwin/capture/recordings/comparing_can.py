@@ -10,14 +10,14 @@ from array import array
 from collections.abc import Hashable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 
-from fieldtwin.capture.decoding.canopen_bus import CanopenWire
-from fieldtwin.capture.decoding.exchange import Exchange
+from fieldtwin.capture.decoding.canopen_bus import CanopenBusDecoder
+from fieldtwin.capture.decoding.exchange import DecodedExchange
 from fieldtwin.capture.decoding.tags import TagMap
 from fieldtwin.capture.recordings.comparing import (
     MAX_DIFFERENCES,
     MAX_LATENCIES,
     Comparison,
-    Difference,
+    ReplyDifference,
     Rules,
     Tolerance,
     judge_latencies,
@@ -60,9 +60,9 @@ class _Side:
         self._told = 0
         self.began_ns = -1
 
-    def transfers(self) -> Iterator[Exchange]:
+    def transfers(self) -> Iterator[DecodedExchange]:
         """Yield the transfers, once; afterwards `kinds` is complete."""
-        wire = CanopenWire("can", ())
+        wire = CanopenBusDecoder("can", ())
         for t_ns, frame in self._frames:
             self.began_ns = t_ns if self.began_ns < 0 else self.began_ns
             for done in wire.feed(frame, t_ns)[1]:
@@ -70,7 +70,7 @@ class _Side:
         for done in wire.finish():
             yield from self._sorted(done)
 
-    def _sorted(self, done: Exchange) -> Iterator[Exchange]:
+    def _sorted(self, done: DecodedExchange) -> Iterator[DecodedExchange]:
         if self._nodes and done.unit not in self._nodes:
             return
         if done.service in TRANSFERS:
@@ -132,11 +132,11 @@ def compare_logs(
     return result
 
 
-def _transfer(done: Exchange) -> Hashable:
+def _transfer(done: DecodedExchange) -> Hashable:
     return done.unit, done.service, done.spans, done.value if done.service == "SDO download" else None
 
 
-def _alike(one: Exchange, two: Exchange, rules: Rules, tags: TagMap | None) -> bool:
+def _alike(one: DecodedExchange, two: DecodedExchange, rules: Rules, tags: TagMap | None) -> bool:
     if one.abort != two.abort or one.problem != two.problem:
         return False
     if one.value == two.value:
@@ -147,7 +147,9 @@ def _alike(one: Exchange, two: Exchange, rules: Rules, tags: TagMap | None) -> b
     return mine == theirs
 
 
-def _values(one: Exchange, two: Exchange, tags: TagMap | None) -> tuple[str, Scalar | None, Scalar | None]:
+def _values(
+    one: DecodedExchange, two: DecodedExchange, tags: TagMap | None
+) -> tuple[str, Scalar | None, Scalar | None]:
     """Return the tag's name and its values.
 
     Without a tag, bytes with the length of a number become a number, lowest byte first.
@@ -178,7 +180,7 @@ def _compare_messages(
         result.by_kind[what] = result.by_kind.get(what, 0) + 1
         if len(result.differences) < MAX_DIFFERENCES:
             result.differences.append(
-                Difference(
+                ReplyDifference(
                     (mine or theirs or _Kind()).first_ns / 1e9, key[0], key[1], what, "", _told(mine), _told(theirs)
                 )
             )
@@ -199,14 +201,16 @@ def _told(kind: _Kind | None) -> str:
     return f"{kind.count} of {', '.join(map(str, sorted(kind.lengths)))} bytes{often}"
 
 
-def _differ(result: Comparison, done: Exchange, what: str, recorded: str, other: str) -> None:
+def _differ(result: Comparison, done: DecodedExchange, what: str, recorded: str, other: str) -> None:
     result.by_kind[what] = result.by_kind.get(what, 0) + 1
     if len(result.differences) < MAX_DIFFERENCES:
         where = str(done.spans[0]) if done.spans else ""
-        result.differences.append(Difference(done.t_ns / 1e9, done.unit, done.service, what, where, recorded, other))
+        result.differences.append(
+            ReplyDifference(done.t_ns / 1e9, done.unit, done.service, what, where, recorded, other)
+        )
 
 
-def _outcome(done: Exchange) -> str:
+def _outcome(done: DecodedExchange) -> str:
     if done.abort is not None:
         return f"abort {done.abort:08X}h"
     return done.problem or str(done.value if done.value is not None else "nothing")

@@ -13,7 +13,7 @@ from typing import Final
 
 from fieldtwin.capture.decoding.exchange import Span
 from fieldtwin.capture.decoding.modbus_pdu import parse_reply, parse_request
-from fieldtwin.gateway.core.files.recording import Exchange
+from fieldtwin.gateway.core.files.recording import RecordedExchange
 
 MAX_UNITS = 256
 MAX_SHAPES = 10_000
@@ -50,7 +50,7 @@ class Drafts:
     def __init__(self) -> None:
         self.units: dict[int, _Unit] = {}
 
-    def note(self, exchange: Exchange) -> None:
+    def note(self, exchange: RecordedExchange) -> None:
         """Add one more exchange of the recording."""
         unit = self.units.get(exchange.unit)
         if unit is None:

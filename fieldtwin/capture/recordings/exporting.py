@@ -28,7 +28,7 @@ from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.gateway.core.files.input_file import open_input
 from fieldtwin.gateway.core.files.profile import DeviceProfile
-from fieldtwin.gateway.core.files.recording import Exchange, RecordingHeader, RecordingReader, SignalRow
+from fieldtwin.gateway.core.files.recording import RecordedExchange, RecordingHeader, RecordingReader, SignalRow
 from fieldtwin.gateway.core.values import Scalar
 from fieldtwin.gateway.protocols.modbus.crc import with_crc
 
@@ -153,7 +153,7 @@ def _frame_rows(path: Path) -> Rows:
             yield t_ns / 1e9, channel, f.can_id, kind, f.dlc, f.data.hex()
 
 
-def _outcome(e: Exchange) -> str:
+def _outcome(e: RecordedExchange) -> str:
     if e.reply is None:
         return e.error or "lost"
     return f"exception {e.reply[1]:02X}" if len(e.reply) == 2 and e.reply[0] & 0x80 else "ok"

@@ -19,12 +19,12 @@ from fieldtwin.capture.formats.tcp_segments import Conversation, Conversations, 
 from fieldtwin.capture.recordings.draft import Drafts
 from fieldtwin.capture.recordings.importing import BadFile, write_drafts
 from fieldtwin.capture.recordings.modbus_conversation import ModbusTalk
-from fieldtwin.capture.recordings.pairing import Bad, OneWirePairer, PairCounters, Pairer, SerialPairer
+from fieldtwin.capture.recordings.pairing import Bad, HalfDuplexPairer, PairCounters, Pairer, SerialPairer
 from fieldtwin.capture.recordings.rotating_file import RotatingFile
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid
-from fieldtwin.gateway.core.files.recording import Exchange, RecordingHeader, encode_exchange, encode_header
+from fieldtwin.gateway.core.files.recording import RecordedExchange, RecordingHeader, encode_exchange, encode_header
 
 LINK_CAN, LINK_USER0, LINK_RTAC = 227, 147, 250
 MAX_SERVERS = 256
@@ -70,7 +70,7 @@ class _Server:
         self.file = RotatingFile(path, encode_header(header))
         self.drafts = Drafts()
 
-    def add(self, exchanges: list[Exchange]) -> None:
+    def add(self, exchanges: list[RecordedExchange]) -> None:
         for exchange in exchanges:
             self.file.line(exchange.t_s, encode_exchange(exchange))
             self.drafts.note(exchange)
@@ -162,11 +162,11 @@ class PacketImport:
         else:
             self.summary.pairs.add(talk.pairer.counters)
 
-    def _add(self, talk: ModbusTalk, exchanges: list[Exchange]) -> None:
+    def _add(self, talk: ModbusTalk, exchanges: list[RecordedExchange]) -> None:
         if exchanges and talk.server is not None:
             self._of(talk.endpoint, exchanges)
 
-    def _of(self, endpoint: str, exchanges: list[Exchange]) -> None:
+    def _of(self, endpoint: str, exchanges: list[RecordedExchange]) -> None:
         server = self._servers.get(endpoint)
         if server is None:
             if len(self._servers) >= MAX_SERVERS:
@@ -204,7 +204,7 @@ class PacketImport:
             return
         self.summary.packets.carried += 1
         if self._line is None:
-            kind = SerialPairer if link == LINK_RTAC else OneWirePairer
+            kind = SerialPairer if link == LINK_RTAC else HalfDuplexPairer
             self._line = kind("ascii" if data[:1] == b":" else "rtu", self._zero_ns, self._bad.keep)
         found = self._line.feed(sent, data, t_ns)
         if found:

@@ -11,8 +11,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from statistics import median
 
-from fieldtwin.capture.decoding.canopen_bus import CanopenWire
-from fieldtwin.capture.decoding.exchange import Exchange
+from fieldtwin.capture.decoding.canopen_bus import CanopenBusDecoder
+from fieldtwin.capture.decoding.exchange import DecodedExchange
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.errors import UsageError
 
@@ -70,7 +70,7 @@ class LogSheet:
         self._mappings: set[int] = set()
         self._pdos: dict[tuple[bool, int], _Pdo] = {}
         self._beat = _Pdo()
-        wire = CanopenWire("can", ())
+        wire = CanopenBusDecoder("can", ())
         for t_ns, frame in frames:
             for done in wire.feed(frame, t_ns)[1]:
                 if done.unit == node:
@@ -78,7 +78,7 @@ class LogSheet:
         if not self._objects and not self._pdos and self._beat.last_ns < 0:
             raise UsageError(f"the log holds nothing of node {node}")
 
-    def _note(self, done: Exchange) -> None:
+    def _note(self, done: DecodedExchange) -> None:
         if done.service in ("SDO upload", "SDO download"):
             self._transfer(done)
         elif done.service[1:4] == "PDO" and done.service[4:].isdigit():
@@ -87,7 +87,7 @@ class LogSheet:
         elif done.service == "heartbeat":
             self._beat.saw(done.t_ns, 1)
 
-    def _transfer(self, done: Exchange) -> None:
+    def _transfer(self, done: DecodedExchange) -> None:
         key = done.spans[0].address, done.spans[0].subindex
         if key not in self._objects and len(self._objects) >= MAX_OBJECTS:
             return

@@ -13,7 +13,7 @@ from collections.abc import Collection
 from fieldtwin.capture.decoding.modbus_frames import RtuSplitter
 from fieldtwin.capture.formats.tcp_segments import Conversation, Side
 from fieldtwin.capture.recordings.pairing import OnBad, Pairer, pairer
-from fieldtwin.gateway.core.files.recording import Exchange
+from fieldtwin.gateway.core.files.recording import RecordedExchange
 
 MODBUS_PORTS = frozenset({502, 503, 802})
 MAX_UNDECIDED = 600
@@ -36,7 +36,7 @@ class ModbusTalk:
         self._seen: list[tuple[Side, bytes, int]] = []
         self._undecided = 0
 
-    def feed(self, side: Side, data: bytes, t_ns: int, lost: int) -> list[Exchange]:
+    def feed(self, side: Side, data: bytes, t_ns: int, lost: int) -> list[RecordedExchange]:
         """Add bytes from `side`; `lost` bytes before them are missing in the capture."""
         if self.pairer is not None:
             if lost:
@@ -49,7 +49,7 @@ class ModbusTalk:
         self._decide()
         return self._catch_up()
 
-    def finish(self) -> list[Exchange]:
+    def finish(self) -> list[RecordedExchange]:
         """Conclude the conversation."""
         if self.pairer is None and not self.foreign and self._seen and self._known_port:
             self._settle(self._framing_of_port())
@@ -68,7 +68,7 @@ class ModbusTalk:
     def _known_port(self) -> bool:
         return any(side[1] in self._ports or side[1] in MODBUS_PORTS for side in self._conversation.sides)
 
-    def _catch_up(self) -> list[Exchange]:
+    def _catch_up(self) -> list[RecordedExchange]:
         if self.pairer is None:
             return []
         seen, self._seen = self._seen, []

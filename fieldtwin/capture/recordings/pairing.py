@@ -1,6 +1,6 @@
 """Combine observed requests and replies into exchanges: the content of a capture or a tap in the form of a recording.
 
-A `Pairer` is fed the bytes of one connection or line, both ways, as they were seen, and yields `Exchange`s in the order
+A `Pairer` is fed the bytes of one connection or line, both ways, as they were seen, and yields `RecordedExchange`s in the order
 of their requests. Bytes that form no frame, and frames without a counterpart, are given to `on_bad` and counted; none
 is dropped silently. Sans-IO: it uses no files and no clocks; times come with the bytes. Bounded: at most `MAX_OPEN`
 requests wait for an answer.
@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 from fieldtwin.capture.decoding.modbus_frames import Expected, Frame, splitter
 from fieldtwin.capture.decoding.modbus_pdu import parse_request
-from fieldtwin.gateway.core.files.recording import Exchange, ExchangeError
+from fieldtwin.gateway.core.files.recording import ExchangeError, RecordedExchange
 from fieldtwin.gateway.protocols.modbus.crc import crc16
 from fieldtwin.gateway.protocols.modbus.frame_shapes import MAX_FRAME, MIN_FRAME, frame_lengths
 
@@ -66,11 +66,11 @@ class Pairer(ABC):
         self._on_bad = on_bad
 
     @abstractmethod
-    def feed(self, sent: bool, data: bytes, t_ns: int) -> list[Exchange]:
+    def feed(self, sent: bool, data: bytes, t_ns: int) -> list[RecordedExchange]:
         """Add bytes that went to the device (`sent`) or came from it; return the exchanges that are now complete."""
 
     @abstractmethod
-    def finish(self) -> list[Exchange]:
+    def finish(self) -> list[RecordedExchange]:
         """Conclude the connection: requests that still wait have no answer."""
 
     def lost(self, sent: bool) -> None:  # noqa: B027 - only a stream can lose its place
@@ -86,12 +86,12 @@ class Pairer(ABC):
 
     def _exchange(
         self, t_ns: int, unit: int, request: bytes, reply: bytes | None, end_ns: int, error: ExchangeError | None
-    ) -> Exchange:
+    ) -> RecordedExchange:
         self.counters.exchanges += 1
         self.counters.unanswered += reply is None
         latency_s = max(end_ns - t_ns, 0) / 1e9 if reply else 0.0
         t_s = max(t_ns - self._zero_ns, 0) / 1e9
-        return Exchange(round(t_s, _DIGITS), unit, request, reply, round(latency_s, _DIGITS), error)
+        return RecordedExchange(round(t_s, _DIGITS), unit, request, reply, round(latency_s, _DIGITS), error)
 
 
 class MbapPairer(Pairer):
@@ -102,13 +102,13 @@ class MbapPairer(Pairer):
         self._datagrams = datagrams
         self._rest = {True: b"", False: b""}
         self._open: dict[int, tuple[int, int, bytes]] = {}  # transaction id -> time, unit, request
-        self._done: dict[int, Exchange] = {}  # answered, and an older request is not
+        self._done: dict[int, RecordedExchange] = {}  # answered, and an older request is not
 
-    def feed(self, sent: bool, data: bytes, t_ns: int) -> list[Exchange]:
+    def feed(self, sent: bool, data: bytes, t_ns: int) -> list[RecordedExchange]:
         rest = self._rest[sent]
         if rest:
             data = rest + data
-        found: list[Exchange] = []
+        found: list[RecordedExchange] = []
         at, end = 0, len(data)
         while end - at >= 8:
             size = 6 + (data[at + 4] << 8 | data[at + 5])
@@ -136,29 +136,29 @@ class MbapPairer(Pairer):
         if rest:
             self._bad(self._zero_ns, sent, rest, "a frame that is incomplete in the capture")
 
-    def finish(self) -> list[Exchange]:
+    def finish(self) -> list[RecordedExchange]:
         for sent, rest in self._rest.items():
             if rest:
                 self._bad(self._zero_ns, sent, rest, "a frame that is cut off")
         self._rest = {True: b"", False: b""}
-        found: list[Exchange] = []
+        found: list[RecordedExchange] = []
         while self._open:
             self._give_up(found)
         return found
 
-    def _request(self, transaction: int, unit: int, pdu: bytes, t_ns: int, found: list[Exchange]) -> None:
+    def _request(self, transaction: int, unit: int, pdu: bytes, t_ns: int, found: list[RecordedExchange]) -> None:
         while transaction in self._open or len(self._open) >= MAX_OPEN:
             self._give_up(found)  # the oldest first, which keeps the order
         self._open[transaction] = (t_ns, unit, pdu)
 
-    def _give_up(self, found: list[Exchange]) -> None:
+    def _give_up(self, found: list[RecordedExchange]) -> None:
         """Complete the oldest request: it has no answer, or its answer has waited for its turn in order."""
         transaction = next(iter(self._open))
         t_ns, unit, request = self._open.pop(transaction)
         done = self._done.pop(transaction, None)
         found.append(done or self._exchange(t_ns, unit, request, None, t_ns, "timeout"))
 
-    def _reply(self, transaction: int, unit: int, pdu: bytes, t_ns: int, found: list[Exchange]) -> None:
+    def _reply(self, transaction: int, unit: int, pdu: bytes, t_ns: int, found: list[RecordedExchange]) -> None:
         asked = self._open.get(transaction)
         if asked is None or transaction in self._done:
             self._bad(t_ns, False, pdu, f"has no request (transaction {transaction}, unit {unit})", stray=True)
@@ -191,7 +191,7 @@ class _Asked:
 class SerialPairer(Pairer):
     """A serial line, also one carried over TCP: one request at a time. `framing` is rtu or ascii.
 
-    Both directions are known here; `OneWirePairer` is for lines without known directions.
+    Both directions are known here; `HalfDuplexPairer` is for lines without known directions.
     """
 
     def __init__(self, framing: str, zero_ns: int, on_bad: OnBad | None = None) -> None:
@@ -201,8 +201,8 @@ class SerialPairer(Pairer):
         self._reply_bytes: dict[bytes, int] = {}
         self._asked: _Asked | None = None
 
-    def feed(self, sent: bool, data: bytes, t_ns: int) -> list[Exchange]:
-        found: list[Exchange] = []
+    def feed(self, sent: bool, data: bytes, t_ns: int) -> list[RecordedExchange]:
+        found: list[RecordedExchange] = []
         if self._rtu and self._is_frame(sent, data):
             frame = Frame(t_ns, data[0], data[1:-2], data)
             (self._take_requests if sent else self._take_replies)([frame], found)
@@ -214,8 +214,8 @@ class SerialPairer(Pairer):
             self._take_replies(self._replies.feed(data, t_ns, self._expected), found)
         return found
 
-    def finish(self) -> list[Exchange]:
-        found: list[Exchange] = []
+    def finish(self) -> list[RecordedExchange]:
+        found: list[RecordedExchange] = []
         self._take_requests(self._requests.flush(), found)
         self._settle(found)
         return found
@@ -238,7 +238,7 @@ class SerialPairer(Pairer):
     def _expected(self) -> Expected | None:
         return self._asked.expected if self._asked else None
 
-    def _take_requests(self, frames: list[Frame], found: list[Exchange]) -> None:
+    def _take_requests(self, frames: list[Frame], found: list[RecordedExchange]) -> None:
         for frame in frames:
             if frame.bad or not frame.pdu:
                 self._bad(frame.t_ns, True, frame.raw, frame.bad or "no frame")
@@ -246,7 +246,7 @@ class SerialPairer(Pairer):
             self._settle(found)
             self._ask(frame, found)
 
-    def _ask(self, frame: Frame, found: list[Exchange]) -> None:
+    def _ask(self, frame: Frame, found: list[RecordedExchange]) -> None:
         if frame.unit == 0:
             found.append(self._exchange(frame.t_ns, 0, frame.pdu, b"", frame.t_ns, None))
             return
@@ -257,7 +257,7 @@ class SerialPairer(Pairer):
             size = self._reply_bytes[frame.pdu] = parse_request(frame.pdu).reply_bytes
         self._asked = _Asked(frame, Expected(frame.unit, frame.pdu[0], size), frame.t_ns)
 
-    def _settle(self, found: list[Exchange]) -> None:
+    def _settle(self, found: list[RecordedExchange]) -> None:
         """Conclude the exchange at the next request or at the end: remaining bytes are a complete reply, or noise."""
         if self._replies.pending:
             self._take_replies(self._replies.flush(self._expected), found)
@@ -265,7 +265,7 @@ class SerialPairer(Pairer):
             self._asked = None
             found.append(self._exchange(asked.began_ns, asked.frame.unit, asked.frame.pdu, None, 0, asked.noise))
 
-    def _take_replies(self, frames: list[Frame], found: list[Exchange]) -> None:
+    def _take_replies(self, frames: list[Frame], found: list[RecordedExchange]) -> None:
         for frame in frames:
             asked = self._asked
             ours = asked is not None and frame.unit == asked.frame.unit and bool(frame.pdu)
@@ -278,23 +278,23 @@ class SerialPairer(Pairer):
                 asked.noise = "crc" if frame.bad else "desync"
 
 
-class OneWirePairer(SerialPairer):
+class HalfDuplexPairer(SerialPairer):
     """A line without known directions: a frame that can be the answer to the last request is taken for it."""
 
-    def feed(self, sent: bool, data: bytes, t_ns: int) -> list[Exchange]:
-        found: list[Exchange] = []
+    def feed(self, sent: bool, data: bytes, t_ns: int) -> list[RecordedExchange]:
+        found: list[RecordedExchange] = []
         for frame in self._replies.feed(data, t_ns):
             self._either(frame, found)
         return found
 
-    def finish(self) -> list[Exchange]:
-        found: list[Exchange] = []
+    def finish(self) -> list[RecordedExchange]:
+        found: list[RecordedExchange] = []
         for frame in self._replies.flush():
             self._either(frame, found)
         self._settle(found)
         return found
 
-    def _either(self, frame: Frame, found: list[Exchange]) -> None:
+    def _either(self, frame: Frame, found: list[RecordedExchange]) -> None:
         if frame.bad or self._may_answer(frame):
             self._take_replies([frame], found)
         else:

@@ -14,7 +14,7 @@ from types import TracebackType
 from typing import Self
 
 from fieldtwin.gateway.core.errors import Bug, FileInvalid
-from fieldtwin.gateway.core.files.recording import Exchange, RecordingHeader, RecordingReader
+from fieldtwin.gateway.core.files.recording import RecordedExchange, RecordingHeader, RecordingReader
 
 MAX_PARTS = 9999
 MB = 1_000_000
@@ -138,7 +138,7 @@ def header_of(path: Path) -> RecordingHeader:
         return reader.header
 
 
-def exchanges_of(path: Path) -> Iterator[Exchange]:
+def exchanges_of(path: Path) -> Iterator[RecordedExchange]:
     """Yield the exchanges of all parts of a recording, in order. Raises `FileInvalid`."""
     for found in parts_of(path):
         with RecordingReader(found) as reader:

@@ -15,7 +15,7 @@ from fieldtwin.gateway.core.clock import NS_PER_S, Clock
 from fieldtwin.gateway.core.connection import Direction, Tap
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import FieldtwinError
-from fieldtwin.gateway.core.files.recording import Exchange, encode_exchange
+from fieldtwin.gateway.core.files.recording import RecordedExchange, encode_exchange
 
 
 class ExchangeSink:
@@ -24,7 +24,7 @@ class ExchangeSink:
     def __init__(self, file: RotatingFile) -> None:
         self.file = file
 
-    def __call__(self, exchange: Exchange) -> None:
+    def __call__(self, exchange: RecordedExchange) -> None:
         self.file.line(exchange.t_s, encode_exchange(exchange))
 
 

@@ -13,7 +13,7 @@ import click
 
 from fieldtwin.cli.options import Duration, profiles_option
 from fieldtwin.commissioning.access.address import ORDERS, TYPES, RawForm
-from fieldtwin.commissioning.access.frame_log import WireLog
+from fieldtwin.commissioning.access.frame_log import FrameLog
 from fieldtwin.commissioning.access.reading import Target, target_of
 from fieldtwin.gateway.core.connection import Tap
 from fieldtwin.gateway.core.errors import UsageError
@@ -102,5 +102,5 @@ def logged(path: Path | None) -> Iterator[list[Tap]]:
     if path is None:
         yield []
         return
-    with WireLog(path, words()) as log:
+    with FrameLog(path, words()) as log:
         yield [log]

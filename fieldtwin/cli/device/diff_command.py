@@ -13,7 +13,7 @@ from rich.text import Text
 from fieldtwin.cli.options import json_option, pairs, profiles_option
 from fieldtwin.commissioning.dump.diff import Differences, Leave, diff_dictionary, diff_dumps, diff_profile
 from fieldtwin.commissioning.dump.file import Dump, load_dump
-from fieldtwin.console import data, talk
+from fieldtwin.console import stderr, stdout
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.gateway.core.files.profile import DeviceProfile, load_profile
 from fieldtwin.gateway.protocols.canopen.dictionary import ObjectDictionary, load_dictionary
@@ -98,7 +98,7 @@ def _dump(path: Path) -> Dump:
     if not dump.passes:
         raise FileInvalid("a dump without values", path=str(path))
     if not dump.ended:
-        talk.print(f"{path.name} was interrupted: what it lacks is not compared", soft_wrap=True)
+        stderr.print(f"{path.name} was interrupted: what it lacks is not compared", soft_wrap=True)
     return dump
 
 
@@ -121,7 +121,7 @@ def _named(dump: Dump, name: str, folders: list[Path]) -> DeviceProfile | None:
         for path in sorted((folder / "devices").glob("*.yaml")):
             if f"device: {known}" in path.read_text(encoding="utf-8", errors="replace"):
                 return load_profile(path)
-    talk.print(f"no profile {known} here: addresses instead of names (--profile)", soft_wrap=True)
+    stderr.print(f"no profile {known} here: addresses instead of names (--profile)", soft_wrap=True)
     return None
 
 
@@ -147,8 +147,8 @@ def _show(found: Differences, left: str, right: str) -> None:
             table.add_column(name, overflow="fold")
         for d in found.found:
             table.add_row(Text(d.name), d.at if d.at != d.name else "", d.kind, Text(d.left), Text(d.right))
-        data.print(table)
+        stdout.print(table)
     for note in found.notes:
-        talk.print(Text(note), soft_wrap=True)
+        stderr.print(Text(note), soft_wrap=True)
     nothing = "" if found.compared else ": nothing in these two can be compared"
-    talk.print(f"{found.compared} compared, {len(found.found)} different{nothing}")
+    stderr.print(f"{found.compared} compared, {len(found.found)} different{nothing}")

@@ -19,7 +19,7 @@ from fieldtwin.commissioning.dump.dump import Progress as Told
 from fieldtwin.commissioning.dump.file import Dump, load_dump
 from fieldtwin.commissioning.dump.profile import dumped_tags
 from fieldtwin.commissioning.dump.session import dump, estimate, frames, log_path, object_ranges, register_spans
-from fieldtwin.console import data, talk
+from fieldtwin.console import stderr, stdout
 from fieldtwin.gateway.core.errors import Unreachable, UsageError
 from fieldtwin.gateway.wallclock import run as run_precise
 
@@ -117,7 +117,7 @@ def command(
             click.echo(frame)
         return 0
     out = out or Path(f"dump-{target.address}.jsonl")
-    talk.print(estimate_text(estimate(job, spacing_s), passes, rate), soft_wrap=True)
+    stderr.print(estimate_text(estimate(job, spacing_s), passes, rate), soft_wrap=True)
     _tell_what_is_left_out(job)
     try:
         with _bar(out.name) as progress:
@@ -125,17 +125,17 @@ def command(
                 dump(job, out, words=words(), resume=resume, retries=retries, spacing_s=spacing_s, progress=progress)
             )
     except KeyboardInterrupt:
-        talk.print(f"stopped; the values read so far are in {out}, and --resume continues", soft_wrap=True)
+        stderr.print(f"stopped; the values read so far are in {out}, and --resume continues", soft_wrap=True)
         raise
     found = load_dump(out)
     if as_json:
         click.echo(json.dumps(_described(found, out)))
     else:
         for part in summary(found):
-            data.print(part)
-        talk.print(f"{out}, and what was sent in {log_path(out)}", soft_wrap=True)
+            stdout.print(part)
+        stderr.print(f"{out}, and what was sent in {log_path(out)}", soft_wrap=True)
     if found.is_mostly_unknown:
-        talk.print(unknown_text(found), soft_wrap=True)
+        stderr.print(unknown_text(found), soft_wrap=True)
         return Unreachable.exit_code
     return 0
 
@@ -144,7 +144,7 @@ def _tell_what_is_left_out(job: Job) -> None:
     if job.target.profile is not None and not job.spans and job.target.protocol == "modbus":
         left = [t.name for t in dumped_tags(job.target.profile)[1]]
         if left:
-            talk.print(f"left out, secret or changed by reading: {', '.join(left)}", soft_wrap=True)
+            stderr.print(f"left out, secret or changed by reading: {', '.join(left)}", soft_wrap=True)
 
 
 def _described(found: Dump, out: Path) -> dict[str, Any]:
@@ -171,9 +171,9 @@ def _bar(name: str) -> Iterator[Told]:
         BarColumn(),
         TextColumn("{task.completed} of {task.total}, {task.fields[requests]} requests"),
         TimeRemainingColumn(),
-        console=talk,
+        console=stderr,
         transient=True,
-        disable=not talk.is_terminal,
+        disable=not stderr.is_terminal,
     ) as bar:
         task = bar.add_task(name, total=None, requests=0)
         yield lambda done, total, requests: bar.update(task, completed=done, total=total, requests=requests)

@@ -18,7 +18,7 @@ from fieldtwin.cli.options import Duration, json_option, profiles_option
 from fieldtwin.commissioning.identify.canopen import CanIdentity, identify_canopen
 from fieldtwin.commissioning.identify.matching import Candidate, Sureness
 from fieldtwin.commissioning.identify.modbus import NAMES, ModbusIdentity, identify_modbus, modbus_frames
-from fieldtwin.console import data, talk
+from fieldtwin.console import stderr, stdout
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.gateway.core.files.profile import DeviceProfile, load_profile
@@ -143,16 +143,16 @@ def known_profiles(folders: list[Path]) -> list[DeviceProfile]:
             try:
                 found[path.stem] = load_profile(path)
             except FileInvalid as e:
-                talk.print(f"left out: {e}", soft_wrap=True, markup=False)
+                stderr.print(f"left out: {e}", soft_wrap=True, markup=False)
     return list(found.values())
 
 
 @contextmanager
 def _progress() -> Iterator[Callable[[str], None]]:
-    if not talk.is_terminal:
+    if not stderr.is_terminal:
         yield lambda _: None
         return
-    with talk.status("asking") as status:
+    with stderr.status("asking") as status:
         yield lambda text: status.update(Text(text))
 
 
@@ -163,21 +163,21 @@ def _show(result: ModbusIdentity | CanIdentity, show_all: bool) -> None:
     for name, text in _told(result):
         table.add_row(name, text)
     if table.row_count:
-        data.print(table)
+        stdout.print(table)
     for candidate in result.candidates:
         if candidate.sureness is not Sureness.RULED_OUT or show_all:
             _show_candidate(candidate)
     hidden = sum(1 for c in result.candidates if c.sureness is Sureness.RULED_OUT)
     if hidden and not show_all:
-        talk.print(f"{hidden} other profiles ruled out (--all shows the reasons)")
-    data.print(Text(result.summary, "bold"), soft_wrap=True)
+        stderr.print(f"{hidden} other profiles ruled out (--all shows the reasons)")
+    stdout.print(Text(result.summary, "bold"), soft_wrap=True)
 
 
 def _show_candidate(candidate: Candidate) -> None:
-    data.print(Text(f"{candidate.sureness}: {candidate.profile}", COLOUR[candidate.sureness]), soft_wrap=True)
+    stdout.print(Text(f"{candidate.sureness}: {candidate.profile}", COLOUR[candidate.sureness]), soft_wrap=True)
     for sign, texts in (("+", candidate.reasons), ("-", candidate.against)):
         for text in texts:
-            data.print(Text(f"  {sign} {text}"), soft_wrap=True)
+            stdout.print(Text(f"  {sign} {text}"), soft_wrap=True)
 
 
 def _told(result: ModbusIdentity | CanIdentity) -> list[tuple[str, str]]:

@@ -15,10 +15,10 @@ from fieldtwin.cli.options import json_option
 from fieldtwin.cli.output_files import write_text
 from fieldtwin.commissioning.dump.file import Dump, load_dump
 from fieldtwin.commissioning.infer.draft import checked, doubts, draft_profile
-from fieldtwin.commissioning.infer.fields import FEWEST_PASSES, Level, Reading
+from fieldtwin.commissioning.infer.fields import FEWEST_PASSES, Interpretation, Level
 from fieldtwin.commissioning.infer.infer import Inference, infer, series_of
 from fieldtwin.commissioning.infer.recorded_passes import dump_of_recording
-from fieldtwin.console import data, talk
+from fieldtwin.console import stderr, stdout
 from fieldtwin.gateway.core.errors import FileInvalid
 
 MOST_HEADER_BYTES = 65_536
@@ -49,7 +49,7 @@ def command(
     loaded = [_load(path, unit) for path in dumps]
     inference = infer(series_of(loaded))
     if inference.series.passes < FEWEST_PASSES:
-        talk.print(
+        stderr.print(
             f"{inference.series.passes} passes: results are uncertain below {FEWEST_PASSES}; use `dump --passes 20`",
             soft_wrap=True,
         )
@@ -60,12 +60,12 @@ def command(
     if as_json:
         click.echo(json.dumps(_described(inference, out)))
         return 0
-    data.print(_table([r for r in inference.readings if everything or any(r.values)]))
+    stdout.print(_table([r for r in inference.readings if everything or any(r.values)]))
     idle = sum(r.registers for r in inference.readings if not any(r.values))
     if idle and not everything:
-        talk.print(f"{idle} registers were always 0 and are not shown (--all); the draft has them")
+        stderr.print(f"{idle} registers were always 0 and are not shown (--all); the draft has them")
     if out is not None:
-        talk.print(f"draft: {out}", soft_wrap=True)
+        stderr.print(f"draft: {out}", soft_wrap=True)
     return 0
 
 
@@ -84,7 +84,7 @@ def _load(path: Path, unit: int | None) -> Dump:
     return dump_of_recording(str(path), header, exchanges_of(path), unit)
 
 
-def _table(readings: list[Reading]) -> Table:
+def _table(readings: list[Interpretation]) -> Table:
     table = Table(box=None, pad_edge=False, header_style="bold")
     for name in ("at", "type", "last", "how sure, and why"):
         table.add_column(name, overflow="fold")

@@ -16,7 +16,7 @@ from fieldtwin.cli.device.scan_progress import ScanProgress
 from fieldtwin.cli.options import Duration, json_option
 from fieldtwin.cli.stop_key import StopKey
 from fieldtwin.commissioning.scan.line import LineLook, LineReport, look_at_line
-from fieldtwin.console import data
+from fieldtwin.console import stdout
 from fieldtwin.gateway.wallclock import run as run_precise
 
 
@@ -69,18 +69,18 @@ def _show(report: LineReport) -> None:
     table.add_column(overflow="fold")
     for name, text in report.facts:
         table.add_row(name, Text(text))
-    data.print(table)
+    stdout.print(table)
     if not report.causes:
-        data.print(Text("no sign of a fault", "green"))
+        stdout.print(Text("no sign of a fault", "green"))
         return
-    data.print()
+    stdout.print()
     causes = Table(box=None, pad_edge=False, header_style="bold", title="possible causes, the most likely first",
                    title_justify="left", title_style="bold")  # fmt: skip
     for name in ("cause", "because", "try"):
         causes.add_column(name, overflow="fold")
     for cause in report.causes:
         causes.add_row(Text(cause.name, "yellow" if cause.weight >= 50 else "dim"), Text(cause.why), Text(cause.remedy))
-    data.print(causes)
+    stdout.print(causes)
 
 
 def _json(report: LineReport) -> dict[str, Any]:

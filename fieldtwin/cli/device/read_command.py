@@ -14,7 +14,7 @@ from fieldtwin.cli.options import json_option
 from fieldtwin.commissioning.access.address import tags_of
 from fieldtwin.commissioning.access.point import Answer
 from fieldtwin.commissioning.access.reading import Target, dry_point, read_all, row_of
-from fieldtwin.console import data
+from fieldtwin.console import stdout
 from fieldtwin.gateway.core.errors import NotAllowed
 from fieldtwin.gateway.core.files.profile import Tag
 from fieldtwin.gateway.wallclock import run as run_precise
@@ -57,7 +57,7 @@ def command(
         rows = [row_of(t, answers[t.name]) for t in tags]
         click.echo(json.dumps({"endpoint": target.url, "address": target.address, "values": rows}))
     else:
-        data.print(value_table(tags, answers))
+        stdout.print(value_table(tags, answers))
     return exit_code(answers.values())
 
 

@@ -20,7 +20,7 @@ from fieldtwin.commissioning.scan.canopen import ALL_NODES, CanScan, CanScanner,
 from fieldtwin.commissioning.scan.modbus import ModbusScan, ModbusScanner, ScanOptions
 from fieldtwin.commissioning.scan.settings import name_of, seconds_of, with_settings
 from fieldtwin.commissioning.scan.sweep import PROBE
-from fieldtwin.console import talk
+from fieldtwin.console import stderr
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.wallclock import run as run_precise
@@ -99,7 +99,7 @@ def _can(endpoint: str, log: Path | None, as_json: bool, options: dict[str, Any]
 
 def _end(found: bool, stopped: bool, took_s: float) -> int:
     if stopped:
-        talk.print(f"stopped after {duration(took_s)}: the list is not complete")
+        stderr.print(f"stopped after {duration(took_s)}: the list is not complete")
         return INTERRUPTED
     return 0 if found else 1
 

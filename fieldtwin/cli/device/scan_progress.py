@@ -11,7 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from fieldtwin.commissioning.access.progress import Progress
-from fieldtwin.console import talk
+from fieldtwin.console import stderr
 
 
 class ScanProgress:
@@ -19,7 +19,7 @@ class ScanProgress:
 
     def __init__(self, stoppable: bool) -> None:
         self._hint = "q stops and keeps the results" if stoppable else "Ctrl-C stops and keeps the results"
-        self._live = Live(console=talk, transient=True, auto_refresh=False) if talk.is_terminal else None
+        self._live = Live(console=stderr, transient=True, auto_refresh=False) if stderr.is_terminal else None
         self._phase = ""
         self._shown = -1.0
 
@@ -37,7 +37,7 @@ class ScanProgress:
         self._phase = progress.phase
         if self._live is None:
             if new:
-                talk.print(phase_line(progress), soft_wrap=True, markup=False)
+                stderr.print(phase_line(progress), soft_wrap=True, markup=False)
             return
         if new or abs(progress.done_s - self._shown) >= 0.1 or progress.done_s >= progress.total_s:
             self._shown = progress.done_s

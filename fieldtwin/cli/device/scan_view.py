@@ -13,7 +13,7 @@ from fieldtwin.commissioning.scan.canopen import CanScan
 from fieldtwin.commissioning.scan.listening import describe
 from fieldtwin.commissioning.scan.modbus import FoundUnit, ModbusScan
 from fieldtwin.commissioning.scan.settings import name_of
-from fieldtwin.console import data, talk
+from fieldtwin.console import stderr, stdout
 from fieldtwin.gateway.core.errors import ModbusExceptionReply
 
 
@@ -21,9 +21,9 @@ def show_modbus(scan: ModbusScan) -> None:
     """Print the units, then the notes."""
     heard = scan.heard
     if heard is not None and heard.bytes:
-        talk.print(f"heard {heard.bytes} bytes, {heard.frames} whole frames", markup=False)
+        stderr.print(f"heard {heard.bytes} bytes, {heard.frames} whole frames", markup=False)
     if scan.verdict is not None:
-        talk.print(f"settings: {describe(scan.verdict)}", soft_wrap=True, markup=False)
+        stderr.print(f"settings: {describe(scan.verdict)}", soft_wrap=True, markup=False)
     table = _table("unit", "settings", "answer", "after")
     if scan.alike is not None and scan.alike.one_device:
         one = scan.units[0]
@@ -41,21 +41,21 @@ def show_modbus(scan: ModbusScan) -> None:
         at = name_of(scan.verdict.settings) if scan.verdict is not None else ""
         table.add_row(str(unit), at, Text("answers another client", "dim"), "")
     if table.row_count:
-        data.print(table)
+        stdout.print(table)
     for odd in scan.damaged:
         at = f" at {name_of(odd.settings)}" if odd.settings is not None else ""
         count = len(odd.units)
         who = f"unit {odd.units[0]}" if count == 1 else f"{count} units ({unit_ranges(odd.units)})"
-        talk.print(f"{who}{at}: {odd.advice}", soft_wrap=True, markup=False)
+        stderr.print(f"{who}{at}: {odd.advice}", soft_wrap=True, markup=False)
     if heard is not None and heard.silent:
-        talk.print(f"polled by another client, and silent: {unit_ranges(sorted(heard.silent))}", soft_wrap=True)
+        stderr.print(f"polled by another client, and silent: {unit_ranges(sorted(heard.silent))}", soft_wrap=True)
     if scan.behind_gateway:
-        talk.print(f"a gateway reports that {len(scan.behind_gateway)} units do not answer (exceptions 0A, 0B)")
+        stderr.print(f"a gateway reports that {len(scan.behind_gateway)} units do not answer (exceptions 0A, 0B)")
     if scan.alike is not None:
         words = "one device that answers to every unit ID" if scan.alike.one_device else "perhaps one device"
-        talk.print(f"{words}: {scan.alike.why}", soft_wrap=True, markup=False)
+        stderr.print(f"{words}: {scan.alike.why}", soft_wrap=True, markup=False)
     if scan.echo:
-        talk.print("this line echoes sent bytes: use --echo with the other commands")
+        stderr.print("this line echoes sent bytes: use --echo with the other commands")
     _end(scan.notes, scan.asked, "question", bool(table.row_count))
 
 
@@ -124,7 +124,7 @@ def show_can(scan: CanScan) -> None:
     """Print the nodes, then the notes."""
     heard = scan.heard
     rate = f" at {scan.bitrate} bit/s" if scan.bitrate else ""
-    talk.print(f"listened for {scan.listened_s:.1f} s{rate}: {heard.frames} frames, {heard.errors} error frames")
+    stderr.print(f"listened for {scan.listened_s:.1f} s{rate}: {heard.frames} frames, {heard.errors} error frames")
     table = _table("node", "state", "SDO", "device type", "vendor", "product", "serial", "heard")
     asked = {n.node: n for n in scan.nodes}
     for number in sorted(asked.keys() | {n for n, h in heard.nodes.items() if h.certain}):
@@ -140,18 +140,18 @@ def show_can(scan: CanScan) -> None:
         words = state.name.lower().replace("_", "-") if state is not None else ""
         table.add_row(str(number), words, sdo, *("" if p is None else f"{p:X}h" for p in parts), beat)
     if table.row_count:
-        data.print(table)
+        stdout.print(table)
     for address in scan.unconfigured:
-        data.print(f"without a node ID: vendor/product/revision/serial {address} (LSS)", markup=False, soft_wrap=True)
+        stdout.print(f"without a node ID: vendor/product/revision/serial {address} (LSS)", markup=False, soft_wrap=True)
     likely = sorted(n for n, h in heard.nodes.items() if not h.certain)
     if likely:
         names = ", ".join(map(str, likely))
-        talk.print(f"seen only by PDO identifiers, which may belong to other nodes: nodes {names}", soft_wrap=True)
+        stderr.print(f"seen only by PDO identifiers, which may belong to other nodes: nodes {names}", soft_wrap=True)
     if scan.blocked:
         names = ", ".join(map(str, scan.blocked))
-        talk.print(f"not asked, because another master uses SDO: nodes {names}", soft_wrap=True)
+        stderr.print(f"not asked, because another master uses SDO: nodes {names}", soft_wrap=True)
     for number, why in sorted(scan.conflicts.items()):
-        talk.print(f"node {number}: {why}", soft_wrap=True, markup=False)
+        stderr.print(f"node {number}: {why}", soft_wrap=True, markup=False)
     _end(scan.notes, scan.asked, "node", bool(table.row_count or scan.unconfigured))
 
 
@@ -196,9 +196,9 @@ def can_json(scan: CanScan) -> dict[str, Any]:
 
 def _end(notes: list[str], asked: int, what: str, found: bool) -> None:
     for note in notes:
-        talk.print(note, soft_wrap=True, markup=False)
+        stderr.print(note, soft_wrap=True, markup=False)
     sent = f"{asked} {what}{'s' * (asked != 1)} asked" if asked else "nothing was sent"
-    talk.print(sent if found else f"no device was found; {sent}")
+    stderr.print(sent if found else f"no device was found; {sent}")
 
 
 def _table(*columns: str) -> Table:

@@ -23,7 +23,7 @@ from fieldtwin.commissioning.access.plotting import check_plot, plot
 from fieldtwin.commissioning.access.point import Answer
 from fieldtwin.commissioning.access.reading import Target, dry_point, point_at, row_of, text_of
 from fieldtwin.commissioning.access.watching import History, Sample, samples
-from fieldtwin.console import data, talk
+from fieldtwin.console import stderr, stdout
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.errors import NotAllowed, Unreachable, UsageError
 from fieldtwin.gateway.core.files.profile import Tag
@@ -92,7 +92,7 @@ def command(
         watch.close()
     if plot_path is not None and watch.count:
         panels = plot(plot_path, target.url, tags, watch.histories)
-        talk.print(
+        stderr.print(
             f"{panels} curves: {plot_path}" if panels else "no numeric values, so there is no plot", soft_wrap=True
         )
     return watch.exit_code
@@ -106,7 +106,7 @@ class _Watch:
         self.count = 0
         self.exit_code = 0
         self._target, self._tags, self._json = target, tags, as_json
-        self._live = Live(console=data, auto_refresh=False) if data.is_terminal and not as_json else None
+        self._live = Live(console=stdout, auto_refresh=False) if stdout.is_terminal and not as_json else None
 
     async def run(self, every_s: float, most: int | None, for_s: float | None, log: Path | None) -> None:
         """Take samples for `for_s` seconds, and abandon a sample that is incomplete then.
@@ -158,14 +158,14 @@ class _Watch:
         table = Table(
             box=None, pad_edge=False, header_style="bold", caption=self._caption(sample), caption_justify="left"
         )
-        wide = data.width
+        wide = stdout.width
         table.add_column("name", overflow="ellipsis", no_wrap=True)
         table.add_column("value", min_width=12, overflow="ellipsis", no_wrap=True)
         table.add_column("least", justify="right", no_wrap=True)
         table.add_column("most", justify="right", no_wrap=True)
         table.add_column("", no_wrap=True)
         room = max(8, min(60, wide - 62))
-        for tag in self._tags[: max(3, data.height - 4)]:
+        for tag in self._tags[: max(3, stdout.height - 4)]:
             answer, history = sample.answers[tag.name], self.histories[tag.name]
             colour = COLOUR.get(str(answer.value.quality), "")
             low, high = (f"{v:.5g}" if history.samples > history.bad and abs(v) < 1e300 else ""
@@ -176,7 +176,7 @@ class _Watch:
         return table
 
     def _caption(self, sample: Sample) -> Text:
-        hidden = len(self._tags) - max(3, data.height - 4)
+        hidden = len(self._tags) - max(3, stdout.height - 4)
         more = f", {hidden} more rows do not fit" if hidden > 0 else ""
         late = f", {sample.late_s:.1f} s late" if sample.late_s > 0.1 else ""
         return Text(f"{self._target.url}: sample {sample.number}, {sample.t_s:.1f} s{late}{more}. Ctrl-C stops", "dim")

@@ -20,7 +20,7 @@ from fieldtwin.commissioning.access.connection import frame_of, modbus_at
 from fieldtwin.commissioning.access.point import Answer, Point, decoded
 from fieldtwin.commissioning.access.reading import Target, dry_point, point_at, text_of
 from fieldtwin.commissioning.access.writing import Write, Written
-from fieldtwin.console import data, talk
+from fieldtwin.console import stderr, stdout
 from fieldtwin.gateway.core.errors import FieldtwinError, NotAllowed, ReplyTimeout, UsageError
 from fieldtwin.gateway.core.files.profile import Tag
 from fieldtwin.gateway.protocols.modbus.diagnostics import Diagnostics
@@ -104,7 +104,7 @@ def command(
         click.echo(json.dumps([_row(w) for w in done]))
     else:
         for written in done:
-            data.print(_told(written))
+            stdout.print(_told(written))
     return 0
 
 
@@ -148,12 +148,12 @@ async def _carry_out(
             done.append(Written(write, before.value.raw if before is not None else None, None))
             done[-1] = await writing.carry_out(point, write, before)
         if hold_s is not None:
-            talk.print(f"written; the old values are restored in {hold_s:g} s")
+            stderr.print(f"written; the old values are restored in {hold_s:g} s")
             await asyncio.sleep(hold_s)
     except BaseException:
         told = done[:-1] if hold_s is None else await _put_back(point, done)
         for written in told:
-            talk.print(Text("" if hold_s is not None else "before that: ") + _told(written), soft_wrap=True)
+            stderr.print(Text("" if hold_s is not None else "before that: ") + _told(written), soft_wrap=True)
         raise
     return done if hold_s is None else await _put_back(point, done)
 
@@ -166,7 +166,7 @@ async def _put_back(point: Point, done: list[Written]) -> list[Written]:
         try:
             back.insert(0, await writing.restore(point, written))
         except FieldtwinError as e:
-            talk.print(Text(f"{written.write.tag.name} was not restored: {e}", "red"), soft_wrap=True)
+            stderr.print(Text(f"{written.write.tag.name} was not restored: {e}", "red"), soft_wrap=True)
             failed = failed or e
     if failed is not None:
         raise failed
@@ -177,9 +177,9 @@ def _show(writes: Sequence[Write], old: Sequence[Answer | None]) -> None:
     for write, before in zip(writes, old, strict=True):
         was = text_of(write.tag, before) if before is not None else "(not read)"
         line = Text.assemble((write.tag.name, "bold"), f": {was} → {_new(write)} {write.tag.unit}".rstrip())
-        talk.print(line, soft_wrap=True)
+        stderr.print(line, soft_wrap=True)
         for warning in write.warnings:
-            talk.print(Text(f"  {warning}", "yellow"), soft_wrap=True)
+            stderr.print(Text(f"  {warning}", "yellow"), soft_wrap=True)
 
 
 def _new(write: Write) -> str:
@@ -236,5 +236,5 @@ def _restart(target: Target, items: Sequence[str], log: Path | None, *, i_know: 
                 return True
 
     answered = run_precise(send())
-    data.print("restarted" if answered else "sent; there was no reply, as is normal for a unit in listen-only mode")
+    stdout.print("restarted" if answered else "sent; there was no reply, as is normal for a unit in listen-only mode")
     return 0

@@ -8,7 +8,7 @@ import sys
 import click
 
 from fieldtwin.cli.options import Duration, json_option, pairs
-from fieldtwin.console import talk
+from fieldtwin.console import stderr
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.runtime.bridge.policy import LOOPBACK, network
@@ -123,14 +123,14 @@ def command(
         instance=instance,
     )
     if not networks and options.listen.host not in ANYWHERE:
-        talk.print("only clients of this host have access; --allow NETWORK admits others")
-    result = run(run_bridge(options, lambda text: talk.print(text, soft_wrap=True, markup=False)))
+        stderr.print("only clients of this host have access; --allow NETWORK admits others")
+    result = run(run_bridge(options, lambda text: stderr.print(text, soft_wrap=True, markup=False)))
     if as_json:
         json.dump(result, sys.stdout, indent=2)
         sys.stdout.write("\n")
     else:
         counted = ", ".join(f"{k} {v}" for k, v in result["target"].items() if v)
-        talk.print(f"{result['requests']} requests" + (f": {counted}" if counted else ""))
+        stderr.print(f"{result['requests']} requests" + (f": {counted}" if counted else ""))
     return 0
 
 

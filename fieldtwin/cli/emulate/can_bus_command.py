@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from fieldtwin.console import talk
+from fieldtwin.console import stderr
 from fieldtwin.emulators.endpoints.bus_bridge import CanBridge
 from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
 from fieldtwin.emulators.endpoints.can_end import open_can_end
@@ -77,17 +77,17 @@ async def _run(
         bridge = await _bridge(bus, kernel, bitrate) if kernel else None
         if bridge:
             closing.push_async_callback(bridge.aclose)
-        talk.print(f"CAN bus on {bus.bound}, {bitrate} bit/s", soft_wrap=True)
+        stderr.print(f"CAN bus on {bus.bound}, {bitrate} bit/s", soft_wrap=True)
         if slcan:
             port = await SlcanPort.open(bus.runner, slcan)
             closing.push_async_callback(port.aclose)
-            talk.print("slcan on {}:{}".format(*port.bound), soft_wrap=True)
+            stderr.print("slcan on {}:{}".format(*port.bound), soft_wrap=True)
         await _until(stop, bridge)
         stats = bus.bus_stats()
-        talk.print(f"{stats['frames']} frames, load {100 * stats['load']:.1f} %, {stats['error_frames']} errors")
+        stderr.print(f"{stats['frames']} frames, load {100 * stats['load']:.1f} %, {stats['error_frames']} errors")
         if bridge:
             crossed = ", ".join(f"{count} from {where}" for where, count in bridge.forwarded.items())
-            talk.print(f"bridge: {crossed}; {bridge.lost} lost", soft_wrap=True)
+            stderr.print(f"bridge: {crossed}; {bridge.lost} lost", soft_wrap=True)
             if bridge.ended.done():
                 raise bridge.ended.result()
     return 0
@@ -97,7 +97,7 @@ async def _bridge(bus: SoftBusServer, kernel: Endpoint, bitrate: int) -> CanBrid
     outside = await open_can_end(kernel, bitrate)
     bridge = CanBridge(bus.attach(f"bridge to {kernel.path}"), outside)
     bridge.start()
-    talk.print(f"joined with {kernel}", soft_wrap=True)
+    stderr.print(f"joined with {kernel}", soft_wrap=True)
     return bridge
 
 

@@ -190,7 +190,7 @@ def command(
                 )
             )
         )
-    from fieldtwin.emulators.context import WhenUsedUp
+    from fieldtwin.emulators.context import EndOfRecording
     from fieldtwin.emulators.models.emulated_node import NodeOptions
     from fieldtwin.emulators.replay.replay import NeverRecorded
     from fieldtwin.run.emulate.device import run_device
@@ -226,7 +226,7 @@ def command(
     return run_loop(
         run_device(
             kind, path, endpoints, unit, recording, speed or 1.0, bitrate, unknown=NeverRecorded(unknown or "exception"),
-            at_end=WhenUsedUp(at_end or "hold"), options=options, extras=extras,
+            at_end=EndOfRecording(at_end or "hold"), options=options, extras=extras,
         ),
         serial=serial,
     )  # fmt: skip

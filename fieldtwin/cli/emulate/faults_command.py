@@ -10,7 +10,7 @@ import click
 from rich.table import Table
 
 from fieldtwin.cli.options import json_option
-from fieldtwin.console import data
+from fieldtwin.console import stdout
 from fieldtwin.emulators.faults.fault import Fault
 
 
@@ -41,8 +41,8 @@ def command(names: tuple[str, ...], as_json: bool) -> int:
         for d in described:
             if d["on"] == on:
                 table.add_row(d["name"], _told(d, codes=bool(names)))
-        data.print(table)
-        data.print()
+        stdout.print(table)
+        stdout.print()
     return 0
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import click
 
-from fieldtwin.console import talk
+from fieldtwin.console import stderr
 from fieldtwin.emulators.can_link import CanLink
 from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
 from fieldtwin.emulators.endpoints.can_end import open_can_end
@@ -108,7 +108,7 @@ async def _run(
             task.cancel()
             await asyncio.gather(task, return_exceptions=True)
         for active in put_in:
-            talk.print(struck(active), soft_wrap=True, markup=False)
+            stderr.print(struck(active), soft_wrap=True, markup=False)
     return 0
 
 
@@ -116,8 +116,8 @@ async def _bytes(near: Endpoint, far: Endpoint, faults: WireFaults | None) -> No
     await run_link(
         near,
         far,
-        on_event=lambda text: talk.print(text, soft_wrap=True, markup=False),
-        on_ready=lambda link: talk.print(f"{near}  ⇄  {far}", soft_wrap=True, markup=False),
+        on_event=lambda text: stderr.print(text, soft_wrap=True, markup=False),
+        on_ready=lambda link: stderr.print(f"{near}  ⇄  {far}", soft_wrap=True, markup=False),
         faults=faults,
     )
 
@@ -127,12 +127,12 @@ async def _can(near: Endpoint, far: Endpoint, faults: WireFaults) -> None:
         link = CanLink(await _can_end(near, closing), await _can_end(far, closing), faults)
         closing.push_async_callback(link.aclose)
         link.start()
-        talk.print(f"{near}  ⇄  {far}", soft_wrap=True, markup=False)
+        stderr.print(f"{near}  ⇄  {far}", soft_wrap=True, markup=False)
         try:
             raise await asyncio.shield(link.ended)
         finally:
             to, back = link.passed[Way.REQUEST], link.passed[Way.REPLY]
-            talk.print(f"{to} frames to {far}, {back} back, {link.lost} lost", soft_wrap=True, markup=False)
+            stderr.print(f"{to} frames to {far}, {back} back, {link.lost} lost", soft_wrap=True, markup=False)
 
 
 async def _can_end(endpoint: Endpoint, closing: AsyncExitStack) -> CanConnection:

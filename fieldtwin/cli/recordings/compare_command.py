@@ -21,7 +21,7 @@ from fieldtwin.cli.device.device_options import device_options, logged, target_f
 from fieldtwin.cli.options import Duration, json_option, pairs
 from fieldtwin.commissioning.record.asking import asker_at, changes, frame_for
 from fieldtwin.commissioning.record.comparing import compare_device, compare_node, uploads_of
-from fieldtwin.console import data, talk
+from fieldtwin.console import stderr, stdout
 from fieldtwin.gateway.core.concurrency.stop_signal import stop_signal
 from fieldtwin.gateway.core.endpoint import SCHEMES
 from fieldtwin.gateway.core.errors import FileInvalid, NotAllowed, UsageError
@@ -281,7 +281,7 @@ def _allow_writes(recording: Path, url: str, options: dict[str, Any]) -> None:
     if not writes or options["yes"]:
         return
     for exchange in writes[:SHOWN]:
-        talk.print(f"  unit {exchange.unit}: {exchange.request.hex(' ')}", soft_wrap=True, markup=False)
+        stderr.print(f"  unit {exchange.unit}: {exchange.request.hex(' ')}", soft_wrap=True, markup=False)
     if not sys.stdin.isatty() or not click.confirm(f"make these {len(writes)} writes at {url}?", err=True):
         raise NotAllowed("the writes were not confirmed", hint="--yes")
 
@@ -297,10 +297,10 @@ def _run(work: Callable[[asyncio.Event, Callable[[int], None]], Coroutine[Any, A
 
     async def main() -> None:
         stop = stop_signal()
-        if not talk.is_terminal:
+        if not stderr.is_terminal:
             await work(stop, lambda done: None)
             return
-        with talk.status("comparing") as status:
+        with stderr.status("comparing") as status:
             await work(stop, lambda done: status.update(f"comparing: {done} exchanges"))
 
     run_precise(main())
@@ -311,15 +311,15 @@ def _run(work: Callable[[asyncio.Event, Callable[[int], None]], Coroutine[Any, A
 
 def _show(result: Comparison, recording: Path, other: str, everything: bool) -> None:
     name = recording.name if recording.suffix == ".log" else shown(parts_of(recording)[0])
-    data.print(f"{other} against {name}", soft_wrap=True, markup=False)
+    stdout.print(f"{other} against {name}", soft_wrap=True, markup=False)
     if result.differences:
         table = Table("at s", "unit", "what", "asked", "where", "recorded", "there", box=None, pad_edge=False)
         for d in result.differences if everything else result.differences[:SHOWN]:
             table.add_row(f"{d.t_s:.3f}", str(d.unit), d.what, d.request, d.where, d.recorded, d.other)
-        data.print(table)
+        stdout.print(table)
         left = sum(result.by_kind.values()) - min(len(result.differences), SHOWN)
         if left > 0 and not everything:
-            talk.print("  and more: --all", soft_wrap=True)
+            stderr.print("  and more: --all", soft_wrap=True)
     if result.latency:
         table = Table(
             "latency, ms", "n", "recorded p50", "p90", "p99", "there p50", "p90", "p99", box=None, pad_edge=False
@@ -327,17 +327,17 @@ def _show(result: Comparison, recording: Path, other: str, everything: bool) -> 
         for row in result.latency:
             times = [f"{1000 * t:.1f}" for t in (*row.recorded_s, *row.other_s)]
             table.add_row(row.service, str(row.count), *times, "" if row.alike else "beyond tolerance")
-        data.print(table)
+        stdout.print(table)
     kinds = ", ".join(f"{n} {kind}" for kind, n in sorted(result.by_kind.items()))
-    data.print(
+    stdout.print(
         f"{result.compared} compared, {result.alike} alike" + (f"; otherwise: {kinds}" if kinds else ""), soft_wrap=True
     )
     if result.extra:
-        data.print(f"{result.extra} more in the other one, which the recording does not contain", soft_wrap=True)
+        stdout.print(f"{result.extra} more in the other one, which the recording does not contain", soft_wrap=True)
     if result.left_out:
-        data.print(f"{result.left_out} left out: they may change the device, or cannot be asked", soft_wrap=True)
+        stdout.print(f"{result.left_out} left out: they may change the device, or cannot be asked", soft_wrap=True)
     if result.left_out_writes and result.by_kind:
-        data.print(
+        stdout.print(
             f"{result.after_left_out} of the differences are in what {result.left_out_writes} left-out writes had set; "
             "others may follow from these writes: --writes makes them again", soft_wrap=True,
         )  # fmt: skip
@@ -345,20 +345,20 @@ def _show(result: Comparison, recording: Path, other: str, everything: bool) -> 
     timing = "not known" if result.timing is None else f"{100 * result.timing:.1f} %"
     verdict = "met" if result.met else "INCONCLUSIVE" if result.inconclusive else "NOT met"
     alike = f"{100 * result.values:.1f} %" if result.compared else "not known"
-    data.print(f"fidelity: values {alike}, timing {timing}: {verdict}", soft_wrap=True)
+    stdout.print(f"fidelity: values {alike}, timing {timing}: {verdict}", soft_wrap=True)
 
 
 def _show_shifts(result: Comparison) -> None:
     """Print where the dialogue continued the recorded one, and what the recording does not cover."""
     for shift in result.shifts[:SHOWN]:
-        data.print(
+        stdout.print(
             f"unit {shift.unit}, {shift.where}: was read before, continues at value {shift.at + 1} of {shift.recorded} recorded",
             soft_wrap=True, markup=False,
         )  # fmt: skip
     if len(result.shifts) > SHOWN:
-        data.print(f"and {len(result.shifts) - SHOWN} more registers or bits", soft_wrap=True)
+        stdout.print(f"and {len(result.shifts) - SHOWN} more registers or bits", soft_wrap=True)
     if result.not_compared:
-        data.print(
+        stdout.print(
             f"{result.not_compared} not compared: the recording has no values after that position. "
             "Restart the emulator to compare everything", soft_wrap=True,
         )  # fmt: skip

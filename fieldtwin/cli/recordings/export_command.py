@@ -9,7 +9,7 @@ from pathlib import Path
 import click
 
 from fieldtwin.cli.options import json_option, profiles_option
-from fieldtwin.console import data
+from fieldtwin.console import stdout
 from fieldtwin.gateway.core.files.profile import load_profile
 from fieldtwin.twin.site.data_files import find
 
@@ -55,5 +55,7 @@ def command(
         json.dump({"out": str(out), "records": count}, sys.stdout)
         sys.stdout.write("\n")
     else:
-        data.print(f"{out}: {count} {'packets' if out.suffix == '.pcap' else 'records'}", soft_wrap=True, markup=False)
+        stdout.print(
+            f"{out}: {count} {'packets' if out.suffix == '.pcap' else 'records'}", soft_wrap=True, markup=False
+        )
     return 0

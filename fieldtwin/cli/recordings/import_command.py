@@ -14,7 +14,7 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TimeRemainingColu
 
 from fieldtwin.capture.formats.cnv import import_cnv
 from fieldtwin.cli.options import json_option, pairs
-from fieldtwin.console import data, talk
+from fieldtwin.console import stderr, stdout
 from fieldtwin.gateway.core.errors import UsageError
 
 _SUFFIXES = (
@@ -126,7 +126,7 @@ class _bar:
     def __init__(self, file: Path) -> None:
         self._bar = Progress(
             "[progress.description]{task.description}", BarColumn(), DownloadColumn(), TimeRemainingColumn(),
-            console=talk, transient=True, disable=not talk.is_terminal,
+            console=stderr, transient=True, disable=not stderr.is_terminal,
         )  # fmt: skip
         self._task = self._bar.add_task(file.name, total=None)
 
@@ -147,15 +147,15 @@ def _packets(file: Path, out: Path, ports: tuple[int, ...], as_json: bool) -> in
         return _print_json(found)
     for made in found.made:
         if made.endpoint == "can":
-            data.print(f"{made.path}: {made.exchanges} CAN frames", soft_wrap=True)
+            stdout.print(f"{made.path}: {made.exchanges} CAN frames", soft_wrap=True)
             continue
         units = ", ".join(map(str, made.units)) or "no unit answered"
         where = f" of {made.endpoint}" if made.endpoint else ""
-        data.print(f"{made.path}: {made.exchanges} exchanges{where}, units {units}", soft_wrap=True)
+        stdout.print(f"{made.path}: {made.exchanges} exchanges{where}, units {units}", soft_wrap=True)
         for profile in made.profiles:
-            data.print(f"  draft profile: {profile}", soft_wrap=True)
+            stdout.print(f"  draft profile: {profile}", soft_wrap=True)
     packets, pairs_ = found.packets, found.pairs
-    talk.print(f"{packets.packets} packets in {found.seconds:.1f} s, {packets.carried} with payload", soft_wrap=True)
+    stderr.print(f"{packets.packets} packets in {found.seconds:.1f} s, {packets.carried} with payload", soft_wrap=True)
     notes = [
         (pairs_.unanswered, "requests without an answer"), (pairs_.strays, "answers without a request"),
         (pairs_.malformed, "malformed"), (packets.lost_bytes, "bytes that the capture lost"),
@@ -166,22 +166,22 @@ def _packets(file: Path, out: Path, ports: tuple[int, ...], as_json: bool) -> in
     ]  # fmt: skip
     for count, what in notes:
         if count:
-            talk.print(f"  {count} {what}", soft_wrap=True)
+            stderr.print(f"  {count} {what}", soft_wrap=True)
     if found.truncated:
-        talk.print("  the file is cut off in its last packet", soft_wrap=True)
+        stderr.print("  the file is cut off in its last packet", soft_wrap=True)
     if found.bad_file is not None:
-        talk.print(f"  malformed or unmatched frames: {found.bad_file}", soft_wrap=True)
+        stderr.print(f"  malformed or unmatched frames: {found.bad_file}", soft_wrap=True)
     if not found.made:
-        talk.print("it contains neither Modbus nor CAN", soft_wrap=True)
+        stderr.print("it contains neither Modbus nor CAN", soft_wrap=True)
     return 0
 
 
 def _show_text(found: Any, what: str, as_json: bool) -> int:
     if as_json:
         return _print_json(found)
-    data.print(f"{found.out}: {found.records} {what}, {found.seconds:.1f} s", soft_wrap=True)
+    stdout.print(f"{found.out}: {found.records} {what}, {found.seconds:.1f} s", soft_wrap=True)
     for profile in found.profiles:
-        data.print(f"  draft profile: {profile}", soft_wrap=True)
+        stdout.print(f"  draft profile: {profile}", soft_wrap=True)
     notes = [
         (found.left_out.fd, "CAN FD frames left out"), (found.left_out.errors, "error frames left out"),
         (found.pairs.unanswered, "requests without an answer"), (found.pairs.strays, "answers without a request"),
@@ -189,9 +189,9 @@ def _show_text(found: Any, what: str, as_json: bool) -> int:
     ]  # fmt: skip
     for count, text in notes:
         if count:
-            talk.print(f"  {count} {text}", soft_wrap=True)
+            stderr.print(f"  {count} {text}", soft_wrap=True)
     if found.bad_file is not None:
-        talk.print(f"  malformed or unmatched frames: {found.bad_file}", soft_wrap=True)
+        stderr.print(f"  malformed or unmatched frames: {found.bad_file}", soft_wrap=True)
     return 0
 
 
@@ -202,11 +202,11 @@ def _show_signals(
         json.dump({"out": str(out), **asdict(found)}, sys.stdout, default=str)
         sys.stdout.write("\n")
         return 0
-    data.print(f"{out}: {rows} rows, {seconds:.1f} s", soft_wrap=True)
+    stdout.print(f"{out}: {rows} rows, {seconds:.1f} s", soft_wrap=True)
     for signal, column in columns.items():
-        data.print(f"  {signal}: column {column}", soft_wrap=True)
+        stdout.print(f"  {signal}: column {column}", soft_wrap=True)
     if bad_values:
-        data.print(f"  {bad_values} values are marked bad in the file and stay without a value", soft_wrap=True)
+        stdout.print(f"  {bad_values} values are marked bad in the file and stay without a value", soft_wrap=True)
     return 0
 
 

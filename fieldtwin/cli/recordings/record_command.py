@@ -33,7 +33,7 @@ from fieldtwin.commissioning.record.polling import (
 )
 from fieldtwin.commissioning.record.sniffing import LineSniffer
 from fieldtwin.commissioning.record.tapping import LineTap
-from fieldtwin.console import data, talk
+from fieldtwin.console import stderr, stdout
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.concurrency.stop_signal import stop_signal
 from fieldtwin.gateway.core.connection import Direction
@@ -144,7 +144,7 @@ def command(
         if not same.requests:
             raise UsageError(f"{like.name} has no requests that may be repeated", hint="only reads may be repeated")
         if same.left_out:
-            talk.print(
+            stderr.print(
                 f"{same.left_out} requests of {like.name} that may change the device are left out", soft_wrap=True
             )
         return job.polls(target, same, header_of(like).device)
@@ -155,7 +155,7 @@ def command(
             hint="or --tap A B to record without polling",
         )
     if target.profile.form.trigger is not None:
-        talk.print(
+        stderr.print(
             f"{target.profile.name} measures only on command, and no command is sent: nothing is written",
             soft_wrap=True,
         )
@@ -268,7 +268,7 @@ class _Job:
 
     @staticmethod
     def _say(text: str) -> None:
-        talk.print(text, soft_wrap=True, markup=False)
+        stderr.print(text, soft_wrap=True, markup=False)
 
     def _line(
         self,
@@ -293,7 +293,7 @@ class _Job:
             "bytes_sent": sink.bytes[Direction.SENT], "bytes_received": sink.bytes[Direction.RECEIVED], "raw": str(raw)
         }  # fmt: skip
         if not any(sink.bytes.values()):
-            talk.print("nothing passed")
+            stderr.print("nothing passed")
             return self._summary(file, None, said)
         header = RecordingHeader(
             version=1, device=f"{how}/{self._out.stem}", kind="exchanges", source="measured", endpoint=str(far),
@@ -354,31 +354,31 @@ class _Job:
             for k, v in said.items()
             if isinstance(v, int) and (v or k in ("exchanges", "frames"))
         )
-        data.print(f"{said.get('recording', self._out)}: {text or 'nothing'}", soft_wrap=True, markup=False)
+        stdout.print(f"{said.get('recording', self._out)}: {text or 'nothing'}", soft_wrap=True, markup=False)
         for profile in said.get("profiles", ()):
-            data.print(f"  draft profile: {profile}", soft_wrap=True, markup=False)
+            stdout.print(f"  draft profile: {profile}", soft_wrap=True, markup=False)
         if "raw" in said:
-            data.print(f"  the bytes as they were: {said['raw']}", soft_wrap=True, markup=False)
+            stdout.print(f"  the bytes as they were: {said['raw']}", soft_wrap=True, markup=False)
         if len(file.parts) > 1:
             gone = f", {file.removed} older ones removed" if file.removed else ""
-            talk.print(f"in {len(file.parts)} parts{gone}", soft_wrap=True)
+            stderr.print(f"in {len(file.parts)} parts{gone}", soft_wrap=True)
         if counters is not None:
             notes = [
                 (counters.rounds, "rounds"), (counters.missed, "rounds that could not begin in time"),
                 (counters.unanswered, "without an answer"), (counters.refused, "refused"),
                 (counters.lost, "times the connection was lost"),
             ]  # fmt: skip
-            talk.print(", ".join(f"{n} {what}" for n, what in notes if n), soft_wrap=True)
+            stderr.print(", ".join(f"{n} {what}" for n, what in notes if n), soft_wrap=True)
         return 4 if silent else 0
 
 
 @contextmanager
 def _status() -> Iterator[Status | None]:
     """Show a status line on a terminal."""
-    if not talk.is_terminal:
+    if not stderr.is_terminal:
         yield None
         return
-    with talk.status("recording") as status:
+    with stderr.status("recording") as status:
         yield status
 
 

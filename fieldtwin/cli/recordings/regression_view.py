@@ -11,10 +11,10 @@ import click
 from rich.markup import escape
 
 from fieldtwin.capture.decoding.trace_file import read_events
-from fieldtwin.console import data, talk
+from fieldtwin.console import stderr, stdout
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.scenarios.regression.as_scenario import Wanted, as_scenario
-from fieldtwin.scenarios.regression.comparing import Allowed, Verdict, compare
+from fieldtwin.scenarios.regression.comparing import Allowed, RunComparison, compare
 from fieldtwin.scenarios.regression.run_history import story_of
 from fieldtwin.twin.site.system import System
 
@@ -42,12 +42,12 @@ def allowed_of(tolerances: tuple[str, ...], window_s: float, ignored: tuple[str,
     return Allowed(window_s, share, amounts, ignored=frozenset(ignored))
 
 
-def judged(system: System, old: Path, new: Path, allowed: Allowed) -> Verdict:
+def judged(system: System, old: Path, new: Path, allowed: Allowed) -> RunComparison:
     """Compare the run in `new` with the run in `old`. Raises `FileInvalid`."""
     return compare(story_of(system, read_events(old, system)), story_of(system, read_events(new, system)), allowed)
 
 
-def show(verdict: Verdict, old: Path, *, as_json: bool) -> int:
+def show(verdict: RunComparison, old: Path, *, as_json: bool) -> int:
     """Print the comparison and return the exit code."""
     if as_json:
         json.dump(
@@ -66,23 +66,23 @@ def show(verdict: Verdict, old: Path, *, as_json: bool) -> int:
         click.echo()
         return 0 if verdict.same else 1
     for difference in verdict.differences[:SHOWN]:
-        data.print(f"[red]{difference.what:<8}[/red] {escape(str(difference))}", soft_wrap=True, highlight=False)
+        stdout.print(f"[red]{difference.what:<8}[/red] {escape(str(difference))}", soft_wrap=True, highlight=False)
     more = len(verdict.differences) - SHOWN
     if more > 0:
-        data.print(f"... and {more} more (--json has all)")
+        stdout.print(f"... and {more} more (--json has all)")
     if verdict.same:
         said = f"[green]the same[/green] as {escape(old.name)}"
     elif not verdict.compared:
         said = "[red]nothing in these runs can be compared[/red]"
     else:
         said = f"[red]{len(verdict.differences)} differences[/red] from {escape(old.name)}"
-    data.print(
+    stdout.print(
         f"{said}: {verdict.compared} fields and services compared over {verdict.common_s:.1f} s",
         highlight=False,
         soft_wrap=True,
     )
     if abs(verdict.old_s - verdict.new_s) > LENGTHS_S:
-        data.print(
+        stdout.print(
             f"  not compared: what one run has after that (lengths {verdict.old_s:.1f} s and {verdict.new_s:.1f} s)",
             highlight=False,
             soft_wrap=True,
@@ -120,5 +120,5 @@ def write_scenario(
     except OSError as e:
         raise UsageError(f"cannot write: {e.strerror or e}", got=str(out)) from e
     steps = text.count("\n  - ")
-    talk.print(f"{steps} steps  →  {escape(str(out))}; run it: fieldtwin test {escape(str(out))}", soft_wrap=True)
+    stderr.print(f"{steps} steps  →  {escape(str(out))}; run it: fieldtwin test {escape(str(out))}", soft_wrap=True)
     return 0

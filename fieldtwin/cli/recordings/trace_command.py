@@ -9,12 +9,12 @@ from pathlib import Path
 import click
 
 from fieldtwin.capture.decoding.decoder import Decoder
-from fieldtwin.capture.decoding.exchange import Decoded, Exchange
+from fieldtwin.capture.decoding.exchange import Decoded, DecodedExchange
 from fieldtwin.capture.decoding.trace_file import read_events
 from fieldtwin.cli.options import Duration, json_option, profiles_option
 from fieldtwin.cli.recordings.regression_options import tolerance_options
 from fieldtwin.cli.template_question import consent, trust_option
-from fieldtwin.console import talk
+from fieldtwin.console import stderr
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.results.trace import Event, Kind
@@ -104,7 +104,7 @@ def command(
 
         inside = [e for e in events if e.t_ns >= start_ns and (end_ns is None or e.t_ns <= end_ns)]
         write_vcd(vcd, inside, plant, machines_of(plant), f"{plant.name}, {file.name}")
-        talk.print(f"{len(inside)} events  →  {vcd}", soft_wrap=True)
+        stderr.print(f"{len(inside)} events  →  {vcd}", soft_wrap=True)
         return 0
     decoder = Decoder(plant)
     for event, decoded in _decoded(decoder, events, end_ns):
@@ -152,7 +152,11 @@ def _show_refusal(event: Event, decoded: Decoded, only: tuple[str, ...], *, as_j
 
 
 def _show_exchanges(
-    exchanges: list[Exchange] | tuple[Exchange, ...], only: tuple[str, ...], *, problems: bool, as_json: bool
+    exchanges: list[DecodedExchange] | tuple[DecodedExchange, ...],
+    only: tuple[str, ...],
+    *,
+    problems: bool,
+    as_json: bool,
 ) -> None:
     for exchange in exchanges:
         if (problems and exchange.ok) or (only and not {exchange.bus, exchange.device}.intersection(only)):

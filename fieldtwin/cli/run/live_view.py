@@ -16,7 +16,7 @@ from rich.table import Table
 from rich.text import Text
 
 from fieldtwin.cli.run.plc_views import acts_text, waiting_texts, without_texts
-from fieldtwin.console import data, talk
+from fieldtwin.console import stderr, stdout
 from fieldtwin.plc.status import PlcStatus
 from fieldtwin.results.trace import refusal_text
 from fieldtwin.run.live.session import RunSession
@@ -37,33 +37,33 @@ def print_mapping(session: RunSession) -> None:
     """Print once which endpoint stands in for each plant endpoint."""
     if not session.options.prototype:
         leave = "writes allowed" if session.options.allow_writes else "read-only"
-        talk.print(f"[bold]plant[/bold] {session.system.name}: {leave}; instance {session.instance.name}")
+        stderr.print(f"[bold]plant[/bold] {session.system.name}: {leave}; instance {session.instance.name}")
         _print_thread(session)
         return
-    talk.print(
+    stderr.print(
         f"[bold]prototype[/bold] of {session.system.name}; instance {session.instance.name} in {session.instance.dir}",
         soft_wrap=True,
     )
     for plant, target in session.mapping.items():
-        talk.print(
+        stderr.print(
             f"  {plant}  →  {target}" if plant != target else f"  {plant}  (the plant's endpoint)", soft_wrap=True
         )
     for bridge, cable in session.cables.items():
-        talk.print(f"  clients of bridge {bridge}  →  {cable.master}", soft_wrap=True)
+        stderr.print(f"  clients of bridge {bridge}  →  {cable.master}", soft_wrap=True)
     for device, endpoint in session.far.items():
-        talk.print(f"  topside end of {device}  →  {endpoint}", soft_wrap=True)
+        stderr.print(f"  topside end of {device}  →  {endpoint}", soft_wrap=True)
     _print_thread(session)
 
 
 def print_metrics(url: str) -> None:
     """Print once the address of the metrics."""
     if url:
-        talk.print(f"  metrics  ←  {url}", soft_wrap=True)
+        stderr.print(f"  metrics  ←  {url}", soft_wrap=True)
 
 
 def _print_thread(session: RunSession) -> None:
     if session.thread_place:
-        talk.print(f"  digital thread  ←  {session.thread_place}", soft_wrap=True)
+        stderr.print(f"  digital thread  ←  {session.thread_place}", soft_wrap=True)
 
 
 class LiveView:
@@ -72,7 +72,7 @@ class LiveView:
     def __init__(self, session: RunSession, quiet: bool) -> None:
         self._session = session
         self._task: asyncio.Task[None] | None = None
-        self._table = talk.is_terminal and not quiet
+        self._table = stderr.is_terminal and not quiet
         self._quiet = quiet
 
     async def __aenter__(self) -> LiveView:
@@ -94,7 +94,7 @@ class LiveView:
 
     async def _show_table(self) -> None:
         open_ports: set[str] = set()
-        with Live(render(self._session), console=talk, auto_refresh=False, transient=True) as live:
+        with Live(render(self._session), console=stderr, auto_refresh=False, transient=True) as live:
             while True:
                 open_ports = self._tell_once(open_ports)
                 live.update(render(self._session), refresh=True)
@@ -109,9 +109,9 @@ class LiveView:
             now = [*troubles(self._session), *_waiting_once(self._session)]
             for trouble in now:
                 if trouble not in told:  # once, and again only after it had disappeared
-                    talk.print(f"! {trouble}", soft_wrap=True, markup=False)
+                    stderr.print(f"! {trouble}", soft_wrap=True, markup=False)
             told = set(now)
-            talk.print(line(self._session), soft_wrap=True, markup=False)
+            stderr.print(line(self._session), soft_wrap=True, markup=False)
 
     def _tell_once(self, told: set[str]) -> set[str]:
         """Print once where the gateway listens (a prototype takes free ports), and report recovered simulated devices."""
@@ -119,7 +119,7 @@ class LiveView:
         if (back := self._session.field_return) is not None and back.news:
             now.add(back.news)
         for text in sorted(now - told):
-            talk.print(f"  {text}", soft_wrap=True, markup=False)
+            stderr.print(f"  {text}", soft_wrap=True, markup=False)
         return now
 
 
@@ -349,55 +349,57 @@ def _us(late: dict[str, Any], key: str) -> str:
 def print_summary(summary: dict[str, Any]) -> None:
     """Print the summary of a run on stdout."""
     kind = "prototype" if summary["prototype"] else "plant"
-    data.print(f"[bold]{summary['system']}[/bold] ({kind}), {summary['duration_s']:.1f} s")
+    stdout.print(f"[bold]{summary['system']}[/bold] ({kind}), {summary['duration_s']:.1f} s")
     for name, device in summary["devices"].items():
         mark = "[green]good[/green]" if device["state"] == "good" else f"[red]bad[/red] {device['error']}"
         plays = f", from {device['plays']}" if "plays" in device else ""
-        data.print(f"  {name:<14} {mark}{plays}", soft_wrap=True, highlight=False)
+        stdout.print(f"  {name:<14} {mark}{plays}", soft_wrap=True, highlight=False)
     for program, states in summary["states"].items():
-        data.print(f"  {program:<14} {' → '.join(states) or 'no scan observed'}")
+        stdout.print(f"  {program:<14} {' → '.join(states) or 'no scan observed'}")
     for bus, row in summary["exchanges"].items():
-        data.print(f"  {bus:<14} {_exchange_text(row)}", soft_wrap=True)
+        stdout.print(f"  {bus:<14} {_exchange_text(row)}", soft_wrap=True)
     print_faults(summary["faults"])
     published = summary["published"]
     if summary["prototype"]:
         checked = f"{published['checked']} compared with what the devices held, {published['wrong']} wrong"
         if published.get("unknown"):
             checked += f"; {published['unknown']} not verifiable, because the field simulator was lost"
-        data.print(f"  published      {checked}", soft_wrap=True)
+        stdout.print(f"  published      {checked}", soft_wrap=True)
     else:
         values = "not known" if published["values"] is None else f"{published['values']} good values"
-        data.print(f"  published      {values}")
+        stdout.print(f"  published      {values}")
     if (field := summary["field"]) and field["losses"]:
-        data.print(f"  simulator      lost {_times(field['losses'])}, away for {field['away_s']:.1f} s", soft_wrap=True)
+        stdout.print(
+            f"  simulator      lost {_times(field['losses'])}, away for {field['away_s']:.1f} s", soft_wrap=True
+        )
     if far := summary["far_end"]:
-        data.print(f"  topside        commands {far['commands_sent']}, responses {far['responses']}")
-    data.print(f"  logged         {summary['logged']} exchanges")
+        stdout.print(f"  topside        commands {far['commands_sent']}, responses {far['responses']}")
+    stdout.print(f"  logged         {summary['logged']} exchanges")
     if thread := summary["thread"]:
-        data.print(f"  thread         {_thread_text(thread)}", soft_wrap=True, markup=False, highlight=False)
+        stdout.print(f"  thread         {_thread_text(thread)}", soft_wrap=True, markup=False, highlight=False)
     for name, learnt in summary["learnt"].items():
-        data.print(f"  {name:<14} {_learnt_text(learnt, kind)}", soft_wrap=True, markup=False)
+        stdout.print(f"  {name:<14} {_learnt_text(learnt, kind)}", soft_wrap=True, markup=False)
     for text in without_texts(summary["plc"].get("started_without", {})):
-        data.print(f"  [yellow]start[/yellow]          {text}", soft_wrap=True, highlight=False)
+        stdout.print(f"  [yellow]start[/yellow]          {text}", soft_wrap=True, highlight=False)
     if acts := summary["plc"].get("acts"):
         left = summary["plc"].get("forces")
-        data.print(f"  [yellow]manual[/yellow]         actions on the PLC: {acts_text(acts)}", soft_wrap=True)
+        stdout.print(f"  [yellow]manual[/yellow]         actions on the PLC: {acts_text(acts)}", soft_wrap=True)
         if left:
-            data.print(f"  [yellow]FORCED[/yellow]         at the end: {forces_text(left)}", soft_wrap=True)
+            stdout.print(f"  [yellow]FORCED[/yellow]         at the end: {forces_text(left)}", soft_wrap=True)
     _print_refused(summary)
     for one in summary["invariants"]:
         if one["verdict"] != "failed":  # the failed ones are among the errors
             said = "holds" if one["verdict"] == "passed" else "not checked"
             text = f"  {one['number']}: {one['text']}: {said}, {one['got']}"
-            data.print(text, soft_wrap=True, markup=False, highlight=False)
+            stdout.print(text, soft_wrap=True, markup=False, highlight=False)
     told = {f"{name}: {device['error']}" for name, device in summary["devices"].items() if device["state"] != "good"}
     for error in summary["errors"]:
         if error in told:  # listed with the device, above
             continue
-        data.print(f"  [red]error[/red]          {escape(error)}", soft_wrap=True)
+        stdout.print(f"  [red]error[/red]          {escape(error)}", soft_wrap=True)
     for what in summary["not_judged"]:
-        data.print(f"  [yellow]not checked[/yellow]    {what}", soft_wrap=True, highlight=False)
-    data.print("[bold green]ok[/bold green]" if summary["ok"] else "[bold red]not ok[/bold red]")
+        stdout.print(f"  [yellow]not checked[/yellow]    {what}", soft_wrap=True, highlight=False)
+    stdout.print("[bold green]ok[/bold green]" if summary["ok"] else "[bold red]not ok[/bold red]")
 
 
 def _print_refused(summary: dict[str, Any]) -> None:
@@ -405,13 +407,13 @@ def _print_refused(summary: dict[str, Any]) -> None:
     by_design = sorted({e["tag"] for e in summary["refused"] if e["cause"] == READ_ONLY})
     if by_design:
         text = f"{', '.join(by_design)}: not written, the plant is read-only (--allow-writes)"
-        data.print(f"  not written    {text}", soft_wrap=True, markup=False, highlight=False)
+        stdout.print(f"  not written    {text}", soft_wrap=True, markup=False, highlight=False)
     others = [e for e in summary["refused"] if e["cause"] != READ_ONLY and not e["fault"]]
     for entry in others[:MAX_REFUSED]:
         text = refusal_text(entry["tag"], entry)
-        data.print(f"  not written    {text}", soft_wrap=True, markup=False, highlight=False)
+        stdout.print(f"  not written    {text}", soft_wrap=True, markup=False, highlight=False)
     if len(others) > MAX_REFUSED:
-        data.print(f"  not written    {len(others) - MAX_REFUSED} more, see the audit log", soft_wrap=True)
+        stdout.print(f"  not written    {len(others) - MAX_REFUSED} more, see the audit log", soft_wrap=True)
 
 
 def print_faults(faults: list[dict[str, Any]]) -> None:
@@ -420,12 +422,12 @@ def print_faults(faults: list[dict[str, Any]]) -> None:
 
     for fault in faults[:MOST_FAULTS]:
         colour = "yellow" if not fault["struck"] and not fault["optional"] else "default"
-        data.print(
+        stdout.print(
             f"  [{colour}]fault[/{colour}]          {escape(struck_of(fault).text)}", soft_wrap=True, highlight=False
         )
     if len(faults) > MOST_FAULTS:
         idle = sum(not fault["struck"] for fault in faults)
-        data.print(f"  faults         {len(faults)} in all, {idle} of them never took effect", soft_wrap=True)
+        stdout.print(f"  faults         {len(faults)} in all, {idle} of them never took effect", soft_wrap=True)
 
 
 def _times(count: int) -> str:

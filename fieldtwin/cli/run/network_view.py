@@ -19,7 +19,7 @@ from fieldtwin.cli.run.live_view import print_faults, troubles
 from fieldtwin.cli.run.network_request import NetworkRequest
 from fieldtwin.cli.run.virtual_view import parse_seeds, progress_bar, run_many, shown_time
 from fieldtwin.cli.template_question import consent
-from fieldtwin.console import data, show_warnings, talk
+from fieldtwin.console import show_warnings, stderr, stdout
 from fieldtwin.emulators.faults.schema import load_faults
 from fieldtwin.gateway.core.errors import FieldtwinError, UsageError
 from fieldtwin.gateway.wallclock import WallClock
@@ -79,11 +79,11 @@ def _print_network(network: Network) -> None:
     """Print the members of the network, and which of them hear each other."""
     show_warnings(dict.fromkeys(warning for member in network.members.values() for warning in member.system.warnings))
     sea = network.medium(network.seed)
-    talk.print(f"[bold]network[/bold] {network.name}, prototypes of {len(network.members)} systems", highlight=False)
+    stderr.print(f"[bold]network[/bold] {network.name}, prototypes of {len(network.members)} systems", highlight=False)
     for name in network.places:
         heard = ", ".join(sea.neighbours(name)) or "nobody"
         what = f" ({network.members[name].system.name})" if name in network.members else ""
-        talk.print(f"  {name}{what}: hears {heard}", soft_wrap=True, highlight=False)
+        stderr.print(f"  {name}{what}: hears {heard}", soft_wrap=True, highlight=False)
 
 
 def _options(request: NetworkRequest, network: Network) -> VirtualNetworkOptions:
@@ -109,7 +109,7 @@ def _many(request: NetworkRequest, network: Network) -> int:
 def _virtual(request: NetworkRequest, network: Network) -> int:
     options = _options(request, network)
     run = options.make()
-    talk.print(f"virtual time, seed {run.seed}, {shown_time(options.duration_s)}", markup=False, highlight=False)
+    stderr.print(f"virtual time, seed {run.seed}, {shown_time(options.duration_s)}", markup=False, highlight=False)
     began_ns = WallClock().monotonic_ns()
     with progress_bar(options.duration_s) as at:
         run.run(at)
@@ -119,8 +119,8 @@ def _virtual(request: NetworkRequest, network: Network) -> int:
         return _as_json(summary)
     print_network_summary(summary)
     trace = summary["trace"]
-    data.print(f"  trace          {trace['events']} events, sha256 {trace['sha256']}", soft_wrap=True)
-    data.print(f"  took           {took_s:.1f} s, {run.elapsed_s / took_s:,.0f} times real time", soft_wrap=True)
+    stdout.print(f"  trace          {trace['events']} events, sha256 {trace['sha256']}", soft_wrap=True)
+    stdout.print(f"  took           {took_s:.1f} s, {run.elapsed_s / took_s:,.0f} times real time", soft_wrap=True)
     return _verdict(summary)
 
 
@@ -159,11 +159,13 @@ async def _on_this_host(request: NetworkRequest, network: Network) -> int:
             raise
         started = True
         for name, one in session.sessions.items():
-            talk.print(f"  {name}: instance {one.instance.name} in {one.instance.dir}", soft_wrap=True, highlight=False)
+            stderr.print(
+                f"  {name}: instance {one.instance.name} in {one.instance.dir}", soft_wrap=True, highlight=False
+            )
             if one.thread_place:
-                talk.print(f"  {name}: digital thread  ←  {one.thread_place}", soft_wrap=True, highlight=False)
+                stderr.print(f"  {name}: digital thread  ←  {one.thread_place}", soft_wrap=True, highlight=False)
         if session.ship is not None:
-            talk.print(f"  the ship's modem  →  {session.ship}", soft_wrap=True, highlight=False)
+            stderr.print(f"  the ship's modem  →  {session.ship}", soft_wrap=True, highlight=False)
         showing = asyncio.create_task(_show(session, quiet=request.as_json))
         try:
             await session.wait()
@@ -192,8 +194,8 @@ async def _show(session: NetworkSession, quiet: bool) -> None:
     """Show a table on a terminal; elsewhere print a line for each system at intervals."""
     if quiet:
         return
-    if talk.is_terminal:
-        with Live(_table(session), console=talk, auto_refresh=False, transient=True) as live:
+    if stderr.is_terminal:
+        with Live(_table(session), console=stderr, auto_refresh=False, transient=True) as live:
             while True:
                 live.update(_table(session), refresh=True)
                 await asyncio.sleep(REFRESH_S)
@@ -203,10 +205,10 @@ async def _show(session: NetworkSession, quiet: bool) -> None:
         now = _troubles(session)
         for trouble in now:
             if trouble not in told:
-                talk.print(f"! {trouble}", soft_wrap=True, markup=False, highlight=False)
+                stderr.print(f"! {trouble}", soft_wrap=True, markup=False, highlight=False)
         told = set(now)
         parts = [f"{name} {_states(one)} {_outputs(one)}".strip() for name, one in session.sessions.items()]
-        talk.print(f"{session.elapsed_s:6.0f} s  {' | '.join(parts)}", soft_wrap=True, markup=False, highlight=False)
+        stderr.print(f"{session.elapsed_s:6.0f} s  {' | '.join(parts)}", soft_wrap=True, markup=False, highlight=False)
 
 
 def _table(session: NetworkSession) -> Group:
@@ -256,24 +258,24 @@ def _as_json(summary: dict[str, Any]) -> int:
 
 
 def _verdict(summary: dict[str, Any]) -> int:
-    data.print("[bold green]ok[/bold green]" if summary["ok"] else "[bold red]not ok[/bold red]")
+    stdout.print("[bold green]ok[/bold green]" if summary["ok"] else "[bold red]not ok[/bold red]")
     return 0 if summary["ok"] else 1
 
 
 def print_network_summary(summary: dict[str, Any]) -> None:
     """Print the summary of a network run on stdout, without the verdict."""
-    data.print(f"[bold]{summary['network']}[/bold] (network of prototypes), {summary['duration_s']:.1f} s")
+    stdout.print(f"[bold]{summary['network']}[/bold] (network of prototypes), {summary['duration_s']:.1f} s")
     for name, one in summary["systems"].items():
         good = [device for device, d in one["devices"].items() if d["state"] == "good"]
         devices = f"{', '.join(good)} [green]good[/green]" if good else ""
         bad = [f"{device} [red]bad[/red] {d['error']}" for device, d in one["devices"].items() if device not in good]
-        data.print(
+        stdout.print(
             f"  {name:<14} {'; '.join([*([devices] if devices else []), *bad])}", soft_wrap=True, highlight=False
         )
         for states in one["states"].values():
-            data.print(f"  {'':<14} {' → '.join(states) or 'no scan observed'}", soft_wrap=True, highlight=False)
+            stdout.print(f"  {'':<14} {' → '.join(states) or 'no scan observed'}", soft_wrap=True, highlight=False)
         published = one["published"]
-        data.print(
+        stdout.print(
             f"  {'':<14} published {published['checked']} compared with what the devices held, {published['wrong']} wrong;"
             f" logged {one['logged']}",
             soft_wrap=True,
@@ -281,17 +283,17 @@ def print_network_summary(summary: dict[str, Any]) -> None:
         )
         print_faults(one["faults"])
         for error in one["errors"]:
-            data.print(f"  {'':<14} [red]error[/red] {error}", soft_wrap=True, highlight=False)
+            stdout.print(f"  {'':<14} [red]error[/red] {error}", soft_wrap=True, highlight=False)
     for name, sea in summary["water"].items():
         lost = ", ".join(f"{sea[why]} by {why}" for why in ("chance", "collision", "speaking", "fault") if sea[why])
         text = f"said {sea['said']}, heard {sea['heard']}" + (f"; missed {lost}" if lost else "")
-        data.print(
+        stdout.print(
             f"  {'water' if name == next(iter(summary['water'])) else '':<14} {name}: {text}",
             soft_wrap=True,
             highlight=False,
         )
     print_faults(summary["faults"])
     if ship := summary["ship"]:
-        data.print(f"  {SHIP:<14} commands {ship['commands_sent']}, heard {ship['responses']}", highlight=False)
+        stdout.print(f"  {SHIP:<14} commands {ship['commands_sent']}, heard {ship['responses']}", highlight=False)
     for error in summary["errors"]:
-        data.print(f"  [red]error[/red]          {error}", soft_wrap=True)
+        stdout.print(f"  [red]error[/red]          {error}", soft_wrap=True)

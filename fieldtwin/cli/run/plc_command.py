@@ -13,7 +13,7 @@ import msgspec
 from fieldtwin.cli.options import NegativeNumbers, json_option, profiles_option
 from fieldtwin.cli.output_files import write_text
 from fieldtwin.cli.template_question import consent, trust_option
-from fieldtwin.console import talk
+from fieldtwin.console import stderr
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.plc.status import PlcStatus
 from fieldtwin.twin.site.system import System, load_system
@@ -135,7 +135,7 @@ def force(tag: str, value: str, yes: bool, instance: str) -> int:
     wanted = codes[value] if value in codes else parse_value(value, tuple(codes))
     _sure(f"{tag} is {now}; force it to {value}", yes)
     _act(instance, "force", tag=tag, value=wanted)
-    talk.print(f"{tag} is forced to {value}", markup=False)
+    stderr.print(f"{tag} is forced to {value}", markup=False)
     return 0
 
 
@@ -148,7 +148,7 @@ def unforce(tag: str | None, every: bool, instance: str) -> int:
     if bool(tag) == every:
         raise UsageError("no tag to unforce", expected="a TAG, or --all")
     done = _act(instance, "unforce", all=True) if every else _act(instance, "unforce", tag=tag)
-    talk.print(f"{done['removed']} removed", markup=False)
+    stderr.print(f"{done['removed']} removed", markup=False)
     return 0
 
 
@@ -159,7 +159,7 @@ def pause(yes: bool, instance: str) -> int:
     """Pause the execution of programs; the outputs keep their values, and the plant keeps them."""
     _sure("pause the PLC: its outputs keep their values, whatever happens in the plant", yes)
     _act(instance, "pause")
-    talk.print("paused; fieldtwin plc step, fieldtwin plc go")
+    stderr.print("paused; fieldtwin plc step, fieldtwin plc go")
     return 0
 
 
@@ -168,7 +168,7 @@ def pause(yes: bool, instance: str) -> int:
 def go(instance: str) -> int:
     """Continue after a pause."""
     _act(instance, "go")
-    talk.print("running")
+    stderr.print("running")
     return 0
 
 
@@ -185,7 +185,7 @@ def step(count: int, instance: str) -> int:
 
     scans = talk_to(instance, lambda client: step_and_wait(client.call, count, getpass.getuser()))
     texts = [f"{name + ': ' if len(scans) > 1 else ''}{n} scan{'' if n == 1 else 's'}" for name, n in scans.items()]
-    talk.print(", ".join(texts), markup=False)
+    stderr.print(", ".join(texts), markup=False)
     return 0
 
 
@@ -196,7 +196,7 @@ def step(count: int, instance: str) -> int:
 def restart(cold: bool, yes: bool, instance: str) -> int:
     """Restart the programs: first scan, initial values, and (unless --cold) retained values."""
     _sure(f"restart the PLC {'cold' if cold else 'warm'}: its outputs are safe during the restart", yes)
-    talk.print(_act(instance, "restart", cold=cold)["start"], markup=False)
+    stderr.print(_act(instance, "restart", cold=cold)["start"], markup=False)
     return 0
 
 

@@ -12,7 +12,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from fieldtwin.console import data, talk
+from fieldtwin.console import stderr, stdout
 from fieldtwin.gateway.core.control import ControlClient
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.plc.prove import Proof, Result
@@ -122,11 +122,11 @@ def print_tags(rows: list[Row]) -> None:
 
 def _width() -> int:
     """Return the number of columns: the terminal's, and unlimited in a pipe, so that nothing is cut off."""
-    return data.width if data.is_terminal else IN_A_PIPE
+    return stdout.width if stdout.is_terminal else IN_A_PIPE
 
 
 def _print_table(table: Table) -> None:
-    console = data if data.is_terminal else Console(file=data.file, width=IN_A_PIPE, highlight=False, emoji=False)
+    console = stdout if stdout.is_terminal else Console(file=stdout.file, width=IN_A_PIPE, highlight=False, emoji=False)
     console.print(table)
 
 
@@ -134,7 +134,7 @@ async def watch_live(path: Path, patterns: tuple[str, ...]) -> None:
     client = await ControlClient.connect_unix(path)
     try:
         names = await chosen_tags(client, patterns)
-        with Live(console=data, auto_refresh=False, transient=True) as live:
+        with Live(console=stdout, auto_refresh=False, transient=True) as live:
             while True:
                 live.update(tag_table(await ask_rows(client, names)), refresh=True)
                 await asyncio.sleep(REFRESH_S)
@@ -148,12 +148,12 @@ def print_status(status: PlcStatus) -> None:
         head += f" ({status.stop_reason})"
     if status.restart_in_ms is not None:
         head += f", restarts in {status.restart_in_ms / 1000:.1f} s"
-    data.print(f"PLC: {head}", markup=False)
+    stdout.print(f"PLC: {head}", markup=False)
     if status.error:
-        data.print(f"  {status.error}", markup=False, soft_wrap=True)
+        stdout.print(f"  {status.error}", markup=False, soft_wrap=True)
     for text in [*waiting_texts(status.waiting), *without_texts(status.started_without)]:
-        data.print(f"  {text}", style="yellow", markup=False, soft_wrap=True)
-    data.print(f"gateway: {'alive' if status.gateway_alive else 'DEAD: every input is bad'}", markup=False)
+        stdout.print(f"  {text}", style="yellow", markup=False, soft_wrap=True)
+    stdout.print(f"gateway: {'alive' if status.gateway_alive else 'DEAD: every input is bad'}", markup=False)
     table = Table(box=None, pad_edge=False)
     for name in (
         "task",
@@ -178,25 +178,25 @@ def print_status(status: PlcStatus) -> None:
             *(_us(late[k]) for k in ("p50", "p99", "max")), *(_us(took[k]) for k in ("p50", "p99", "max")),
         )  # fmt: skip
     _print_table(table)
-    data.print(f"restarts: {status.restarts}; {status.retain.start}", markup=False)
+    stdout.print(f"restarts: {status.restarts}; {status.retain.start}", markup=False)
     realtime = status.realtime or RealtimeStatus()
-    data.print("granted: " + (", ".join(realtime.granted) or "nothing"), markup=False, soft_wrap=True)
+    stdout.print("granted: " + (", ".join(realtime.granted) or "nothing"), markup=False, soft_wrap=True)
     if realtime.refused:
-        data.print(
+        stdout.print(
             "refused: " + ", ".join(f"{k} ({v})" for k, v in realtime.refused.items()), markup=False, soft_wrap=True
         )
     counters = {name: count for name, count in status.counters.items() if count}
     if counters:
-        data.print("counted: " + ", ".join(f"{n} {c}" for n, c in counters.items()), markup=False)
+        stdout.print("counted: " + ", ".join(f"{n} {c}" for n, c in counters.items()), markup=False)
     if status.acts:
-        data.print("done to it: " + acts_text(status.acts), markup=False)
+        stdout.print("done to it: " + acts_text(status.acts), markup=False)
     if status.forces:
-        data.print(f"FORCED: {len(status.forces)}", style="yellow")
+        stdout.print(f"FORCED: {len(status.forces)}", style="yellow")
         for tag, force in status.forces.items():
             by = f" by {force['by']}" if force["by"] else ""
-            data.print(f"  {tag} = {force['value']}{by}, {_age(force['age_ms'])} ago", style="yellow", markup=False)
+            stdout.print(f"  {tag} = {force['value']}{by}, {_age(force['age_ms'])} ago", style="yellow", markup=False)
     else:
-        data.print("no tag is forced")
+        stdout.print("no tag is forced")
 
 
 def waiting_texts(waiting: Mapping[str, WaitingStatus]) -> list[str]:
@@ -233,33 +233,33 @@ def acts_text(acts: dict[str, int]) -> str:
 def print_why(tag: str, changes: list[dict[str, Any]], waits_for: str = "") -> None:
     """Print the reason of a tag's value. `waits_for`: what the program that writes the tag waits for before it starts."""
     if waits_for:
-        data.print(f"{tag}: its program has not started; missing {waits_for}", markup=False, soft_wrap=True)
+        stdout.print(f"{tag}: its program has not started; missing {waits_for}", markup=False, soft_wrap=True)
     elif not changes:
-        data.print(f"{tag} has not changed since the programs began", markup=False)
+        stdout.print(f"{tag} has not changed since the programs began", markup=False)
     for change in changes:
         by = "a force, through" if change["forced"] else ""
-        data.print(
+        stdout.print(
             f"{_age(change['age_ms'])} ago, scan {change['scan']}: {_value(change['before'])} to {_value(change['after'])}, "
             f"by {by + ' ' if by else ''}program {change['program']}",
             markup=False,
         )
         for name, value in change["inputs"].items():
-            data.print(f"    {name} was {_value(value)}", markup=False)
+            stdout.print(f"    {name} was {_value(value)}", markup=False)
 
 
 def print_proof(name: str, proof: Proof, result: Result, text: str) -> None:
     seen = f"{result.states} states, {result.transitions} scans, {result.depth} deep"
     if result.proved:
-        data.print(f"{name}: proved for {seen}", markup=False)
+        stdout.print(f"{name}: proved for {seen}", markup=False)
         for invariant in proof.invariants:
-            data.print(f"  holds: {invariant}", markup=False, soft_wrap=True)
+            stdout.print(f"  holds: {invariant}", markup=False, soft_wrap=True)
     elif result.broken:
-        data.print(f"{name}: violated after {len(result.way)} scans: {result.broken}", markup=False, soft_wrap=True)
-        data.print(text, markup=False, highlight=False, soft_wrap=True, end="")
+        stdout.print(f"{name}: violated after {len(result.way)} scans: {result.broken}", markup=False, soft_wrap=True)
+        stdout.print(text, markup=False, highlight=False, soft_wrap=True, end="")
     else:
-        data.print(f"{name}: no violation in {seen}, but no proof: {result.reason}", markup=False, soft_wrap=True)
+        stdout.print(f"{name}: no violation in {seen}, but no proof: {result.reason}", markup=False, soft_wrap=True)
         if result.bounded:
-            talk.print("raise --max-states")
+            stderr.print("raise --max-states")
 
 
 def _us(us: float) -> str:

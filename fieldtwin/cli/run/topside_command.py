@@ -10,13 +10,13 @@ from pathlib import Path
 import click
 
 from fieldtwin.cli.options import Duration, Secret, json_option, profiles_option
-from fieldtwin.console import talk
+from fieldtwin.console import stderr
 from fieldtwin.gateway.core.concurrency.stop_signal import stop_signal
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.run.processes.field_contact import connect_control, reachable
-from fieldtwin.run.processes.topside import Shore, parse_periods, script
+from fieldtwin.run.processes.topside import TopsideController, parse_periods, script
 from fieldtwin.twin.prototype.field_status import FieldStatus
 from fieldtwin.twin.site.system import System, load_system
 
@@ -93,8 +93,8 @@ async def _run(
 ) -> int:
     stop = stop_signal()
     endpoint = Endpoint.parse(far) if far else await _ask_field(device, field_host, token)
-    shore = Shore(system, device, endpoint, WallClock())
-    talk.print(f"topside end of {device} at {endpoint}", soft_wrap=True)
+    shore = TopsideController(system, device, endpoint, WallClock())
+    stderr.print(f"topside end of {device} at {endpoint}", soft_wrap=True)
     serving = asyncio.create_task(shore.run(script(periods, duration_s or 20.0)))
     showing = asyncio.create_task(_show(shore)) if not as_json else None
     stopping = asyncio.create_task(stop.wait())
@@ -110,7 +110,7 @@ async def _run(
         json.dump(seen, sys.stdout)
         sys.stdout.write("\n")
     else:
-        talk.print(f"commands {seen['commands_sent']}, responses {seen['responses']}")
+        stderr.print(f"commands {seen['commands_sent']}, responses {seen['responses']}")
     return 0 if seen["responses"] or not periods else 1
 
 
@@ -125,11 +125,11 @@ async def _ask_field(device: str, field_host: str, token: str) -> Endpoint:
     return reachable(Endpoint.parse(far[device]), host)
 
 
-async def _show(shore: Shore) -> None:
+async def _show(shore: TopsideController) -> None:
     shown = 0
     while True:
         await asyncio.sleep(0.2)
         new = shore.responses_received - shown
         for response in list(shore.responses)[-new:] if new else []:
-            talk.print(f"response {response.hex()}", soft_wrap=True)
+            stderr.print(f"response {response.hex()}", soft_wrap=True)
         shown = shore.responses_received

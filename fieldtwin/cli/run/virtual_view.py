@@ -14,7 +14,7 @@ from rich.table import Table
 
 from fieldtwin.cli.output_files import write_text
 from fieldtwin.cli.run.live_view import print_summary
-from fieldtwin.console import data, show_warnings, talk
+from fieldtwin.console import show_warnings, stderr, stdout
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.wallclock import WallClock
 
@@ -41,7 +41,7 @@ def run_one(options: VirtualOptions, as_json: bool) -> int:
     from fieldtwin.run.virtual.run import VirtualRun
 
     run = VirtualRun(options)
-    talk.print(
+    stderr.print(
         f"{run.system.name} (prototype, virtual time), seed {run.seed}, {shown_time(options.duration_s)}", markup=False
     )
     show_warnings(run.system.warnings)
@@ -56,8 +56,8 @@ def run_one(options: VirtualOptions, as_json: bool) -> int:
     else:
         print_summary(summary)
         trace = summary["trace"]
-        data.print(f"  trace          {trace['events']} events, sha256 {trace['sha256']}", soft_wrap=True)
-        data.print(f"  took           {took_s:.1f} s, {run.elapsed_s / took_s:,.0f} times real time", soft_wrap=True)
+        stdout.print(f"  trace          {trace['events']} events, sha256 {trace['sha256']}", soft_wrap=True)
+        stdout.print(f"  took           {took_s:.1f} s, {run.elapsed_s / took_s:,.0f} times real time", soft_wrap=True)
     return 0 if summary["ok"] else 1
 
 
@@ -120,10 +120,10 @@ def run_many(
         sys.stdout.write("\n")
         return 1 if failed or before or untested else 0
     for result in failed:
-        data.print(f"[red]seed {result.seed}[/red]", soft_wrap=True)
+        stdout.print(f"[red]seed {result.seed}[/red]", soft_wrap=True)
         for error in result.errors:
-            data.print(f"  {error}", soft_wrap=True, markup=False)
-        data.print(f"  {again(result.seed)}", soft_wrap=True, markup=False)
+            stdout.print(f"  {error}", soft_wrap=True, markup=False)
+        stdout.print(f"  {again(result.seed)}", soft_wrap=True, markup=False)
     if failed and (options.random_faults is not None or options.faults):
         _shrink(options, failed[0])
     table = Table(box=None, show_header=False, pad_edge=False)
@@ -137,16 +137,16 @@ def run_many(
         table.add_row("not repeated", f"{len(seeds) - len(left)} seeds that the ledger has")
         bad = f", {len(ledger.failed)} runs failed, {ledger.wrong} wrong values" if ledger.failed else ", no run failed"
         table.add_row("the ledger", f"{ledger.hours:g} virtual hours in {len(ledger.entries)} runs{bad}")
-    data.print(table)
+    stdout.print(table)
     for seed in before:
-        data.print(f"[red]seed {seed}[/red] failed before, by the ledger: {again(seed)}", soft_wrap=True)
+        stdout.print(f"[red]seed {seed}[/red] failed before, by the ledger: {again(seed)}", soft_wrap=True)
     if untested and not failed and not before:
-        data.print(
+        stdout.print(
             "no fault took effect in any run, so nothing was tested with faults: try a longer --for", soft_wrap=True
         )
-        data.print("[bold yellow]inconclusive[/bold yellow]")
+        stdout.print("[bold yellow]inconclusive[/bold yellow]")
         return 1
-    data.print("[bold red]not ok[/bold red]" if failed or before else "[bold green]ok[/bold green]")
+    stdout.print("[bold red]not ok[/bold red]" if failed or before else "[bold green]ok[/bold green]")
     return 1 if failed or before else 0
 
 
@@ -165,10 +165,10 @@ def _shrink(options: Options, failed: SeedResult) -> None:
     from fieldtwin.run.campaigns.many_seeds import shrunk
     from fieldtwin.run.campaigns.shrink import as_scenario
 
-    talk.print(f"shrinking the faults of seed {failed.seed}", markup=False)
+    stderr.print(f"shrinking the faults of seed {failed.seed}", markup=False)
     small = shrunk(options, failed)
     if small.result.ok:
-        data.print(
+        stdout.print(
             f"seed {failed.seed} does not fail again with the same faults, so no scenario is written", soft_wrap=True
         )
         return
@@ -180,7 +180,7 @@ def _shrink(options: Options, failed: SeedResult) -> None:
     told = shrunk_texts(failed.seed, len(small.faults), small.minimal, small.without.ok, small.without.errors)
     told += [f"it is written to {path}", confirm_run(path, small.result, options.profiles)]
     for line in told:
-        data.print(line, soft_wrap=True, markup=False, highlight=False)
+        stdout.print(line, soft_wrap=True, markup=False, highlight=False)
 
 
 def shrunk_texts(seed: int, count: int, minimal: bool, passes_without: bool, otherwise: Sequence[str]) -> list[str]:
@@ -217,7 +217,7 @@ class progress_bar:
             BarColumn(),
             TextColumn("{task.completed:g} {task.fields[unit]}"),
         )
-        self._progress = Progress(*columns, console=talk, transient=True, disable=not talk.is_terminal)
+        self._progress = Progress(*columns, console=stderr, transient=True, disable=not stderr.is_terminal)
         self._task = self._progress.add_task("", total=total, unit=unit)
 
     def __enter__(self) -> Callable[[float], None]:

@@ -10,7 +10,7 @@ from rich.markup import escape
 
 from fieldtwin.cli.options import pairs, profiles_option
 from fieldtwin.cli.template_question import consent, trust_option
-from fieldtwin.console import show_warnings, talk
+from fieldtwin.console import show_warnings, stderr
 from fieldtwin.gateway.core.errors import UsageError
 
 LONG = ("_URL", "_TTY", "_BAUDRATE", "_FRAME", "_HOST", "_PORT", "_INTERFACE", "_CHANNEL")
@@ -89,16 +89,16 @@ def command(
     def tell(env: dict[str, str]) -> None:
         if quiet:
             return
-        talk.print(f"[bold]field simulator[/bold] of {escape(loaded.name)}")
+        stderr.print(f"[bold]field simulator[/bold] of {escape(loaded.name)}")
         show_warnings(loaded.warnings)
         for name, value in env.items():
             if name.endswith(LONG):
                 continue
-            talk.print(f"  {name}={escape(value)}", soft_wrap=True)
+            stderr.print(f"  {name}={escape(value)}", soft_wrap=True)
 
     def tell_struck(struck: list[dict[str, Any]]) -> None:
         if not quiet:
             for one in struck:
-                talk.print(f"fault {struck_of(one).text}", soft_wrap=True, markup=False, highlight=False)
+                stderr.print(f"fault {struck_of(one).text}", soft_wrap=True, markup=False, highlight=False)
 
     return run(run_with(config, words, instance=instance, faults=put_in, tell=tell, tell_struck=tell_struck))

@@ -8,11 +8,15 @@ import sys
 import click
 
 from fieldtwin.cli.options import json_option
-from fieldtwin.console import data
+from fieldtwin.console import stdout
 from fieldtwin.doctor.checks import examine
-from fieldtwin.doctor.verdicts import Check, Verdict
+from fieldtwin.doctor.verdicts import Check, HostVerdict
 
-MARK = {Verdict.OK: "[green]ok[/green]  ", Verdict.NOTE: "[yellow]note[/yellow]", Verdict.BAD: "[red]bad[/red] "}
+MARK = {
+    HostVerdict.OK: "[green]ok[/green]  ",
+    HostVerdict.NOTE: "[yellow]note[/yellow]",
+    HostVerdict.BAD: "[red]bad[/red] ",
+}
 
 
 @click.command("doctor")
@@ -32,10 +36,10 @@ def command(as_json: bool) -> int:
     else:
         for check in checks:
             _show(check)
-    return 1 if any(c.verdict is Verdict.BAD for c in checks) else 0
+    return 1 if any(c.verdict is HostVerdict.BAD for c in checks) else 0
 
 
 def _show(check: Check) -> None:
-    data.print(f"{MARK[check.verdict]} {check.name:<16} {check.found}", soft_wrap=True)
+    stdout.print(f"{MARK[check.verdict]} {check.name:<16} {check.found}", soft_wrap=True)
     if check.advice:
-        data.print(f"{'':21}{check.advice}", soft_wrap=True)
+        stdout.print(f"{'':21}{check.advice}", soft_wrap=True)

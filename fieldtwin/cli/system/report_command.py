@@ -11,7 +11,7 @@ from pathlib import Path
 import click
 
 from fieldtwin.cli.options import json_option, pairs
-from fieldtwin.console import talk
+from fieldtwin.console import stderr
 from fieldtwin.gateway.core.errors import UsageError
 
 
@@ -82,7 +82,7 @@ def command(
         setattr(named[0], what, said)
     write_html(document, out)
     for why in left_out:
-        talk.print(f"left out: {why}", markup=False, soft_wrap=True)
+        stderr.print(f"left out: {why}", markup=False, soft_wrap=True)
     if as_json:
         json.dump(document.as_json(), sys.stdout, indent=2)
         sys.stdout.write("\n")

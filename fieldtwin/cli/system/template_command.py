@@ -14,14 +14,21 @@ from rich.markup import escape
 from fieldtwin.__about__ import __version__
 from fieldtwin.cli.options import json_option, profiles_option
 from fieldtwin.cli.template_question import ask_about, shown
-from fieldtwin.console import data, talk
+from fieldtwin.console import stderr, stdout
 from fieldtwin.gateway.core.errors import UsageError
-from fieldtwin.gateway.core.escaping import visible
+from fieldtwin.gateway.core.escaping import escape_controls
 from fieldtwin.gateway.wallclock import WallClock
-from fieldtwin.run.template import Stranger
+from fieldtwin.run.template import ForeignParts
 from fieldtwin.twin.prototype.file import prototype_path
 from fieldtwin.twin.site.system import load_system
-from fieldtwin.twin.template.check import Difference, differences, examine, put_together, software_difference, unified
+from fieldtwin.twin.template.check import (
+    TemplateDifference,
+    differences,
+    examine,
+    put_together,
+    software_difference,
+    unified,
+)
 from fieldtwin.twin.template.pack import Extras, collect, pack
 from fieldtwin.twin.template.package import FolderPackage, open_package, unpack
 from fieldtwin.twin.template.software import modules_hash
@@ -74,11 +81,11 @@ def pack_command(
         _print_json({"template": str(out), **_described(manifest)})
         return 0
     total = sum(file.bytes for file in manifest.files)
-    talk.print(
+    stderr.print(
         f"{escape(str(out))}: {len(manifest.files)} files, {total:,} bytes; template {manifest.id[:16]}", soft_wrap=True
     )
     if not manifest.prototype_file:
-        talk.print("it has no prototype file, so it runs only as a plant")
+        stderr.print("it has no prototype file, so it runs only as a plant")
     return 0
 
 
@@ -107,11 +114,11 @@ def unpack_command(template: Path, out: Path | None, as_json: bool) -> int:
     if as_json:
         _print_json({"folder": str(out), **_described(manifest)})
         return 0
-    talk.print(
+    stderr.print(
         f"{escape(str(out))}: {len(manifest.files)} files, as packed; template {manifest.id[:16]}", soft_wrap=True
     )
     if manifest.code:
-        talk.print(
+        stderr.print(
             f"control logic in Python, not run: {shown(manifest.code)}. Read it before you run it.",
             soft_wrap=True,
         )
@@ -137,7 +144,7 @@ def check_command(template: Path, trust: bool, as_json: bool) -> int:
         here = FolderPackage(folder)
         manifest = here.manifest
         system = examine(folder, manifest, shown=package.path)
-        may_run = not here.code or trust or (not as_json and ask_about(Stranger(package.path, package.code)))
+        may_run = not here.code or trust or (not as_json and ask_about(ForeignParts(package.path, package.code)))
         if may_run:
             put_together(manifest, system, folder, WallClock())
     same = manifest.software.modules_sha256 == modules_hash()
@@ -145,13 +152,13 @@ def check_command(template: Path, trust: bool, as_json: bool) -> int:
         _print_json({**_described(manifest), "ok": True, "control_logic_checked": may_run, "same_software_here": same})
         return 0
     _print_files(manifest)
-    talk.print("every hash is correct, and no file of the system is missing")
+    stderr.print("every hash is correct, and no file of the system is missing")
     if not may_run:
-        talk.print("its control logic was not checked")
+        stderr.print("its control logic was not checked")
     if not same:
         there = f"{manifest.software.version}, modules {manifest.software.modules_sha256[:12]}"
         here_is = f"{__version__}, modules {modules_hash()[:12]}"
-        talk.print(f"it was packed by a different version: {there}; this is {here_is}", soft_wrap=True)
+        stderr.print(f"it was packed by a different version: {there}; this is {here_is}", soft_wrap=True)
     return 0
 
 
@@ -179,19 +186,19 @@ def diff_command(before: Path, after: Path, names: bool, as_json: bool) -> int:
             path = difference.path
             if not names and difference.kind != "software":
                 for line in unified(path, (a, old.get(path)), (b, new.get(path))):
-                    data.print(visible(line), style=_style(line), markup=False, soft_wrap=True)
+                    stdout.print(escape_controls(line), style=_style(line), markup=False, soft_wrap=True)
     if not found:
-        talk.print("no difference")
+        stderr.print("no difference")
     return 1 if found else 0
 
 
-def _print_difference(d: Difference) -> None:
+def _print_difference(d: TemplateDifference) -> None:
     def short(side: str) -> str:
         version, _, digest = side.rpartition(" ")
         return f"{version} {digest[:12]}".strip() or "nothing"
 
     style = {"added": "green", "removed": "red", "changed": "yellow"}[d.what]
-    data.print(f"[{style}]{d.what:8}[/] {escape(d.path)}  {short(d.before)} -> {short(d.after)}", soft_wrap=True)
+    stdout.print(f"[{style}]{d.what:8}[/] {escape(d.path)}  {short(d.before)} -> {short(d.after)}", soft_wrap=True)
 
 
 def _style(line: str) -> str:
@@ -199,11 +206,13 @@ def _style(line: str) -> str:
 
 
 def _print_files(manifest: Manifest) -> None:
-    data.print(f"{manifest.system}: template {manifest.id[:16]}, fieldtwin {manifest.software.version}", soft_wrap=True)
-    data.print(f"  {'SHA-256':12}  {'bytes':>13}  {'kind':17}  file")
+    stdout.print(
+        f"{manifest.system}: template {manifest.id[:16]}, fieldtwin {manifest.software.version}", soft_wrap=True
+    )
+    stdout.print(f"  {'SHA-256':12}  {'bytes':>13}  {'kind':17}  file")
     for file in manifest.files:  # the path is last and unwrapped, so that it can be copied
         words = f"  {file.sha256[:12]}  {file.bytes:13,}  {file.document or file.kind:17}  {escape(file.path)}"
-        data.print(words, soft_wrap=True, highlight=False)
+        stdout.print(words, soft_wrap=True, highlight=False)
 
 
 def _described(manifest: Manifest) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from rich.markup import escape
 from fieldtwin.cli.campaign_options import CampaignRequest
 from fieldtwin.cli.output_files import write_text
 from fieldtwin.cli.run.virtual_view import parse_seeds, progress_bar, shrunk_texts
-from fieldtwin.console import data, talk
+from fieldtwin.console import stderr, stdout
 from fieldtwin.results.model import ScenarioResult, Verdict
 from fieldtwin.run.campaigns.campaign import Campaign, run_campaign, verdict_of
 from fieldtwin.run.campaigns.confirming import CONFIRMED
@@ -73,23 +73,25 @@ def _show_seed(result: ScenarioResult, show: Callable[[ScenarioResult], None]) -
     told = [*struck[:FAULTS_SHOWN], *([f"{len(struck) - FAULTS_SHOWN} more"] if len(struck) > FAULTS_SHOWN else [])]
     told += [f"{idle} never took effect"] if idle else []
     text = "; ".join(told) or "no fault"
-    data.print(f"[green]passed[/green]  seed {result.seed}  [dim]{escape(text)}[/dim]", soft_wrap=True, highlight=False)
+    stdout.print(
+        f"[green]passed[/green]  seed {result.seed}  [dim]{escape(text)}[/dim]", soft_wrap=True, highlight=False
+    )
 
 
 def _show_whole(whole: ScenarioResult) -> None:
     colour = _COLOUR[whole.verdict.value]
-    data.print(f"[{colour}]{whole.verdict.value}[/{colour}]  {escape(whole.title)}", soft_wrap=True, highlight=False)
+    stdout.print(f"[{colour}]{whole.verdict.value}[/{colour}]  {escape(whole.title)}", soft_wrap=True, highlight=False)
     for check in whole.checks:
         text = f"  {check.number}: {check.text}: {check.got}"
-        data.print(text, soft_wrap=True, markup=False, highlight=False)
+        stdout.print(text, soft_wrap=True, markup=False, highlight=False)
 
 
 def _shrink(campaign: Campaign, failed: ScenarioResult, told: bool) -> list[ScenarioResult]:
     """Write the smallest failing schedule as a scenario into the working directory, and confirm it."""
-    talk.print(f"shrinking the faults of seed {failed.seed}", markup=False)
+    stderr.print(f"shrinking the faults of seed {failed.seed}", markup=False)
     small = shrink_seed(campaign, failed)
     if not small.result.verdict.bad:
-        talk.print(
+        stderr.print(
             f"seed {small.seed} does not fail again with the same faults, so no scenario is written", markup=False
         )
         return []
@@ -104,5 +106,5 @@ def _shrink(campaign: Campaign, failed: ScenarioResult, told: bool) -> list[Scen
         CONFIRMED if confirmed else f"not confirmed: this scenario has a different result; use {small.result.reproduce}"
     )
     for line in lines if told else ():
-        data.print(f"  {line}", soft_wrap=True, markup=False, highlight=False)
+        stdout.print(f"  {line}", soft_wrap=True, markup=False, highlight=False)
     return [confirmed] if confirmed is not None else []

@@ -26,7 +26,7 @@ from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.results.subject import who
 
 if TYPE_CHECKING:
-    from fieldtwin.conformance.clients.run import Plan
+    from fieldtwin.conformance.clients.run import ClientTestOptions
     from fieldtwin.conformance.core.case import Basis, Case
     from fieldtwin.conformance.core.results import CaseResult
     from fieldtwin.emulators.modbus.bank import Table
@@ -162,17 +162,17 @@ def modbus_master(
     Exit code 0 if test cases passed and none that --fail-on counts has failed, else 1.
     """
     from fieldtwin.conformance.clients.modbus.cases import CASES
-    from fieldtwin.conformance.clients.run import Plan
+    from fieldtwin.conformance.clients.run import ClientTestOptions
     from fieldtwin.conformance.clients.session import Listener, Options, judge_modbus_master
-    from fieldtwin.conformance.core.case import Danger
+    from fieldtwin.conformance.core.case import Impact
 
     cases = [case.about for case in CASES]
     if list_only:
         return _list(cases, as_json)
     if not listen:
         raise UsageError("no endpoint to listen on", expected="--listen ENDPOINT")
-    plan = Plan(
-        only_of(only, cases), timeout_s, patience_s, wait_s, for_s, frozenset({"echo"} if echo else ()), Danger(at_most)
+    plan = ClientTestOptions(
+        only_of(only, cases), timeout_s, patience_s, wait_s, for_s, frozenset({"echo"} if echo else ()), Impact(at_most)
     )
     options = Options(
         Endpoint.parse(listen), plan, _words(values), probe, frozenset(none), _held(hold), in_ascii, command=argv
@@ -253,16 +253,16 @@ def canopen_master(
     Exit code 0 if test cases passed and none that --fail-on counts has failed, else 1.
     """
     from fieldtwin.conformance.clients.canopen.cases import CASES
-    from fieldtwin.conformance.clients.run import Plan
+    from fieldtwin.conformance.clients.run import ClientTestOptions
     from fieldtwin.conformance.clients.session import Listener, Options, judge_canopen_master
-    from fieldtwin.conformance.core.case import Danger
+    from fieldtwin.conformance.core.case import Impact
 
     cases = [case.about for case in CASES]
     if list_only:
         return _list(cases, as_json)
     if not listen:
         raise UsageError("no endpoint to listen on", expected="--listen ENDPOINT")
-    plan = Plan(only_of(only, cases), timeout_s, patience_s, wait_s, for_s, frozenset(), Danger(at_most))
+    plan = ClientTestOptions(only_of(only, cases), timeout_s, patience_s, wait_s, for_s, frozenset(), Impact(at_most))
     options = Options(
         Endpoint.parse(listen), plan, _words(values), probe, frozenset(none), command=argv, objects=_objects(hold),
         size=int(size), nodes=frozenset(nodes), heartbeat_s=heartbeat_s, bitrate=bitrate,
@@ -310,7 +310,7 @@ def _judged(
     files: Files,
     as_json: bool,
     title: str,
-    plan: Plan,
+    plan: ClientTestOptions,
     fail_on: frozenset[Basis],
     protocol: str,
 ) -> int:

@@ -22,7 +22,7 @@ from fieldtwin.gateway.core.errors import NotAllowed, UsageError
 if TYPE_CHECKING:
     from fieldtwin.conformance.devices.checked import Checked
     from fieldtwin.conformance.devices.device_case import DeviceCase, DeviceResult
-    from fieldtwin.conformance.devices.run import Plan
+    from fieldtwin.conformance.devices.run import DeviceTestOptions
     from fieldtwin.results.subject import Subject
 
 DANGERS = ("observe", "read", "write", "disrupt")
@@ -79,37 +79,39 @@ class Check:
         self.words = "fieldtwin " + shlex.join(sys.argv[1:])
         self.interrupted = False
 
-    def plan(self, cases: Sequence[DeviceCase[Any]], has: set[str], writes: bool) -> Plan:
+    def plan(self, cases: Sequence[DeviceCase[Any]], has: set[str], writes: bool) -> DeviceTestOptions:
         """Return the plan. Also read the waivers, so that an invalid file is reported before anything is sent."""
         from fieldtwin.cli.test.check_cases import only_of
-        from fieldtwin.conformance.core.case import Danger
+        from fieldtwin.conformance.core.case import Impact
         from fieldtwin.conformance.core.waivers import Waivers, load_waivers
-        from fieldtwin.conformance.devices.run import Plan
+        from fieldtwin.conformance.devices.run import DeviceTestOptions
 
         path = self.options["waivers_path"]
         known = {case.id for case in cases} | {case.row for case in cases}
         self.waivers = load_waivers(path, known) if path else Waivers()
         allow = self.options["allow"] or ("write" if writes else "read")
-        if writes and Danger(allow).rank < Danger.WRITE.rank:
+        if writes and Impact(allow).rank < Impact.WRITE.rank:
             raise UsageError("--write needs test cases that write", expected="--allow write or disrupt", got=allow)
         if self.options["i_know"]:
             has = has | {"i-know"}
-        return Plan(only_of(self.options["only"], cases), Danger(allow), frozenset(has), self.options["for_s"])
+        return DeviceTestOptions(
+            only_of(self.options["only"], cases), Impact(allow), frozenset(has), self.options["for_s"]
+        )
 
-    def ask(self, cases: Sequence[DeviceCase[Any]], plan: Plan, traits: frozenset[str]) -> None:
+    def ask(self, cases: Sequence[DeviceCase[Any]], plan: DeviceTestOptions, traits: frozenset[str]) -> None:
         """Ask before anything except reading is sent. Raises `NotAllowed` without a terminal, `Abort` if the answer is no."""
-        from fieldtwin.conformance.core.case import Danger
+        from fieldtwin.conformance.core.case import Impact
         from fieldtwin.conformance.devices.run import why_not
-        from fieldtwin.console import talk
+        from fieldtwin.console import stderr
 
         played = [c for c in cases if c.chosen(plan.only) and not why_not(c, plan, traits)]
-        risky = [c for c in played if c.danger.rank > Danger.READ.rank]
+        risky = [c for c in played if c.danger.rank > Impact.READ.rank]
         if not risky or self.options["yes"]:
             return
         for danger, means in MEANS[self.protocol].items():
             ids = [c.id for c in risky if c.danger.value == danger]
             if ids:
-                talk.print(
+                stderr.print(
                     f"{len(ids)} test cases with impact level {danger}: {means}.\n  {', '.join(ids)}", markup=False
                 )
         if not sys.stdin.isatty():
@@ -153,13 +155,13 @@ class Check:
         Ctrl-C ends it after the present test case, a second one at once; changed values are restored in any case.
         """
         from fieldtwin.cli.test.check_view import Progress
-        from fieldtwin.commissioning.access.frame_log import WireLog
-        from fieldtwin.console import talk
+        from fieldtwin.commissioning.access.frame_log import FrameLog
+        from fieldtwin.console import stderr
         from fieldtwin.gateway.wallclock import run
 
         with ExitStack() as stack:
             path = self.options["log_path"]
-            log = stack.enter_context(WireLog(path, self.words)) if path is not None else None
+            log = stack.enter_context(FrameLog(path, self.words)) if path is not None else None
             progress = stack.enter_context(Progress(most, "examining its answers"))
 
             def go_on() -> str:
@@ -175,7 +177,7 @@ class Check:
                     if self.interrupted:
                         task.cancel()
                     self.interrupted = True
-                    talk.print("ends after this test case; press Ctrl-C again to end at once", markup=False)
+                    stderr.print("ends after this test case; press Ctrl-C again to end at once", markup=False)
 
                 with suppress(NotImplementedError):  # not on Unix
                     asyncio.get_running_loop().add_signal_handler(signal.SIGINT, stop)
@@ -188,7 +190,7 @@ class Check:
                 raise KeyboardInterrupt from None
 
     def subject(
-        self, checked: Checked, plan: Plan, began: datetime, wrote: tuple[str, ...], timeout_s: float
+        self, checked: Checked, plan: DeviceTestOptions, began: datetime, wrote: tuple[str, ...], timeout_s: float
     ) -> Subject:
         from fieldtwin.results.subject import Subject, who
 
@@ -200,19 +202,19 @@ class Check:
 
     def estimate(self, on_paper: Checked) -> None:
         """Return the number of cases and their duration with a device that answers at once."""
-        from fieldtwin.console import talk
+        from fieldtwin.console import stderr
 
         played = sum(bool(result.spoken) for result in on_paper.results)
-        talk.print(
+        stderr.print(
             f"{played} cases, about {max(1, round(on_paper.took_s))} s if the device answers at once; Ctrl-C stops",
             markup=False,
         )
 
     def on_paper(self, checked: Checked) -> int:
         """Print the frames of a dry run."""
-        from fieldtwin.cli.test.check_view import print_paper
+        from fieldtwin.cli.test.check_view import print_dry_run
 
-        print_paper(checked, as_json=self.options["as_json"])
+        print_dry_run(checked, as_json=self.options["as_json"])
         return 0
 
 

@@ -55,7 +55,7 @@ def modbus(
 
     By default it sends only reads. Exit code 0 if test cases passed and none that --fail-on counts has failed, else 1.
     """
-    from fieldtwin.conformance.devices.dry_run import modbus_on_paper
+    from fieldtwin.conformance.devices.dry_run import modbus_dry_run
     from fieldtwin.conformance.devices.modbus.cases import CASES
     from fieldtwin.conformance.devices.modbus.session import ModbusOptions, check_modbus, traits_of
 
@@ -73,7 +73,7 @@ def modbus(
         endpoint, unit, plan, timeout_s, 1 / options["rate"], echo, share_bus=share_bus,
         given={table: at for table, at, _ in map(_cell, reads)}, may_write=may_write,
     )  # fmt: skip
-    on_paper = modbus_on_paper(to_do)
+    on_paper = modbus_dry_run(to_do)
     if options["dry_run"]:
         return check.on_paper(on_paper)
     check.ask(CASES, plan, traits)
@@ -130,7 +130,7 @@ def canopen(
     """
     from fieldtwin.conformance.devices.canopen.cases import CASES
     from fieldtwin.conformance.devices.canopen.session import CanopenOptions, check_canopen
-    from fieldtwin.conformance.devices.dry_run import canopen_on_paper
+    from fieldtwin.conformance.devices.dry_run import canopen_dry_run
 
     if options["list_only"]:
         return list_cases(CASES, options["as_json"])
@@ -145,7 +145,7 @@ def canopen(
     to_do = CanopenOptions(
         endpoint, node, plan, bitrate or 0, timeout_s, 1 / options["rate"], boot_s, eds, share_bus, may_write
     )
-    on_paper = canopen_on_paper(to_do)
+    on_paper = canopen_dry_run(to_do)
     if options["dry_run"]:
         return check.on_paper(on_paper)
     check.ask(CASES, plan, frozenset({"can"}))

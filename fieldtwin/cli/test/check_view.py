@@ -18,7 +18,7 @@ from rich.table import Table
 
 from fieldtwin.conformance.core.case import OTHER_WIRE, Basis
 from fieldtwin.conformance.core.results import FOUND, called
-from fieldtwin.console import data, talk
+from fieldtwin.console import stderr, stdout
 from fieldtwin.gateway.core.connection import Direction
 from fieldtwin.results.model import Verdict
 
@@ -46,8 +46,8 @@ class Progress:
 
     def __init__(self, most: int, at_first: str = "learning the polling pattern") -> None:
         self._bar = Bar(
-            TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed:.0f} cases"), console=talk,
-            transient=True, disable=not talk.is_terminal,
+            TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed:.0f} cases"), console=stderr,
+            transient=True, disable=not stderr.is_terminal,
         )  # fmt: skip
         self._task = self._bar.add_task(at_first, total=most)
 
@@ -60,7 +60,7 @@ class Progress:
 
     def say(self, text: str) -> None:
         """Print a diagnostic line."""
-        talk.print(text, markup=False, soft_wrap=True)
+        stderr.print(text, markup=False, soft_wrap=True)
 
     def tell(self, result: CaseResult) -> None:
         """Report a finished case."""
@@ -68,9 +68,9 @@ class Progress:
         if result.verdict.bad:
             mark = f"[{style_of(result)}]{MARK[result.verdict] if result.deviates else '!'}[/]"
             kind = why(result)
-            talk.print(
+            stderr.print(
                 f"{mark} {result.case.id} {escape(result.case.title)} ({escape(kind)}): {escape(result.reason)}",
-                soft_wrap=not talk.is_terminal,
+                soft_wrap=not stderr.is_terminal,
             )
 
 
@@ -96,18 +96,18 @@ def print_results(results: Sequence[CaseResult], does: str = "the device", *, al
     counts = Counter(called(r) for r in results)
     order = ("passed", *FOUND.values(), "error", "inconclusive", "skipped")
     parts = [f"[{styles[word]}]{counts[word]} {word}[/]" for word in order if counts[word]]
-    data.print(", ".join(parts) or "no case was chosen")
+    stdout.print(", ".join(parts) or "no case was chosen")
     if elsewhere:
-        talk.print(f"{len(elsewhere)} more test cases are for other kinds of bus", markup=False)
+        stderr.print(f"{len(elsewhere)} more test cases are for other kinds of bus", markup=False)
 
 
 def _print_each(results: Sequence[CaseResult], does: str) -> None:
-    if not data.is_terminal:
+    if not stdout.is_terminal:
         for r in results:
             reason = f": {r.reason}" if r.reason else ""
             reason += f" ({why(r)})" if r.deviates else ""
             line = f"{called(r):<13} {r.case.id:<7} {r.case.danger.value:<8} {r.case.title}{reason}"
-            data.print(line, markup=False, soft_wrap=True)
+            stdout.print(line, markup=False, soft_wrap=True)
     else:
         table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
         table.add_column("")
@@ -127,18 +127,18 @@ def _print_each(results: Sequence[CaseResult], does: str) -> None:
                 f"[{style}]{mark}[/]", f"[{style}]{r.case.id}[/]", f"[{DANGER[danger]}]{danger}[/]",
                 escape(r.case.title), f"[{style}]{escape(found)}[/]",
             )  # fmt: skip
-        data.print(table)
+        stdout.print(table)
 
 
 def print_cases(
     cases: Sequence[About], does: str = "what the device does", must: str = "what the master must do"
 ) -> None:
     """Print all cases for `--list`: a table, or without a terminal one line per case."""
-    if not data.is_terminal:
+    if not stdout.is_terminal:
         for case in cases:
             words = f"{case.title}: {case.does}; expected: {case.must} [{case.sources}]"
             line = f"{case.id:<7} {case.bases:<25} {case.danger.value:<8} {words}"
-            data.print(line, markup=False, soft_wrap=True)
+            stdout.print(line, markup=False, soft_wrap=True)
         return
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
     for name in ("case", "basis", "danger", does, must, "source"):
@@ -149,7 +149,7 @@ def print_cases(
             case.id, f"[{basis}]{escape(case.bases)}[/]", f"[{DANGER[danger]}]{danger}[/]", escape(case.does),
             escape(case.must), escape(case.sources),
         )  # fmt: skip
-    data.print(table)
+    stdout.print(table)
 
 
 def listed(case: About) -> dict[str, Any]:
@@ -164,7 +164,7 @@ def listed(case: About) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def print_paper(checked: Checked, *, as_json: bool) -> None:
+def print_dry_run(checked: Checked, *, as_json: bool) -> None:
     """Print the frames that a check would send, case by case, without the cases that are not run."""
     played = [r for r in checked.results if r.spoken]
     if as_json:
@@ -183,13 +183,13 @@ def print_paper(checked: Checked, *, as_json: bool) -> None:
         json.dump({"kind": "fieldtwin check dry run", "cases": cases}, sys.stdout, indent=2)
         sys.stdout.write("\n")
         return
-    data.print("before: its answers and its identification", markup=False)
+    stdout.print("before: its answers and its identification", markup=False)
     _print_sent(_sent(checked.before))
     for r in played:
         danger = r.case.danger.value
-        data.print(f"{r.case.id} [{DANGER[danger]}]{danger}[/] {escape(r.case.title)}", soft_wrap=True)
+        stdout.print(f"{r.case.id} [{DANGER[danger]}]{danger}[/] {escape(r.case.title)}", soft_wrap=True)
         _print_sent(_sent(r.spoken))
-    talk.print(
+    stderr.print(
         f"{len(played)} cases. A normal read precedes each case as well. The frames are those for a conforming device; "
         "other devices can lead to different frames.", markup=False, soft_wrap=True,
     )  # fmt: skip
@@ -203,4 +203,4 @@ def _print_sent(frames: Sequence[str]) -> None:
     """Print one frame per line; equal consecutive frames once, with their number."""
     for text, same in groupby(frames):
         times = len(list(same))
-        data.print(f"  {text}" + (f"   x {times}" if times > 1 else ""), markup=False, soft_wrap=True)
+        stdout.print(f"  {text}" + (f"   x {times}" if times > 1 else ""), markup=False, soft_wrap=True)

@@ -30,10 +30,10 @@ def bases_of(choice: str) -> frozenset[Basis]:
 def print_not_counted(results: Sequence[CaseResult], fail_on: frozenset[Basis]) -> None:
     """Print that failures are not counted, if there are any."""
     from fieldtwin.conformance.core.results import counts_as_failed
-    from fieldtwin.console import talk
+    from fieldtwin.console import stderr
 
     if any(r.verdict.bad and not counts_as_failed(r, fail_on) for r in results):
-        talk.print(
+        stderr.print(
             "The standard does not require what robustness and field problem cases ask. "
-            "The exit code does not count them: see --fail-on.", markup=False, soft_wrap=not talk.is_terminal,
+            "The exit code does not count them: see --fail-on.", markup=False, soft_wrap=not stderr.is_terminal,
         )  # fmt: skip

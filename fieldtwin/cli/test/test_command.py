@@ -22,8 +22,8 @@ from fieldtwin.__about__ import __version__
 from fieldtwin.cli.campaign_options import CampaignRequest, campaign_options
 from fieldtwin.cli.options import Secret, json_option, junit_flavour_option, profiles_option
 from fieldtwin.cli.template_question import consent, trust_option
-from fieldtwin.conformance.core.case import Danger
-from fieldtwin.console import data, show_warnings
+from fieldtwin.conformance.core.case import Impact
+from fieldtwin.console import show_warnings, stdout
 from fieldtwin.gateway.core.errors import UsageError
 
 if TYPE_CHECKING:
@@ -57,8 +57,8 @@ class _WithCommand(click.Command):
 )
 @click.option(
     "--allow",
-    type=click.Choice([danger.value for danger in Danger]),
-    default=Danger.READ.value,
+    type=click.Choice([danger.value for danger in Impact]),
+    default=Impact.READ.value,
     show_default=True,
     help="With --target real: highest impact level of steps.",
 )
@@ -170,7 +170,7 @@ def command(
     if trace and len(paths) != 1:
         raise UsageError("--trace needs a single scenario", got=f"{len(paths)} of them")
     _check(target, allow, instance, far, capture, can)
-    if retries and target == "real" and Danger(allow).rank > Danger.READ.rank:
+    if retries and target == "real" and Impact(allow).rank > Impact.READ.rank:
         raise UsageError(
             "--retry-inconclusive would repeat a scenario's writes to a plant",
             expected="--allow read, or no retries",
@@ -191,7 +191,7 @@ def command(
         token,
         far,
         Path(capture) if capture else None,
-        Danger(allow),
+        Impact(allow),
         can,
         controller,
     )
@@ -238,7 +238,7 @@ def command(
         json.dump([_plain(result) for result in results], sys.stdout, indent=2)
         sys.stdout.write("\n")
     else:
-        data.print(f"[bold]{_counts(seeds or results, 'seeds: ' if seeds else '')}[/bold]")
+        stdout.print(f"[bold]{_counts(seeds or results, 'seeds: ' if seeds else '')}[/bold]")
     return 0 if all_well(results) else 1
 
 
@@ -296,7 +296,7 @@ def _controller(target: str, with_command: bool) -> tuple[str, tuple[str, ...]]:
 def _check(target: str, allow: str, instance: str, far: str, capture: str | None, can: str) -> None:
     if can and target != "local":
         raise UsageError("--can needs --target local", got=f"--target {target}")
-    if target != "real" and (far or allow != Danger.READ.value):
+    if target != "real" and (far or allow != Impact.READ.value):
         raise UsageError("--far and --allow need --target real", got=f"--target {target}")
     if target in ("virtual", "local") and instance:
         raise UsageError("--instance names a running instance", expected="--target compose or real")
@@ -322,20 +322,20 @@ def _show(result: object) -> None:
     assert isinstance(result, ScenarioResult)
     colour = _COLOUR[result.verdict.value]
     took = f"[dim]{round(result.simulated_s, 3):g} s in {result.took_s:.1f} s[/dim]"
-    data.print(f"[{colour}]{result.verdict.value}[/{colour}]  {escape(result.title)}  {took}", soft_wrap=True)
+    stdout.print(f"[{colour}]{result.verdict.value}[/{colour}]  {escape(result.title)}  {took}", soft_wrap=True)
     for n, reason in enumerate(result.earlier, 1):
-        data.print(f"  attempt {n} of {result.attempts} was inconclusive: {escape(reason)}", soft_wrap=True)
+        stdout.print(f"  attempt {n} of {result.attempts} was inconclusive: {escape(reason)}", soft_wrap=True)
     for check in result.checks:
         if check.reason and check.verdict is Verdict.PASSED:
-            data.print(f"  {check.number}: {escape(check.reason)}", soft_wrap=True)
+            stdout.print(f"  {check.number}: {escape(check.reason)}", soft_wrap=True)
         if check.verdict is Verdict.SKIPPED and result.verdict is Verdict.PASSED:
-            data.print(f"  {check.number} skipped: {escape(check.got or check.reason)}", soft_wrap=True)
+            stdout.print(f"  {check.number} skipped: {escape(check.got or check.reason)}", soft_wrap=True)
     for fault in result.faults:
-        data.print(f"  fault {escape(fault.text)}", soft_wrap=True, highlight=False)
+        stdout.print(f"  fault {escape(fault.text)}", soft_wrap=True, highlight=False)
     if result.verdict is Verdict.PASSED:
         return
     if result.reason:
-        data.print(f"  {escape(result.reason)}", soft_wrap=True)
+        stdout.print(f"  {escape(result.reason)}", soft_wrap=True)
     table = Table(box=None, show_header=False, pad_edge=False)
     for check in result.checks:
         if check.verdict is not Verdict.PASSED:
@@ -346,10 +346,10 @@ def _show(result: object) -> None:
             table.add_row("  got", escape(check.got))
             table.add_row("  at", f"{(check.t_ns or 0) / 1e9:.3f} s, {escape(check.where)}")
     if table.row_count:
-        data.print(table)
+        stdout.print(table)
     for n, line in enumerate(result.evidence):
-        data.print(f"  {'  ' if n else ''}{escape(line)}", soft_wrap=True, highlight=False)
-    data.print(f"  {escape(result.reproduce)}", soft_wrap=True)
+        stdout.print(f"  {'  ' if n else ''}{escape(line)}", soft_wrap=True, highlight=False)
+    stdout.print(f"  {escape(result.reproduce)}", soft_wrap=True)
 
 
 def _plain(result: object) -> dict[str, object]:

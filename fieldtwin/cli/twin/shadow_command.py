@@ -13,7 +13,7 @@ import click
 from rich.markup import escape
 
 from fieldtwin.cli.options import Duration, json_option, profiles_option
-from fieldtwin.console import talk
+from fieldtwin.console import stderr
 from fieldtwin.gateway.core.concurrency.stop_signal import stop_signal
 from fieldtwin.gateway.core.errors import Unreachable
 from fieldtwin.run.shadow.shadow import Shadowing
@@ -42,7 +42,7 @@ class ShadowTalk:
         style = STYLE.get(verdict.finding, "")
         word = f"[{style}]{verdict.finding:10}[/]" if style else f"{verdict.finding:10}"
         subject = f"{verdict.subject}: " if not verdict.text.startswith(verdict.subject) else ""
-        talk.print(f"{when} {word} {escape(subject + verdict.text)}", soft_wrap=True)
+        stderr.print(f"{when} {word} {escape(subject + verdict.text)}", soft_wrap=True)
 
     def trouble(self, where: str, text: str) -> None:
         """Print the problems of thread or store once, and their end."""
@@ -51,7 +51,7 @@ class ShadowTalk:
 
     def line(self, word: str, text: str) -> None:
         """Print a line with the present time; `word` is its label."""
-        talk.print(f"{_clock(datetime.now(UTC))} {word} {escape(text)}", soft_wrap=True)
+        stderr.print(f"{_clock(datetime.now(UTC))} {word} {escape(text)}", soft_wrap=True)
 
 
 def _clock(when: datetime) -> str:
@@ -109,7 +109,7 @@ async def _run(
     shadowing = Shadowing(system, place, instance, store=store, on_verdict=talks)
     shadowing.on_trouble = talks.trouble
     if not as_json:
-        talk.print(f"[bold]shadow[/bold] of {system.name}, from {escape(place)}", soft_wrap=True)
+        stderr.print(f"[bold]shadow[/bold] of {system.name}, from {escape(place)}", soft_wrap=True)
     await shadowing.run(stop, duration_s)
     return shadowing.describe()
 
@@ -156,4 +156,4 @@ def print_shadow(seen: dict[str, Any]) -> None:
         lines.append(("store", seen["store_trouble"]))
     lines += [("wrong now", f"{name}: {', '.join(what)}") for name, what in seen["wrong"].items()]
     for name, text in lines:
-        talk.print(f"  {name:10} {escape(text)}", soft_wrap=True)
+        stderr.print(f"  {name:10} {escape(text)}", soft_wrap=True)

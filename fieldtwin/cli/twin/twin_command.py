@@ -13,7 +13,7 @@ import click
 from fieldtwin.cli.options import Duration, json_option, profiles_option
 from fieldtwin.cli.template_question import consent, trust_option
 from fieldtwin.cli.twin.shadow_command import ShadowTalk, print_shadow, why_nothing
-from fieldtwin.console import talk
+from fieldtwin.console import stderr
 from fieldtwin.gateway.core.concurrency.stop_signal import stop_signal
 from fieldtwin.gateway.core.errors import Unreachable, UsageError
 from fieldtwin.gateway.core.statemachine import decode_period, encode_period
@@ -137,7 +137,7 @@ def command(
         asked = f", {seen['asked']} simulated" if questions else ""
         there = f", {seen['refused_by_plant']} refused by the plant" if seen["refused_by_plant"] else ""
         counts = f"{seen['planned']} planned{asked}, {seen['sent']} sent, {seen['refused']} refused{there}"
-        talk.print(f"  commands   {counts}", soft_wrap=True)
+        stderr.print(f"  commands   {counts}", soft_wrap=True)
     if not seen["origins"]:
         raise Unreachable(f"the plant's thread: {why_nothing(seen, place)}", where=place)
     return 0 if seen["agreed"] == seen["statuses"] else 1
@@ -183,6 +183,6 @@ async def _run(
         await asking.check(questions)
     stop = stop_signal()
     if not as_json:
-        talk.print(f"[bold]twin[/bold] of {system.name}, opposite {place}", soft_wrap=True, markup=True)
+        stderr.print(f"[bold]twin[/bold] of {system.name}, opposite {place}", soft_wrap=True, markup=True)
     await twinning.run(stop, duration_s)
     return twinning.describe()

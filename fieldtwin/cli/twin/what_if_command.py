@@ -13,7 +13,7 @@ from rich.markup import escape
 from fieldtwin.cli.options import Duration, json_option, profiles_option
 from fieldtwin.cli.template_question import consent, trust_option
 from fieldtwin.cli.twin.what_if_view import show
-from fieldtwin.console import data, talk
+from fieldtwin.console import stderr, stdout
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.gateway.core.files.input_file import open_input
 from fieldtwin.run.template import system_file
@@ -81,11 +81,11 @@ def command(
     """
     from fieldtwin.run.what_if.fork import Fork
     from fieldtwin.run.what_if.many import answers
-    from fieldtwin.run.what_if.plan import Plan, in_words, load_plans
+    from fieldtwin.run.what_if.plan import WhatIfPlan, in_words, load_plans
     from fieldtwin.run.what_if.plan import command as parsed
     from fieldtwin.twin.site.system import load_system
 
-    plans: list[Plan] = []
+    plans: list[WhatIfPlan] = []
     if plan_file is not None:
         named, plans = load_plans(plan_file)
         beside = plan_file.parent / named
@@ -104,14 +104,14 @@ def command(
             raise FileInvalid(f"cannot be written: {e.strerror or e}", path=str(save_state)) from e
         values, programs = len(state.values), len(state.programs)
         told = f"{values} value{'s'[: values != 1]} and what {programs} program{'s'[: programs != 1]} hold{'s'[: programs == 1]}"
-        talk.print(f"{told} → {escape(str(save_state))}", soft_wrap=True)
+        stderr.print(f"{told} → {escape(str(save_state))}", soft_wrap=True)
         return 0
     if commands or require or finally_ or fault_file or not plans:
         faults = _faults(fault_file, loaded)
         own = tuple(parsed(c) for c in commands)
-        plans.append(Plan(in_words(own, faults), own, faults, require, finally_))
+        plans.append(WhatIfPlan(in_words(own, faults), own, faults, require, finally_))
     fork = Fork(system, state, horizon_s, folders, prototype_file, seed, settle_s)
-    talk.print(
+    stderr.print(
         f"{loaded.name}: {len(plans)} plan{'s'[: len(plans) != 1]}, {_ahead(horizon_s)} ahead, from {escape(state.source)}",
         soft_wrap=True,
     )
@@ -119,7 +119,7 @@ def command(
         fork,
         plans,
         jobs,
-        lambda o: talk.print(f"  {escape(o.plan)}: {'met' if o.met else 'not met'}, {o.took_s:.1f} s"),
+        lambda o: stderr.print(f"  {escape(o.plan)}: {'met' if o.met else 'not met'}, {o.took_s:.1f} s"),
     )
     if as_json:
         found: dict[str, Any] = {
@@ -131,7 +131,7 @@ def command(
         click.echo(json.dumps(found | {"outcomes": [o.described() for o in outcomes]}, indent=1))
     else:
         units = {f"{d.name}.{t.name}": t.unit or "" for d in loaded.devices.values() for t in d.profile.tags.values()}
-        show(data, outcomes, units)
+        show(stdout, outcomes, units)
     return 0 if any(o.met for o in outcomes) else 1
 
 

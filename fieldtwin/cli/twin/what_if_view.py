@@ -9,12 +9,12 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from fieldtwin.run.what_if.outcome import Outcome
+from fieldtwin.run.what_if.outcome import PlanOutcome
 
 _SHOWN = 40
 
 
-def show(console: Console, outcomes: Sequence[Outcome], units: Mapping[str, str]) -> None:
+def show(console: Console, outcomes: Sequence[PlanOutcome], units: Mapping[str, str]) -> None:
     """Print each plan: its verdict, requirements, states and variables. `units` by tag name."""
     for outcome in outcomes:
         console.print()
@@ -38,7 +38,7 @@ def show(console: Console, outcomes: Sequence[Outcome], units: Mapping[str, str]
         console.print(_table(outcome, units))
 
 
-def _table(outcome: Outcome, units: Mapping[str, str]) -> Table:
+def _table(outcome: PlanOutcome, units: Mapping[str, str]) -> Table:
     table = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 1, 0, 0))
     table.add_column("variable", no_wrap=True)
     table.add_column("unit", no_wrap=True)

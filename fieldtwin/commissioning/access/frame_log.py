@@ -21,7 +21,7 @@ from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.wallclock import WallClock
 
 
-class WireLog(Tap):
+class FrameLog(Tap):
     """A log that appends to `path`, a session at a time; a line is handed to the operating system when the call returns.
 
     At most `max_bytes` a session: then `full` is True and nothing more is written. A command that may only send logged

@@ -48,7 +48,7 @@ PROBES: tuple[tuple[int, Request[Any]], ...] = (
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class AskResult:
     """The result of a question.
 
     `us` is the time in microseconds from the question to the last byte of the answer, `requests` the number of requests
@@ -63,11 +63,11 @@ class Asked:
 class Asker(Protocol):
     """Asks one device."""
 
-    async def read(self, asked: RegisterRange | ObjectKey, *, patient: bool = True) -> Asked:
+    async def read(self, asked: RegisterRange | ObjectKey, *, patient: bool = True) -> AskResult:
         """Read a range or an object, without any retry unless `patient`. Raises only errors that end the connection."""
         ...
 
-    async def function(self, request: Request[Any]) -> Asked:
+    async def function(self, request: Request[Any]) -> AskResult:
         """Send that request."""
         ...
 
@@ -86,12 +86,12 @@ class ModbusAsker:
         self._retries, self._spacing_ns = retries, round(spacing_s * NS_PER_S)
         self._free_ns = 0
 
-    async def read(self, asked: RegisterRange | ObjectKey, *, patient: bool = True) -> Asked:
+    async def read(self, asked: RegisterRange | ObjectKey, *, patient: bool = True) -> AskResult:
         if not isinstance(asked, RegisterRange):
             raise Bug("a unit has registers", got=str(asked))
         return await self._patiently(lambda: self._read(asked), self._retries if patient else 0)
 
-    async def function(self, request: Request[Any]) -> Asked:
+    async def function(self, request: Request[Any]) -> AskResult:
         async def once() -> tuple[bytes, int]:
             reply = await self._client.execute(self._unit, request)
             return reply.raw, reply.t_ns
@@ -105,7 +105,7 @@ class ModbusAsker:
         reply = await self._client.read_registers(self._unit, at.table, at.address, at.count)
         return reply.raw, reply.t_ns
 
-    async def _patiently(self, once: Callable[[], Awaitable[tuple[bytes, int]]], retries: int) -> Asked:
+    async def _patiently(self, once: Callable[[], Awaitable[tuple[bytes, int]]], retries: int) -> AskResult:
         lost = busy = 0
         invalid: WireError | None = None
         first_ns = self._clock.monotonic_ns()
@@ -118,7 +118,7 @@ class ModbusAsker:
                 if e.code in (NO_PATH, NO_TARGET):
                     raise  # a gateway speaks, and not the device
                 if e.code not in (ACKNOWLEDGE, BUSY) or busy >= MOST_BUSY:
-                    return Asked(Refused(e.code), self._us(asked_ns), lost + busy + 1)
+                    return AskResult(Refused(e.code), self._us(asked_ns), lost + busy + 1)
                 busy += 1
                 await self._clock.sleep_until_ns(self._clock.monotonic_ns() + round(BUSY_WAIT_S * NS_PER_S))
             except (ReplyTimeout, CrcError, Desync) as e:
@@ -126,9 +126,9 @@ class ModbusAsker:
                 if not isinstance(e, ReplyTimeout):
                     invalid = e
                 if lost > retries:
-                    return Asked(_without_result(invalid or e), self._us(first_ns), lost + busy)
+                    return AskResult(_without_result(invalid or e), self._us(first_ns), lost + busy)
             else:
-                return Asked(Taken(raw), max(0, t_ns - asked_ns) // 1000, lost + busy + 1)
+                return AskResult(Taken(raw), max(0, t_ns - asked_ns) // 1000, lost + busy + 1)
             finally:
                 self._free_ns = self._clock.monotonic_ns() + self._spacing_ns
 
@@ -152,7 +152,7 @@ class CanopenAsker:
         self._master, self._node, self._clock = master, node, clock
         self._retries, self._spacing_ns = retries, round(spacing_s * NS_PER_S)
 
-    async def read(self, asked: RegisterRange | ObjectKey, *, patient: bool = True) -> Asked:
+    async def read(self, asked: RegisterRange | ObjectKey, *, patient: bool = True) -> AskResult:
         if not isinstance(asked, ObjectKey):
             raise Bug("a node has objects", got=str(asked))
         lost = 0
@@ -173,7 +173,7 @@ class CanopenAsker:
             if self._spacing_ns:
                 await self._clock.sleep_until_ns(now_ns + self._spacing_ns)
             if not failed or lost > (self._retries if patient else 0):
-                return Asked(outcome, (now_ns - asked_ns) // 1000, lost + (not failed))
+                return AskResult(outcome, (now_ns - asked_ns) // 1000, lost + (not failed))
 
-    async def function(self, request: Request[Any]) -> Asked:
+    async def function(self, request: Request[Any]) -> AskResult:
         raise Bug("a node has no functions", got=str(request))

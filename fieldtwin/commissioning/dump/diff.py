@@ -29,7 +29,7 @@ NOTHING_WRONG = (0x0800_0024, 0x0800_0022, 0x0800_0021)
 
 
 @dataclass(frozen=True, slots=True)
-class Difference:
+class DumpDifference:
     """A difference of `name` at `at`: the two sides and the kind of the difference."""
 
     kind: str
@@ -46,7 +46,7 @@ class Differences:
     `compared` counts the values and objects that were compared, `notes` are remarks that are not differences.
     """
 
-    found: list[Difference] = field(default_factory=list)
+    found: list[DumpDifference] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     compared: int = 0
 
@@ -101,9 +101,9 @@ def diff_dumps(
             if not _refused(left if a is None else right, cells):
                 alone += 1
                 continue
-            out.found.append(Difference("not in both", tag.name, place(tag), _shown(tag, a), _shown(tag, b)))
+            out.found.append(DumpDifference("not in both", tag.name, place(tag), _shown(tag, a), _shown(tag, b)))
         elif not leave.near(tag, a, b):
-            out.found.append(Difference("value", tag.name, place(tag), _shown(tag, a), _shown(tag, b)))
+            out.found.append(DumpDifference("value", tag.name, place(tag), _shown(tag, a), _shown(tag, b)))
         out.compared += 1
     if not leave.settings:
         alone += _diff_unnamed(out, left, right, named, leave)
@@ -128,7 +128,7 @@ def diff_profile(dump: Dump, profile: DeviceProfile, leave: Leave | None = None)
             if not _refused(dump, cells_of(tag)):
                 out.notes.append(f"{tag.name} ({place(tag)}) {_why_not(dump, cells_of(tag))}")
                 continue
-            out.found.append(Difference("not there", tag.name, place(tag), "cannot be read", "read by the profile"))
+            out.found.append(DumpDifference("not there", tag.name, place(tag), "cannot be read", "read by the profile"))
         else:
             out.found += _implausible(tag, value)
     _diff_limits(out, dump, profile)
@@ -154,17 +154,17 @@ def diff_dictionary(dump: Dump, dictionary: ObjectDictionary) -> Differences:
                 continue
             said = "not there" if code == NOT_THERE else "refused"
             out.found.append(
-                Difference(said, entry.name, at, f"aborted with {code:08X}h", f"{entry.access} in the EDS")
+                DumpDifference(said, entry.name, at, f"aborted with {code:08X}h", f"{entry.access} in the EDS")
             )
             continue
         raw = last.cells[cell]
         try:
             value = decode(entry.type_code, raw)
         except LengthMismatch as e:
-            out.found.append(Difference("length", entry.name, at, f"{len(raw)} bytes", e.expected))
+            out.found.append(DumpDifference("length", entry.name, at, f"{len(raw)} bytes", e.expected))
             continue
         if entry.access == "const" and entry.default is not None and value != entry.default:
-            out.found.append(Difference("constant", entry.name, at, str(value), str(entry.default)))
+            out.found.append(DumpDifference("constant", entry.name, at, str(value), str(entry.default)))
     unknown = [c for c in last.cells if c not in dictionary.entries]
     if unknown:
         first = ", ".join(f"{i:04X}h:{s:02X}" for i, s in sorted(unknown)[:8])
@@ -245,7 +245,7 @@ def _diff_unnamed(out: Differences, left: Dump, right: Dump, named: set[Cell], l
         out.compared += 1
         if a != b:
             kind = "value" if a is not None and b is not None else "not in both"
-            out.found.append(Difference(kind, name, name, _hex(a), _hex(b)))
+            out.found.append(DumpDifference(kind, name, name, _hex(a), _hex(b)))
     return alone
 
 
@@ -255,14 +255,14 @@ def _hex(raw: bytes | None) -> str:
     return f"{raw.hex()}h" + (f" ({int.from_bytes(raw)})" if len(raw) == 2 else "")
 
 
-def _implausible(tag: Tag, value: TagValue) -> list[Difference]:
+def _implausible(tag: Tag, value: TagValue) -> list[DumpDifference]:
     if value.reason in (Reason.OUT_OF_RANGE, Reason.NOT_A_NUMBER):
         limits = f"{tag.range[0]:g} to {tag.range[1]:g} {tag.unit}".rstrip() if tag.range else f"a {tag.type}"
-        return [Difference(str(value.reason), tag.name, place(tag), _shown(tag, value), limits)]
+        return [DumpDifference(str(value.reason), tag.name, place(tag), _shown(tag, value), limits)]
     states = dict(tag.values)
     if states and isinstance(value.value, int) and value.value not in states:
         names = ", ".join(f"{n} {text}" for n, text in states.items())
-        return [Difference("unknown state", tag.name, place(tag), str(value.value), names)]
+        return [DumpDifference("unknown state", tag.name, place(tag), str(value.value), names)]
     return []
 
 
@@ -291,11 +291,11 @@ def _diff_access(out: Differences, left: Dump, right: Dump) -> None:
     for table in left.maps.keys() & right.maps.keys():
         a, b = left.maps[table], right.maps[table]
         if a.get("limit_proved") and b.get("limit_proved") and a["max_read"] != b["max_read"]:
-            out.found.append(Difference("longest read", table, "", str(a["max_read"]), str(b["max_read"])))
+            out.found.append(DumpDifference("longest read", table, "", str(a["max_read"]), str(b["max_read"])))
     for number in sorted(left.functions.keys() & right.functions.keys()):
         had, has = _access(left.functions[number]), _access(right.functions[number])
         if had != has:
-            out.found.append(Difference("function", f"{number:02X}h", "", had, has))
+            out.found.append(DumpDifference("function", f"{number:02X}h", "", had, has))
 
 
 def _access(line: Mapping[str, object]) -> str:
@@ -312,10 +312,10 @@ def _diff_limits(out: Differences, dump: Dump, profile: DeviceProfile) -> None:
         words = table in ("holding", "input")
         if words and line.get("limit_proved") and longest < limits.read_registers:
             said = f"{limits.read_registers} in `limits: read_registers`"
-            out.found.append(Difference("longest read", table, "", str(longest), said))
+            out.found.append(DumpDifference("longest read", table, "", str(longest), said))
         function = READ_FUNCTION[table]  # type: ignore[index]
         if limits.functions is not None and function in limits.functions and "01" in line.get("codes", {}):
-            out.found.append(Difference("function", f"{function:02X}h", "", "not there", "in `limits: functions`"))
+            out.found.append(DumpDifference("function", f"{function:02X}h", "", "not there", "in `limits: functions`"))
     holes = [h for table in dump.maps for h in dump.holes(table)]
     sweep = ProfileSweep(profile, dumped_tags(profile)[0])
     for read in sweep.plan.reads:
@@ -324,7 +324,7 @@ def _diff_limits(out: Differences, dump: Dump, profile: DeviceProfile) -> None:
             first = over[0]
             missing = f"no read over {first}"
             out.found.append(
-                Difference("gap", ", ".join(t.name for t in read.tags[:3]), str(first), "refused", missing)
+                DumpDifference("gap", ", ".join(t.name for t in read.tags[:3]), str(first), "refused", missing)
             )
 
 

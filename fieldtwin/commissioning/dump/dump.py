@@ -12,9 +12,9 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Any
 
-from fieldtwin.commissioning.access.frame_log import WireLog
+from fieldtwin.commissioning.access.frame_log import FrameLog
 from fieldtwin.commissioning.access.reading import Target
-from fieldtwin.commissioning.dump.asking import PROBES, Asked, Asker
+from fieldtwin.commissioning.dump.asking import PROBES, Asker, AskResult
 from fieldtwin.commissioning.dump.beyond import beyond_silence, other_lengths
 from fieldtwin.commissioning.dump.file import (
     TABLES,
@@ -131,7 +131,7 @@ class Dumper:
         asker: Asker,
         clock: Clock,
         writer: DumpWriter,
-        log: WireLog | None = None,
+        log: FrameLog | None = None,
         earlier: Dump | None = None,
         progress: Progress = lambda done, total, requests: None,
     ) -> None:
@@ -260,10 +260,10 @@ class Dumper:
         self._count(_function(asked), line)
         return outcome
 
-    async def _ask(self, question: Callable[[], Any]) -> Asked:
+    async def _ask(self, question: Callable[[], Any]) -> AskResult:
         if self._log is not None and self._log.full:
             raise FileInvalid("the log of sent frames is full", path=str(self._log.path), hint="move it, then --resume")
-        asked: Asked = await question()
+        asked: AskResult = await question()
         self.result.requests += asked.requests
         return asked
 
@@ -333,7 +333,7 @@ def _map_line(found: TableMap) -> dict[str, Any]:
     }
 
 
-def _line(asked: Asked) -> dict[str, Any]:
+def _line(asked: AskResult) -> dict[str, Any]:
     outcome = asked.outcome
     if isinstance(outcome, Taken):
         return {"hex": outcome.raw.hex(), "us": asked.us}

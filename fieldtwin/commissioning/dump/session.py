@@ -12,7 +12,7 @@ from pathlib import Path
 
 from fieldtwin.commissioning.access.address import raw_tag
 from fieldtwin.commissioning.access.connection import canopen_at, frame_of, modbus_at
-from fieldtwin.commissioning.access.frame_log import WireLog
+from fieldtwin.commissioning.access.frame_log import FrameLog
 from fieldtwin.commissioning.access.point import CanopenPoint, read_request
 from fieldtwin.commissioning.dump.asking import Asker, CanopenAsker, ModbusAsker
 from fieldtwin.commissioning.dump.dump import Dumper, Job, Progress, Result, check_resumable, started
@@ -160,7 +160,7 @@ async def dump(
     timing = target.profile.form.timing if target.profile is not None else None
     timeout_s = max(target.timeout_s, (timing.timeout_ms or 0) / 1000 if timing is not None else 0.0)
     spacing_s = max(spacing_s, timing.spacing_ms / 1000 if timing is not None else 0.0)
-    with WireLog(log_path(out), words, clock) as log:
+    with FrameLog(log_path(out), words, clock) as log:
         if target.protocol == "canopen":
             async with canopen_at(
                 target.url, target.bitrate, sdo_timeout_s=timeout_s, taps=[log], connector=connector, clock=clock
@@ -175,7 +175,7 @@ async def dump(
 
 
 async def _run(
-    job: Job, asker: Asker, clock: Clock, out: Path, earlier: Dump | None, log: WireLog, progress: Progress
+    job: Job, asker: Asker, clock: Clock, out: Path, earlier: Dump | None, log: FrameLog, progress: Progress
 ) -> Result:
     resume_at = earlier.whole_bytes if earlier is not None else 0 if out.exists() and not out.stat().st_size else None
     writer = DumpWriter(out, resume_at=resume_at)

@@ -82,7 +82,7 @@ class Candidate:
 
 
 @dataclass(frozen=True, slots=True)
-class Reading:
+class ProfileReading:
     """A tag that was read for a profile: its value, or the problem. `refused`: the device refused the read."""
 
     tag: Tag
@@ -134,7 +134,7 @@ def contradicted(profile: DeviceProfile, clues: ModbusClues) -> str:
     return ""
 
 
-def judge_modbus(profile: DeviceProfile, clues: ModbusClues, readings: Mapping[str, Reading]) -> Candidate:
+def judge_modbus(profile: DeviceProfile, clues: ModbusClues, readings: Mapping[str, ProfileReading]) -> Candidate:
     """Return the certainty that the unit is a device of `profile`.
 
     `readings`: tags of its `identify`, and others, by name.
@@ -169,7 +169,7 @@ def judge_modbus(profile: DeviceProfile, clues: ModbusClues, readings: Mapping[s
 
 
 def _own_words(
-    profile: DeviceProfile, clues: ModbusClues, readings: Mapping[str, Reading]
+    profile: DeviceProfile, clues: ModbusClues, readings: Mapping[str, ProfileReading]
 ) -> tuple[list[str], list[str], bool]:
     """Compare the unit's identification with `profile`'s: reasons for, doubts, and whether they prove it."""
     reasons: list[str] = []
@@ -216,7 +216,7 @@ def _model_holds(profile: DeviceProfile, found: SunSpec, number: int) -> str:
     return f"model {number}" if inside and tags else ""
 
 
-def _keys(profile: DeviceProfile, readings: Mapping[str, Reading]) -> tuple[list[str], list[str]]:
+def _keys(profile: DeviceProfile, readings: Mapping[str, ProfileReading]) -> tuple[list[str], list[str]]:
     """Check the `identify` entries of the profile: reasons for, and contradictions that rule it out."""
     good: list[str] = []
     wrong: list[str] = []
@@ -245,7 +245,7 @@ def _keys(profile: DeviceProfile, readings: Mapping[str, Reading]) -> tuple[list
     return good, wrong
 
 
-def _plausibility(readings: Iterable[Reading]) -> tuple[list[str], list[str]]:
+def _plausibility(readings: Iterable[ProfileReading]) -> tuple[list[str], list[str]]:
     """Return the plausible values, out of those that could have been implausible, and the implausible ones."""
     signs: list[str] = []
     nonsense: list[str] = []
@@ -258,7 +258,7 @@ def _plausibility(readings: Iterable[Reading]) -> tuple[list[str], list[str]]:
     return signs, nonsense
 
 
-def _sense(reading: Reading) -> int:
+def _sense(reading: ProfileReading) -> int:
     """Return 1 for a plausible value that could have been implausible, -1 for an implausible one, 0 for no evidence."""
     tag = reading.tag
     if reading.value is None:
@@ -280,7 +280,7 @@ def _sense(reading: Reading) -> int:
     return 0
 
 
-def _shown(reading: Reading) -> str:
+def _shown(reading: ProfileReading) -> str:
     if reading.value is None:
         return f"{reading.tag.name} cannot be read: {reading.problem}"
     return f"{reading.tag.name} would be {reading.value.value!r}"

@@ -12,7 +12,7 @@ from fieldtwin.commissioning.identify import sunspec
 from fieldtwin.commissioning.identify.matching import (
     Candidate,
     ModbusClues,
-    Reading,
+    ProfileReading,
     SunSpec,
     Sureness,
     certain,
@@ -215,7 +215,7 @@ def _telling(tag: Tag) -> int:
     return 0 if tag.type.startswith("float") else 1 if tag.values or tag.range is not None else 2
 
 
-async def _read(point: ModbusPoint, tags: Sequence[Tag]) -> dict[str, Reading]:
+async def _read(point: ModbusPoint, tags: Sequence[Tag]) -> dict[str, ProfileReading]:
     if not tags:
         return {}
     readings = {}
@@ -224,5 +224,5 @@ async def _read(point: ModbusPoint, tags: Sequence[Tag]) -> dict[str, Reading]:
         if tag is not None:
             refused = answer.value.reason is Reason.REFUSED
             value = None if answer.problem else answer.value
-            readings[name] = Reading(tag, value, answer.problem, refused)
+            readings[name] = ProfileReading(tag, value, answer.problem, refused)
     return readings

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from fieldtwin.commissioning.dump.coverage import STATE_KEYS, STATE_NAMES
 from fieldtwin.commissioning.dump.file import Dump
-from fieldtwin.commissioning.infer.fields import Level, Reading
+from fieldtwin.commissioning.infer.fields import Interpretation, Level
 from fieldtwin.commissioning.infer.infer import BIT_TABLES, Inference, Series
 from fieldtwin.commissioning.infer.joint import toggled_bits
 from fieldtwin.gateway.core.files.profile import DeviceProfile, RegisterRange, gap_text, resolve
@@ -53,12 +53,12 @@ def checked(text: str, path: Path) -> DeviceProfile:
     return resolve(parse(text, str(path)))
 
 
-def tag_name(reading: Reading) -> str:
+def tag_name(reading: Interpretation) -> str:
     """Return a preliminary name such as ``input_12``, for the user to replace."""
     return f"{reading.table}_{reading.address}"
 
 
-def doubts(reading: Reading) -> str:
+def doubts(reading: Interpretation) -> str:
     """Return one line with the certainty, the alternatives, and other remarks."""
     parts = [f"{reading.level}" if reading.level is Level.CERTAIN else f"{reading.level} ({_percent(reading)})"]
     if reading.level is Level.UNKNOWN:
@@ -78,11 +78,11 @@ def doubts(reading: Reading) -> str:
     return "; ".join(p for p in parts if p)
 
 
-def _percent(reading: Reading) -> str:
+def _percent(reading: Interpretation) -> str:
     return f"{min(99, int(100 * reading.probability))} %"
 
 
-def _seen(reading: Reading) -> str:
+def _seen(reading: Interpretation) -> str:
     if reading.type == "string":
         return f"{reading.values[0]!r}".replace("#", "")
     numbers = [float(v) for v in reading.values]
@@ -90,7 +90,7 @@ def _seen(reading: Reading) -> str:
     return f"always {low:.6g}" if low == high else f"{low:.6g} to {high:.6g}"
 
 
-def _tag(reading: Reading) -> list[str]:
+def _tag(reading: Interpretation) -> list[str]:
     """Return the lines of one value. One of unknown type is a plain number for each of its registers."""
     if reading.level is Level.UNKNOWN and reading.type != "uint16":
         return [
@@ -112,7 +112,7 @@ def _tag(reading: Reading) -> list[str]:
     return [f"  {tag_name(reading)}: {{{', '.join(keys)}}}  # {doubts(reading)}", *_flags(reading)]
 
 
-def _flags(reading: Reading) -> list[str]:
+def _flags(reading: Interpretation) -> list[str]:
     """Return a tag for each bit of a status word that changed."""
     if "bits" not in reading.marks:
         return []

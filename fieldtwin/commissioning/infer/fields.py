@@ -48,7 +48,7 @@ class Level(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Reading:
+class Interpretation:
     """A stretch of registers read as one value. `probability` against all others; `rivals` the next best, best first.
 
     `model` is the probability before calibration (`calibration`), None if not calibrated. `sign_open`: no value
@@ -125,7 +125,7 @@ def run_of(table: str, address: int, words: Sequence[Sequence[int]]) -> Run:
     return Run(table, address, words, [t for start in range(len(words)) for t in _tiles(words, start)])
 
 
-def infer_run(run: Run, orders: Mapping[str, float] = ORDER_COST, single_cost: float = 0.0) -> list[Reading]:
+def infer_run(run: Run, orders: Mapping[str, float] = ORDER_COST, single_cost: float = 0.0) -> list[Interpretation]:
     """Return the most probable tiling of a run.
 
     `orders`: the cost of each order; `single_cost`: the additional cost of a value of one register.
@@ -233,7 +233,7 @@ def _reading(
     tile: _Tile,
     share: float,
     covering: Sequence[tuple[float, _Tile]],
-) -> Reading:
+) -> Interpretation:
     rows = list(zip(*words[tile.start : tile.end], strict=True))
     values: tuple[float | str, ...]
     if tile.type == "string":
@@ -246,7 +246,7 @@ def _reading(
     others = sorted(((w, t) for w, t in covering if t is not tile and w not in same), key=lambda x: -x[0])[:3]
     rivals = tuple((t.type, address + t.start, t.order, min(1.0, math.exp(w))) for w, t in others)
     kind = tile.type if not same else f"u{tile.type.removeprefix('u')}"
-    return Reading(
+    return Interpretation(
         table,
         address + tile.start,
         tile.size,

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from fieldtwin.commissioning.dump.file import Dump
 from fieldtwin.commissioning.infer.calibration import calibrated, kind_of
 from fieldtwin.commissioning.infer.costs import ORDER_COST, decode_series
-from fieldtwin.commissioning.infer.fields import LIKELY, Reading, Run, infer_run, run_of, runs_of
+from fieldtwin.commissioning.infer.fields import LIKELY, Interpretation, Run, infer_run, run_of, runs_of
 from fieldtwin.commissioning.infer.marks import clock_fields, marked, with_scales
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.errors import FileInvalid
@@ -52,7 +52,7 @@ class Inference:
     """Readings in the order of tables and addresses; bits as they were."""
 
     series: Series
-    readings: tuple[Reading, ...]
+    readings: tuple[Interpretation, ...]
     orders: Mapping[str, float]
 
 
@@ -114,7 +114,7 @@ def infer(series: Series) -> Inference:
 
 
 def _between(
-    address: int, words: Sequence[Sequence[int]], clocks: Sequence[Reading]
+    address: int, words: Sequence[Sequence[int]], clocks: Sequence[Interpretation]
 ) -> list[tuple[int, Sequence[Sequence[int]]]]:
     """Return the parts of a run between its clocks."""
     taken = {r.address - address for r in clocks}
@@ -129,11 +129,11 @@ def _between(
     return [(first, rows) for first, rows in parts]
 
 
-def _look(runs: Sequence[Run], orders: Mapping[str, float], pairs: frozenset[str]) -> list[Reading]:
+def _look(runs: Sequence[Run], orders: Mapping[str, float], pairs: frozenset[str]) -> list[Interpretation]:
     return [r for run in runs for r in infer_run(run, orders, SINGLE_COST if run.table in pairs else 0.0)]
 
 
-def _marked(reading: Reading, series: Series) -> Reading:
+def _marked(reading: Interpretation, series: Series) -> Interpretation:
     """Return the reading with the marks of all passes, including repetitions, because the time that a state is held matters."""
     if reading.type == "string":
         return reading
@@ -143,7 +143,7 @@ def _marked(reading: Reading, series: Series) -> Reading:
     return replace(reading, marks=seen.marks, notes=seen.notes)
 
 
-def _as_observed(reading: Reading) -> Reading:
+def _as_observed(reading: Interpretation) -> Interpretation:
     """Return the reading with the observed share of right readings on generated maps as its probability."""
     kind = kind_of(reading.type, reading.registers, moves=reading.moves, capped=reading.capped)
     share = calibrated(reading.probability, kind)
@@ -152,7 +152,7 @@ def _as_observed(reading: Reading) -> Reading:
     return replace(reading, probability=share, model=reading.probability, rivals=rivals)
 
 
-def _orders_kept(readings: Sequence[Reading]) -> dict[str, float]:
+def _orders_kept(readings: Sequence[Interpretation]) -> dict[str, float]:
     """Return the cost of each order on this device, because devices use one order throughout."""
     seen = {order: PRIOR_WEIGHT * math.exp(-cost) for order, cost in ORDER_COST.items()}
     for reading in readings:
@@ -162,14 +162,14 @@ def _orders_kept(readings: Sequence[Reading]) -> dict[str, float]:
     return {order: -math.log(seen[order] / total) for order in ORDER_COST}
 
 
-def _supported(readings: Sequence[Reading]) -> list[Reading]:
+def _supported(readings: Sequence[Interpretation]) -> list[Interpretation]:
     """Cap readings without support on the device: of an order with few values, or a single float."""
     moving = [r for r in readings if r.moves and r.probability >= LIKELY and r.type != "string"]
     orders = Counter(r.order for r in moving if r.registers > 1)
     floats = Counter(r.order for r in moving if r.type.startswith("float"))
     swapped = orders["BADC"] + orders["DCBA"]
 
-    def doubt(r: Reading) -> str:
+    def doubt(r: Interpretation) -> str:
         if r.type == "string":
             return ""
         if r.type == "float32" and floats[r.order] < FLOCK:

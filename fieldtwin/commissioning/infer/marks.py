@@ -10,7 +10,7 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from itertools import pairwise
 
-from fieldtwin.commissioning.infer.fields import FEWEST_PASSES, Reading
+from fieldtwin.commissioning.infer.fields import FEWEST_PASSES, Interpretation
 from fieldtwin.commissioning.infer.joint import toggled_bits
 
 FEWEST_STEPS = 5
@@ -27,7 +27,7 @@ _MAINS = (
 )
 
 
-def marked(reading: Reading, times_s: Sequence[float]) -> Reading:
+def marked(reading: Interpretation, times_s: Sequence[float]) -> Interpretation:
     """Return `reading` with its marks. `times_s`: the time of each pass, in seconds since 1970 UTC."""
     if reading.type == "string" or not reading.moves:
         return reading
@@ -57,7 +57,7 @@ def marked(reading: Reading, times_s: Sequence[float]) -> Reading:
     return replace(reading, marks=tuple(marks), notes=tuple(notes + _likeness(reading, numbers, whole=whole)))
 
 
-def _bits(reading: Reading) -> tuple[int, ...]:
+def _bits(reading: Interpretation) -> tuple[int, ...]:
     return toggled_bits([int(v) & 0xFFFF for v in reading.values])
 
 
@@ -92,7 +92,7 @@ def _is_state(numbers: Sequence[float], steps: Sequence[float]) -> bool:
     )
 
 
-def _likeness(reading: Reading, numbers: Sequence[float], *, whole: bool) -> list[str]:
+def _likeness(reading: Interpretation, numbers: Sequence[float], *, whole: bool) -> list[str]:
     """Return notes on mere resemblances."""
     if reading.type.startswith("float") or whole:
         for scale in SCALES if whole else (1.0,):
@@ -104,13 +104,13 @@ def _likeness(reading: Reading, numbers: Sequence[float], *, whole: bool) -> lis
     return []
 
 
-def with_scales(readings: Sequence[Reading]) -> list[Reading]:
+def with_scales(readings: Sequence[Interpretation]) -> list[Interpretation]:
     """Give integers that equal a float of the same device times a power of ten in every pass that scale."""
     floats = [r for r in readings if r.type.startswith("float") and r.moves and r.probability >= 0.8]
     return [_scaled(r, floats) if "int" in r.type and r.moves else r for r in readings]
 
 
-def _scaled(reading: Reading, floats: Sequence[Reading]) -> Reading:
+def _scaled(reading: Interpretation, floats: Sequence[Interpretation]) -> Interpretation:
     """Find the scale with which all passes agree to the last digit. It is significant only if the digits change much."""
     numbers = [float(v) for v in reading.values]
     spread = max(numbers) - min(numbers)
@@ -128,12 +128,14 @@ def _scaled(reading: Reading, floats: Sequence[Reading]) -> Reading:
 _CLOCK = ("year", "month", "day", "hour", "minute", "second")
 
 
-def clock_fields(table: str, address: int, words: Sequence[Sequence[int]], times_s: Sequence[float]) -> list[Reading]:
+def clock_fields(
+    table: str, address: int, words: Sequence[Sequence[int]], times_s: Sequence[float]
+) -> list[Interpretation]:
     """Return six registers that are the date and time of day, year first or second first, as numbers or as BCD, as readings.
 
     They are a clock when each pass gives a date within a day of the truth (time zones) that advances with time.
     """
-    found: list[Reading] = []
+    found: list[Interpretation] = []
     start = 0
     while start + 6 <= len(words):
         stretch = words[start : start + 6]
@@ -174,9 +176,9 @@ def _is_clock(clock_s: Sequence[float | None], times_s: Sequence[float]) -> bool
     )
 
 
-def _clock_reading(table: str, address: int, name: str, words: Sequence[int], bcd: bool) -> Reading:
+def _clock_reading(table: str, address: int, name: str, words: Sequence[int], bcd: bool) -> Interpretation:
     kind = "bcd16" if bcd else "uint16"
     values = tuple(int(f"{w:x}") if bcd else w for w in words)
-    return Reading(
+    return Interpretation(
         table, address, 1, kind, "ABCD", 0.9999, values, marks=("timestamp",), notes=(f"the {name} of a clock",)
     )

@@ -15,7 +15,7 @@ from fieldtwin.capture.decoding.modbus_pdu import BIT_TABLES, parse_reply, parse
 from fieldtwin.commissioning.dump.file import VERSION, Cell, Dump, Pass
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
-from fieldtwin.gateway.core.files.recording import Exchange, RecordingHeader
+from fieldtwin.gateway.core.files.recording import RecordedExchange, RecordingHeader
 
 MOST_PASSES = 2_000
 """Maximum number of passes of a long recording, spread evenly over it."""
@@ -24,13 +24,13 @@ FEWEST_REPLIES = 3
 
 
 def dump_of_recording(
-    path: str, header: RecordingHeader, exchanges: Iterable[Exchange], unit: int | None = None
+    path: str, header: RecordingHeader, exchanges: Iterable[RecordedExchange], unit: int | None = None
 ) -> Dump:
     """Return the reads of one unit as passes of a dump. Only good replies to functions 01 to 04 and 17h count.
 
     Raises `UsageError` if the recording has several units and `unit` is not given, `FileInvalid` if it has no read of the unit.
     """
-    by_unit: dict[int, list[Exchange]] = {}
+    by_unit: dict[int, list[RecordedExchange]] = {}
     for exchange in exchanges:
         if exchange.reply is not None and parse_request(exchange.request).read_span is not None:
             by_unit.setdefault(exchange.unit, []).append(exchange)
@@ -51,7 +51,7 @@ def _start_ns(header: RecordingHeader) -> int:
     return round(datetime.fromisoformat(header.start_utc).timestamp() * NS_PER_S) if header.start_utc else 0
 
 
-def _passes(reads: list[Exchange], start_ns: int) -> list[Pass]:
+def _passes(reads: list[RecordedExchange], start_ns: int) -> list[Pass]:
     answered = Counter(e.request for e in reads)
     often = any(count >= FEWEST_REPLIES for count in answered.values())
     requests = {request for request, count in answered.items() if not often or count >= FEWEST_REPLIES}
@@ -80,7 +80,7 @@ def _passes(reads: list[Exchange], start_ns: int) -> list[Pass]:
     return passes
 
 
-def _values(exchange: Exchange) -> dict[Cell, bytes] | None:
+def _values(exchange: RecordedExchange) -> dict[Cell, bytes] | None:
     """Return the cells that a reply carries; None if it is an exception or does not fit its request."""
     asked = parse_request(exchange.request)
     span, reply = asked.read_span, exchange.reply

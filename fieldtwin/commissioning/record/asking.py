@@ -1,4 +1,4 @@
-"""Send one arbitrary request to a live device and return the result as a recording keeps it: PDU in, `Exchange` out.
+"""Send one arbitrary request to a live device and return the result as a recording keeps it: PDU in, `RecordedExchange` out.
 
 The gateway's own Modbus client sends it, with its silences and its validation of replies. It never retries; a fault of
 the connection is an outcome. This module must never decide which requests are allowed: the caller does, with `changes`.
@@ -22,22 +22,22 @@ from fieldtwin.gateway.core.errors import (
     ReplyTimeout,
     VerifyFailed,
 )
-from fieldtwin.gateway.core.files.recording import Exchange, ExchangeError
+from fieldtwin.gateway.core.files.recording import ExchangeError, RecordedExchange
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient
 from fieldtwin.gateway.protocols.modbus.framings import framing_of
-from fieldtwin.gateway.protocols.modbus.server import BROADCAST_FUNCTIONS, Asked, examine
+from fieldtwin.gateway.protocols.modbus.server import BROADCAST_FUNCTIONS, ServerRequest, examine
 from fieldtwin.gateway.protocols.modbus.server_forward import Forwarded
 from fieldtwin.gateway.wallclock import WallClock
 
 _READS = frozenset({1, 2, 3, 4})
 
 
-def asked_of(pdu: bytes) -> Asked | None:
+def asked_of(pdu: bytes) -> ServerRequest | None:
     """Parse a request, even a malformed read (which a device refuses); None for a PDU that cannot be a request."""
     try:
         return examine(pdu)
     except ModbusExceptionReply:
-        return Asked(pdu[0], changes=pdu[0] not in _READS) if pdu and 1 <= pdu[0] <= 0x7F else None
+        return ServerRequest(pdu[0], changes=pdu[0] not in _READS) if pdu and 1 <= pdu[0] <= 0x7F else None
 
 
 def changes(pdu: bytes) -> bool:
@@ -82,7 +82,7 @@ class Asker:
         self._zero_ns = zero_ns
         self._lost = False
 
-    async def ask(self, unit: int, pdu: bytes) -> Exchange | None:
+    async def ask(self, unit: int, pdu: bytes) -> RecordedExchange | None:
         """Send the request and return the exchange; None if it cannot be sent.
 
         Raises `ConnectionLost` when the connection was lost before. If it is lost during the request, that is the
@@ -114,7 +114,7 @@ class Asker:
         sent_ns = self._sent.t_ns
         latency_s = max(end_ns - sent_ns, 0) / NS_PER_S if reply else 0.0
         t_s = max(min(began_ns, sent_ns) - self._zero_ns, 0) / NS_PER_S
-        return Exchange(round(t_s, 6), unit, pdu, reply, round(latency_s, 6), error)
+        return RecordedExchange(round(t_s, 6), unit, pdu, reply, round(latency_s, 6), error)
 
 
 @asynccontextmanager

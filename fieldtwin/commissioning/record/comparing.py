@@ -8,8 +8,8 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 
-from fieldtwin.capture.decoding.canopen_bus import CanopenWire
-from fieldtwin.capture.decoding.exchange import Exchange as Transfer
+from fieldtwin.capture.decoding.canopen_bus import CanopenBusDecoder
+from fieldtwin.capture.decoding.exchange import DecodedExchange as Transfer
 from fieldtwin.capture.decoding.modbus_pdu import parse_request
 from fieldtwin.capture.recordings.aligning import Dialogue
 from fieldtwin.capture.recordings.comparing import Comparer, Comparison, Rules
@@ -22,7 +22,7 @@ from fieldtwin.gateway.core.clock import NS_PER_S, Clock
 from fieldtwin.gateway.core.connection import Connector, Direction, Tap
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import SdoAborted, WireError
-from fieldtwin.gateway.core.files.recording import Exchange
+from fieldtwin.gateway.core.files.recording import RecordedExchange
 from fieldtwin.gateway.wallclock import WallClock
 
 MAX_FRAMES = 1_000_000
@@ -40,7 +40,7 @@ def cells_written(request: bytes) -> set[Cell]:
 
 
 async def compare_device(
-    recorded: Iterable[Exchange],
+    recorded: Iterable[RecordedExchange],
     asker: Asker,
     comparer: Comparer,
     *,
@@ -72,7 +72,7 @@ async def compare_device(
 
 
 async def _ask_all(
-    recorded: Iterable[Exchange],
+    recorded: Iterable[RecordedExchange],
     asker: Asker,
     comparer: Comparer,
     dialogue: Dialogue,
@@ -120,7 +120,7 @@ class _Kept(Tap):
 
 def transfers_of(frames: Frames, node: int | None) -> Iterator[Transfer]:
     """Yield the SDO transfers of a log, of `node` or of all."""
-    wire = CanopenWire("can", ())
+    wire = CanopenBusDecoder("can", ())
     for t_ns, frame in frames:
         for exchange in wire.feed(frame, t_ns)[1]:
             if exchange.service in TRANSFERS and node in (None, exchange.unit):

@@ -22,7 +22,7 @@ from fieldtwin.gateway.core.clock import NS_PER_S, Clock
 from fieldtwin.gateway.core.connection import Connector, Tap
 from fieldtwin.gateway.core.errors import ConnectionLost, Unreachable, UsageError
 from fieldtwin.gateway.core.files.profile import READ_FUNCTION, DeviceProfile
-from fieldtwin.gateway.core.files.recording import Exchange
+from fieldtwin.gateway.core.files.recording import RecordedExchange
 from fieldtwin.gateway.devices.read_plan import GroupPlan, Learnt, Read
 from fieldtwin.gateway.wallclock import WallClock
 
@@ -30,7 +30,7 @@ FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 10.0
 MAX_REQUESTS = 10_000
 """Maximum number of different requests that are repeated from another recording."""
 
-Sink = Callable[[Exchange], None]
+Sink = Callable[[RecordedExchange], None]
 
 
 @dataclass(slots=True)
@@ -106,7 +106,7 @@ class SameRequests:
     `left_out` counts requests that may change the device, or that cannot be sent.
     """
 
-    def __init__(self, exchanges: Iterable[Exchange], unit: int | None = None) -> None:
+    def __init__(self, exchanges: Iterable[RecordedExchange], unit: int | None = None) -> None:
         self.requests: dict[tuple[int, bytes], None] = {}
         self.left_out = 0
         for exchange in exchanges:
@@ -149,7 +149,7 @@ async def record_polls(
     clock = clock or WallClock()
     zero_ns = clock.monotonic_ns()
 
-    def counted(exchange: Exchange) -> None:
+    def counted(exchange: RecordedExchange) -> None:
         counters.exchanges += 1
         counters.unanswered += exchange.reply is None
         counters.refused += bool(exchange.reply and exchange.reply[0] & 0x80)

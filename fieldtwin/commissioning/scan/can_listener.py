@@ -72,7 +72,7 @@ class BusHeard:
         return self.bits / (seconds * bitrate) if seconds > 0 and bitrate else 0.0
 
 
-class BusEar:
+class BusListener:
     """Feed it every frame that is received."""
 
     def __init__(self) -> None:

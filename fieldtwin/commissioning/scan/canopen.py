@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 
 from fieldtwin.commissioning.access.connection import canopen_at, frames_at
 from fieldtwin.commissioning.access.progress import Progress
-from fieldtwin.commissioning.scan.can_listener import BusEar, BusHeard
+from fieldtwin.commissioning.scan.can_listener import BusHeard, BusListener
 from fieldtwin.gateway.connections.can_facts import CanFacts, can_facts
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.clock import NS_PER_S, Clock
@@ -80,7 +80,7 @@ class CanScan:
 class _EarTap(Tap):
     """A tap that passes received frames to the listener while the scan sends."""
 
-    def __init__(self, ear: BusEar) -> None:
+    def __init__(self, ear: BusListener) -> None:
         self._ear = ear
 
     def on_bytes(self, endpoint: Endpoint, direction: Direction, t_ns: int, data: bytes) -> None:
@@ -113,7 +113,7 @@ class CanScanner:
         self._tell, self._stop = on_progress, stop
         self._connector, self._clock = connector, clock or WallClock()
         self._facts = facts
-        self._ear = BusEar()
+        self._ear = BusListener()
         self._taps = (_EarTap(self._ear), *taps)
         self.result = CanScan(url, heard=self._ear.heard)
 

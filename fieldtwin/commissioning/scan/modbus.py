@@ -18,7 +18,7 @@ from fieldtwin.commissioning.scan.odd_replies import OddReply, gathered
 from fieldtwin.commissioning.scan.settings import Pace, Step
 from fieldtwin.commissioning.scan.shared_unit_ids import SPREAD, Alike, likeness, spread_over
 from fieldtwin.commissioning.scan.sweep import Send, UnitAnswer, UnitSweep
-from fieldtwin.commissioning.scan.traffic import Heard, LineEar
+from fieldtwin.commissioning.scan.traffic import Heard, LineListener
 from fieldtwin.gateway.connections.line_counters import CountsErrors, LineCounters
 from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S, Clock
 from fieldtwin.gateway.core.connection import ByteConnection, Connector, Tap
@@ -252,7 +252,7 @@ class ModbusScanner:
 
     async def _audition(self, settings: SerialSettings, listen_s: float, *, whole: bool = False) -> Audition:
         """Listen at `settings`: for `listen_s` with `whole`, else until the result is clear."""
-        ear = LineEar(self._framing)
+        ear = LineListener(self._framing)
         url = str(plan.with_settings(self._endpoint, settings))
         async with bytes_at(url, taps=self._taps, connector=self._connector, clock=self._clock) as connection:
             before = _counters(connection)

@@ -73,7 +73,7 @@ class Heard:
         return self.frames >= SURE_FRAMES and self.share > 0.5
 
 
-class LineEar:
+class LineListener:
     """A listener for `framing` (rtu or ascii). `feed` received bytes; call `settle` from time to time, or during silence."""
 
     def __init__(self, framing: Framing) -> None:

@@ -8,8 +8,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 
-from fieldtwin.conformance.core.case import Finding, Judge, failed, inconclusive, passed, skipped
-from fieldtwin.conformance.core.observation import Asked, Came, Ended, Garbled, Left, Observation, Shown, Told, Word
+from fieldtwin.conformance.core.case import CheckFunction, Finding, failed, inconclusive, passed, skipped
+from fieldtwin.conformance.core.observation import (
+    Came,
+    Ended,
+    Garbled,
+    Left,
+    Observation,
+    ReplySent,
+    RequestSeen,
+    ValuePublished,
+    Word,
+)
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.results.model import Verdict
 
@@ -23,7 +33,7 @@ UNSEEN = "its published values were not observed: no --probe"
 Rule = Callable[[Observation], Finding | None]
 
 
-def all_of(*rules: Rule) -> Judge:
+def all_of(*rules: Rule) -> CheckFunction:
     """Return the first finding that is not a pass, else the first pass with a reason."""
 
     def judge(seen: Observation) -> Finding:
@@ -47,7 +57,7 @@ def goes_on(seen: Observation) -> Finding | None:
         return failed(
             f"the master ended, exit code {ended.status}, {seen.since_s(ended.t_ns):.2f} s after the first faulty answer"
         )
-    asked = next(seen.of(Asked, seen.over_ns + 1), None)
+    asked = next(seen.of(RequestSeen, seen.over_ns + 1), None)
     if asked is None:
         return failed(
             f"no request for {(seen.until_ns - seen.over_ns) / NS_PER_S:.1f} s after the last faulty answer: it has stopped"
@@ -65,7 +75,7 @@ def asks_cleanly(seen: Observation) -> Finding | None:
 def does_not_flood(seen: Observation) -> Finding | None:
     """Check that the numbers of retries and new connections are bounded."""
     span_s = max((seen.until_ns - seen.begun_ns) / NS_PER_S, 0.001)
-    for kind, what in ((Asked, "requests"), (Came, "connections")):
+    for kind, what in ((RequestSeen, "requests"), (Came, "connections")):
         count = sum(isinstance(event, kind) for event in seen.events if event.t_ns >= seen.begun_ns)
         if count > FLOOD_FLOOR and count > FLOOD_FACTOR * seen.habit.rate_per_s * span_s:
             usual = seen.habit.rate_per_s
@@ -77,7 +87,7 @@ def does_not_flood(seen: Observation) -> Finding | None:
 
 def publishes_nothing_bad(seen: Observation) -> Finding | None:
     """Check that every published value was in a correct answer."""
-    for shown in seen.of(Shown, seen.begun_ns):
+    for shown in seen.of(ValuePublished, seen.begun_ns):
         if shown.word is Word.POISON:
             return failed(f"published {shown.text}, the value of the bad frame, {_when(seen, shown.t_ns)}")
         if shown.word is Word.OTHER:
@@ -87,7 +97,7 @@ def publishes_nothing_bad(seen: Observation) -> Finding | None:
 
 def publishes_good_again(seen: Observation) -> Finding | None:
     """Check that the device's value is published again after the device has recovered."""
-    if seen.probed and not any(shown.word is seen.last for shown in seen.of(Shown, seen.over_ns)):
+    if seen.probed and not any(shown.word is seen.last for shown in seen.of(ValuePublished, seen.over_ns)):
         waited = (seen.until_ns - seen.over_ns) / NS_PER_S
         return failed(f"the correct value was not published within {waited:.1f} s after the last faulty answer")
     return None
@@ -97,7 +107,7 @@ def sees_all_values(seen: Observation) -> Finding | None:
     """Check that every number that may be a published value was classified. Comes last: a failure outranks it."""
     if not seen.probed:
         return passed(UNSEEN)
-    for shown in seen.of(Shown, seen.begun_ns):
+    for shown in seen.of(ValuePublished, seen.begun_ns):
         if shown.word is Word.UNCLEAR:
             return inconclusive(
                 f"printed {shown.text!r} {_when(seen, shown.t_ns)}, which may or may not be a published value: give a "
@@ -113,7 +123,7 @@ def needs_probe(seen: Observation) -> Finding | None:
     return None if seen.probed else skipped(NEEDS_PROBE)
 
 
-def owes(*rules: Rule) -> Judge:
+def owes(*rules: Rule) -> CheckFunction:
     """Check the duties of every master, then `rules`; passed only if the probe saw all published values."""
     return all_of(*DUTIES, *rules, sees_all_values)
 
@@ -131,8 +141,8 @@ def took_odd_answer(seen: Observation) -> Finding | None:
     """Check that the master took the value from the faulty answers, before the correct ones came again."""
     if not seen.probed:
         return skipped(NEEDS_PROBE)
-    first = next((s for s in seen.of(Shown, seen.begun_ns) if s.word is seen.after), None)
-    plain = next((t.t_ns for t in seen.of(Told, seen.over_ns + 1) if t.good), seen.until_ns)
+    first = next((s for s in seen.of(ValuePublished, seen.begun_ns) if s.word is seen.after), None)
+    plain = next((t.t_ns for t in seen.of(ReplySent, seen.over_ns + 1) if t.good), seen.until_ns)
     if first is None or first.t_ns >= plain:
         return failed(
             "the unusual answers were not accepted, although they contain the value: it was published only after the normal ones"
@@ -146,10 +156,10 @@ def keeps_waiting(seen: Observation) -> Finding | None:
     On a line, a frame after the next request answers the first one: a master that has asked again gave up waiting for
     it.
     """
-    for told in seen.of(Told, seen.begun_ns):
+    for told in seen.of(ReplySent, seen.begun_ns):
         if told.good or not told.asked_ns:
             continue
-        asked = seen.of(Asked, told.asked_ns + 1, told.t_ns - 1)
+        asked = seen.of(RequestSeen, told.asked_ns + 1, told.t_ns - 1)
         again = next((a for a in asked if a.client == told.client), None)
         if again is None:
             continue
@@ -176,7 +186,9 @@ def answers_at_once(seen: Observation) -> Finding | None:
     frame is sent later than the first: a master that waits out its timeout asks again at the same time after both
     requests.
     """
-    gaps_s = [(delay_s, gap_s) for told in seen.of(Told, seen.begun_ns) for delay_s, gap_s in _gap_after(seen, told)]
+    gaps_s = [
+        (delay_s, gap_s) for told in seen.of(ReplySent, seen.begun_ns) for delay_s, gap_s in _gap_after(seen, told)
+    ]
     if not gaps_s:
         return inconclusive("no request after the short frame")
     silence_s = seen.habit.silent_gap_s
@@ -198,22 +210,22 @@ def answers_at_once(seen: Observation) -> Finding | None:
     return inconclusive(f"{said}, and later when the frame came later: it backs off, or its timeout begins anew")
 
 
-def _gap_after(seen: Observation, told: Told) -> Iterator[tuple[float, float]]:
+def _gap_after(seen: Observation, told: ReplySent) -> Iterator[tuple[float, float]]:
     """Yield the delay of a faulty answer after its request, and the time from it to the next request.
 
     Nothing is yielded if that request came before.
     """
     if told.good:
         return
-    after = next(seen.of(Asked, told.t_ns + 1), None)
-    asked = next((a for a in reversed(list(seen.of(Asked, 0, told.t_ns))) if a.client == told.client), None)
+    after = next(seen.of(RequestSeen, told.t_ns + 1), None)
+    asked = next((a for a in reversed(list(seen.of(RequestSeen, 0, told.t_ns))) if a.client == told.client), None)
     if after is not None and asked is not None and told.asked_ns in (0, asked.t_ns):
         yield (told.t_ns - asked.t_ns) / NS_PER_S, (after.t_ns - told.t_ns) / NS_PER_S
 
 
 def backs_off(seen: Observation) -> Finding | None:
     """Check that a busy device is not asked more often than usual."""
-    busy = list(seen.of(Asked, seen.begun_ns, seen.over_ns))
+    busy = list(seen.of(RequestSeen, seen.begun_ns, seen.over_ns))
     span_s = (seen.over_ns - seen.begun_ns) / NS_PER_S
     if len(busy) < 3 or span_s <= 0:
         return None
@@ -233,13 +245,13 @@ def quarantines(seen: Observation) -> Finding | None:
     a probe saw the late value, another check has already decided; otherwise it is a failure only if the user stated the
     timeout.
     """
-    late = next((t for t in seen.of(Told, seen.begun_ns) if not t.good), None)
-    first = next(seen.of(Asked, seen.begun_ns), None)
+    late = next((t for t in seen.of(ReplySent, seen.begun_ns) if not t.good), None)
+    first = next(seen.of(RequestSeen, seen.begun_ns), None)
     if late is None and any(not left.by_us for left in seen.of(Left, seen.begun_ns)):
         return None  # the connection was closed: a late reply cannot come
     if late is None or first is None:
         return inconclusive("the late answer was never sent")
-    again = next((a for a in seen.of(Asked, first.t_ns + 1, late.t_ns) if a.target == first.target), None)
+    again = next((a for a in seen.of(RequestSeen, first.t_ns + 1, late.t_ns) if a.target == first.target), None)
     if again is None or seen.probed:
         return None
     gap_s = (again.t_ns - first.t_ns) / NS_PER_S
@@ -260,7 +272,7 @@ late_same_shape = all_of(
 
 
 def another_shape_came(seen: Observation) -> Finding | None:
-    if not any(not told.good for told in seen.of(Told, seen.begun_ns)):
+    if not any(not told.good for told in seen.of(ReplySent, seen.begun_ns)):
         return skipped("all its requests have one shape: see MB-013")
     return None
 
@@ -270,10 +282,10 @@ late_other = all_of(another_shape_came, *DUTIES, needs_probe, sees_all_values)
 
 def checks_echo_of_write(seen: Observation) -> Finding | None:
     """Check that the master notices a differing echo of a write: it repeats it, reads it back, or reports it."""
-    first = next(seen.of(Asked, seen.begun_ns), None)
+    first = next(seen.of(RequestSeen, seen.begun_ns), None)
     if first is None:
         return inconclusive("no write was seen")
-    for asked in seen.of(Asked, first.t_ns + 1):
+    for asked in seen.of(RequestSeen, first.t_ns + 1):
         if asked.target == first.target:
             return passed("it wrote again")
         if (
@@ -296,8 +308,8 @@ def reconnects(seen: Observation) -> Finding | None:
 
 def asked_once(seen: Observation) -> Finding | None:
     """Check that a broadcast, which no device answers, is not repeated for lack of an answer."""
-    first = next(seen.of(Asked, seen.begun_ns), None)
-    again = next((a for a in seen.of(Asked, first.t_ns + 1) if a.target == first.target), None) if first else None
+    first = next(seen.of(RequestSeen, seen.begun_ns), None)
+    again = next((a for a in seen.of(RequestSeen, first.t_ns + 1) if a.target == first.target), None) if first else None
     if first is None or again is None:
         return None
     gap_s, usual_s = (again.t_ns - first.t_ns) / NS_PER_S, seen.habit.period_s.get(first.target, 0.0)
@@ -314,13 +326,13 @@ def _when(seen: Observation, t_ns: int) -> str:
 
 def asks_for_less(seen: Observation) -> Finding | None:
     """Check that a read that was refused is repeated in parts."""
-    first = next(seen.of(Asked, seen.begun_ns), None)
+    first = next(seen.of(RequestSeen, seen.begun_ns), None)
     if first is None:
         return inconclusive("no such read was seen")
     asked_for = int.from_bytes(first.target[4:6], "big")
     parts = [
         a
-        for a in seen.of(Asked, seen.begun_ns)
+        for a in seen.of(RequestSeen, seen.begun_ns)
         if a.target[:2] == first.target[:2] and int.from_bytes(a.target[4:6], "big") < asked_for
     ]
     if not parts:

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from fieldtwin.commissioning.access.frame_log import WireLog
+from fieldtwin.commissioning.access.frame_log import FrameLog
 from fieldtwin.conformance.core.evidence import line_of
-from fieldtwin.conformance.core.observation import Asked, Event, Garbled, Sent, Told
+from fieldtwin.conformance.core.observation import Event, Garbled, ReplySent, RequestSeen, Sent
 
 
-class MasterLog(WireLog):
+class MasterLog(FrameLog):
     """Appends to `path`; `where` is the endpoint on which the master is served, `words` the command line."""
 
     def __init__(self, path: Path, where: str, words: str) -> None:
@@ -22,10 +22,13 @@ class MasterLog(WireLog):
 
     def on_event(self, event: Event) -> None:
         """Write a line for a frame; connections, published values and the program's end are not written."""
-        if not isinstance(event, Asked | Told | Sent | Garbled):
+        if not isinstance(event, RequestSeen | ReplySent | Sent | Garbled):
             return
         _, frame, _ = line_of(event)
         head, _, data = frame.rpartition("#")
         line: dict[str, object] = {"t_ns": event.t_ns, "endpoint": self._where}
-        line |= {"direction": "received" if isinstance(event, Told) else "sent", "hex": data.replace(" ", "").lower()}
+        line |= {
+            "direction": "received" if isinstance(event, ReplySent) else "sent",
+            "hex": data.replace(" ", "").lower(),
+        }
         self._write(line | ({"frame": frame} if head else {}))

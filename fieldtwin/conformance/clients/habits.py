@@ -6,7 +6,7 @@ import itertools
 import math
 
 from fieldtwin.conformance.core.case import Finding, failed, inconclusive, passed, skipped
-from fieldtwin.conformance.core.observation import Asked, Came, Left, Observation
+from fieldtwin.conformance.core.observation import Came, Left, Observation, RequestSeen
 from fieldtwin.gateway.core.clock import NS_PER_MS
 
 TURNAROUND_MS = 100
@@ -21,7 +21,7 @@ READS = frozenset({0x01, 0x02, 0x03, 0x04, 0x07, 0x0B, 0x0C, 0x11, 0x14, 0x17, 0
 
 
 def broadcasts_wait(seen: Observation) -> Finding:
-    asked = list(seen.of(Asked))
+    asked = list(seen.of(RequestSeen))
     shortest_ms = math.inf
     broadcasts = [(a, b) for a, b in itertools.pairwise(asked) if a.target[0] == 0]
     if not any(a.target[0] == 0 for a in asked):
@@ -40,14 +40,14 @@ def broadcasts_wait(seen: Observation) -> Finding:
 
 
 def no_broadcast_reads(seen: Observation) -> Finding:
-    for asked in seen.of(Asked):
+    for asked in seen.of(RequestSeen):
         if asked.target[0] == 0 and asked.target[1] in READS:
             return failed(f"sent a read as a broadcast: {asked.target.hex(' ')}")
     return passed(_of(seen))
 
 
 def legal_requests(seen: Observation) -> Finding:
-    for asked in seen.of(Asked):
+    for asked in seen.of(RequestSeen):
         function, count = asked.target[1], _count(asked.target)
         if function in MOST and not 1 <= count <= MOST[function]:
             return failed(f"asked for {count} with function {function:02X}h, 1 to {MOST[function]} are allowed")
@@ -55,7 +55,7 @@ def legal_requests(seen: Observation) -> Finding:
 
 
 def bounded_addresses(seen: Observation) -> Finding:
-    for asked in seen.of(Asked):
+    for asked in seen.of(RequestSeen):
         start = int.from_bytes(asked.target[2:4], "big")
         if asked.target[1] in MOST and start + _count(asked.target) > 0x10000:
             return failed(f"asked for {_count(asked.target)} from {start} on: beyond 65535")
@@ -78,4 +78,4 @@ def _count(target: bytes) -> int:
 
 
 def _of(seen: Observation) -> str:
-    return f"{sum(1 for _ in seen.of(Asked))} requests"
+    return f"{sum(1 for _ in seen.of(RequestSeen))} requests"

@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable
 from statistics import median
 
-from fieldtwin.conformance.core.observation import Asked, Event, Habit, Told
+from fieldtwin.conformance.core.observation import Event, Habit, ReplySent, RequestSeen
 from fieldtwin.gateway.core.clock import NS_PER_S
 
 MOST_EVENTS = 200_000
@@ -43,7 +43,7 @@ class Recorder:
 
     def habit(self, since_ns: int, until_ns: int, silent_gap_s: float = 0.0) -> Habit:
         """Return the polling behaviour of the master between two moments."""
-        asked = [e for e in self._events if isinstance(e, Asked) and since_ns <= e.t_ns <= until_ns]
+        asked = [e for e in self._events if isinstance(e, RequestSeen) and since_ns <= e.t_ns <= until_ns]
         gaps = [(b.t_ns - a.t_ns) / NS_PER_S for a, b in itertools.pairwise(asked)]
         times: dict[bytes, list[int]] = {}
         for request in asked:
@@ -57,6 +57,6 @@ class Recorder:
         rate = (len(asked) - 1) / span_s if span_s > 0 else 1.0
         return Habit(periods, max(gaps, default=1.0), silent_gap_s, max(rate, 0.01))
 
-    def count(self, kind: type[Asked] | type[Told], since_ns: int) -> int:
+    def count(self, kind: type[RequestSeen] | type[ReplySent], since_ns: int) -> int:
         """Return the number of events of a kind since `since_ns`; of replies, only the good ones."""
-        return sum(isinstance(e, kind) and (not isinstance(e, Told) or e.good) for e in self.since(since_ns))
+        return sum(isinstance(e, kind) and (not isinstance(e, ReplySent) or e.good) for e in self.since(since_ns))

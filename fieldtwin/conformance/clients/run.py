@@ -13,9 +13,18 @@ from typing import Generic, Protocol, TypeVar
 
 from fieldtwin.conformance.clients.probe import Probe
 from fieldtwin.conformance.clients.recorder import Recorder
-from fieldtwin.conformance.core.case import OTHER_WIRE, TRAIL_S, Case, Danger, Finding, inconclusive, skipped
+from fieldtwin.conformance.core.case import OTHER_WIRE, TRAIL_S, Case, Finding, Impact, inconclusive, skipped
 from fieldtwin.conformance.core.evidence import Line, lines
-from fieldtwin.conformance.core.observation import Asked, Ended, Event, Habit, Observation, Shown, Told, Word
+from fieldtwin.conformance.core.observation import (
+    Ended,
+    Event,
+    Habit,
+    Observation,
+    ReplySent,
+    RequestSeen,
+    ValuePublished,
+    Word,
+)
 from fieldtwin.conformance.core.results import CaseResult
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.errors import Unreachable
@@ -52,7 +61,7 @@ C = TypeVar("C", bound=Playable)
 C_contra = TypeVar("C_contra", bound=Playable, contravariant=True)
 
 
-class AnyStage(Protocol[C_contra]):
+class HostileDevice(Protocol[C_contra]):
     """The test setup of the cases: see `modbus_stage.Stage`. Times are its `now_ns`."""
 
     recorder: Recorder
@@ -71,7 +80,7 @@ class AnyStage(Protocol[C_contra]):
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class ClientTestOptions:
     """The options of a run.
 
     `timeout_s` is the master's response timeout, 0 if unknown; `patience_s` is the longest time of any step, `wait_s`
@@ -85,7 +94,7 @@ class Plan:
     wait_s: float = 30.0
     for_s: float = 0.0
     has: frozenset[str] = frozenset()
-    at_most: Danger = Danger.DISRUPT
+    at_most: Impact = Impact.DISRUPT
 
 
 @dataclass
@@ -96,10 +105,10 @@ class MasterRun(Generic[C]):
     unanswered, which measures the master's timeout. `tell` is called with each result.
     """
 
-    stage: AnyStage[C]
+    stage: HostileDevice[C]
     cases: Sequence[C]
     silent: C
-    plan: Plan
+    plan: ClientTestOptions
     traits: frozenset[str]
     probe: Probe | None = None
     tell: Callable[[CaseResult], None] = lambda result: None
@@ -118,7 +127,7 @@ class MasterRun(Generic[C]):
     # -- events from outside --------------------------------------------------------------------------------------
 
     def _shown(self, word: Word, text: str) -> None:
-        self.stage.recorder.add(Shown(self.stage.now_ns(), word, text))
+        self.stage.recorder.add(ValuePublished(self.stage.now_ns(), word, text))
 
     def ended(self, status: int) -> None:
         """Record that the program under test ended by itself."""
@@ -145,12 +154,14 @@ class MasterRun(Generic[C]):
     async def _learn(self) -> None:
         """Measure the master's polling behaviour, the representation of the correct words, and its response timeout."""
         stage = self.stage
-        if not await self._until(lambda: any(isinstance(e, Asked) for e in stage.recorder.since(0)), self.plan.wait_s):
+        if not await self._until(
+            lambda: any(isinstance(e, RequestSeen) for e in stage.recorder.since(0)), self.plan.wait_s
+        ):
             if self._ended is not None:
                 raise Unreachable(f"the program ended before its first request, exit code {self._ended.status}")
             raise Unreachable("no request was received", hint=f"within {self.plan.wait_s:g} s")
         since_ns = stage.now_ns()
-        await self._until(lambda: stage.recorder.count(Asked, since_ns) >= 2 * STEADY, self.plan.patience_s)
+        await self._until(lambda: stage.recorder.count(RequestSeen, since_ns) >= 2 * STEADY, self.plan.patience_s)
         if self.probe is not None:
             await self._teach(Word.FIRST)
             await self._teach(Word.SECOND)
@@ -185,7 +196,7 @@ class MasterRun(Generic[C]):
         return (following - first_ns) / NS_PER_S if following else 0.0
 
     def _next_asked(self, after_ns: int) -> int | None:
-        return next((e.t_ns for e in self.stage.recorder.since(after_ns + 1) if isinstance(e, Asked)), None)
+        return next((e.t_ns for e in self.stage.recorder.since(after_ns + 1) if isinstance(e, RequestSeen)), None)
 
     # -- one case -------------------------------------------------------------------------------------------------
 
@@ -226,20 +237,20 @@ class MasterRun(Generic[C]):
         self._ended = None
         await self.restart()
         await self._until(
-            lambda: self.stage.recorder.count(Asked, self.stage.now_ns() - NS_PER_S) > 0, self.plan.wait_s
+            lambda: self.stage.recorder.count(RequestSeen, self.stage.now_ns() - NS_PER_S) > 0, self.plan.wait_s
         )
         return await self._well()
 
     async def _good_again(self, since_ns: int) -> bool:
         return await self._until(
-            lambda: self.stage.recorder.count(Told, since_ns) >= 2 and self._seen(self._word, since_ns),
+            lambda: self.stage.recorder.count(ReplySent, since_ns) >= 2 and self._seen(self._word, since_ns),
             self.plan.patience_s,
         )
 
     def _seen(self, word: Word, since_ns: int) -> bool:
         if self.probe is None:
             return True
-        return any(isinstance(e, Shown) and e.word is word for e in self.stage.recorder.since(since_ns))
+        return any(isinstance(e, ValuePublished) and e.word is word for e in self.stage.recorder.since(since_ns))
 
     async def _play(self, case: C) -> tuple[Finding, tuple[Event, ...]]:
         stage, before = self.stage, self._word
@@ -301,7 +312,7 @@ class MasterRun(Generic[C]):
         self._held = self.stage.hold(word)
 
     async def _polled(self, count: int, since_ns: int, within_s: float) -> bool:
-        return await self._until(lambda: self.stage.recorder.count(Told, since_ns) >= count, within_s)
+        return await self._until(lambda: self.stage.recorder.count(ReplySent, since_ns) >= count, within_s)
 
     async def _until(self, condition: Callable[[], bool], within_s: float) -> bool:
         """Wait for `condition` and return whether it holds; also end when the master has ended."""

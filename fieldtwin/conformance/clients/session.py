@@ -10,13 +10,13 @@ from dataclasses import dataclass, field
 
 from fieldtwin.conformance.clients.canopen.cases import CASES as CANOPEN_CASES
 from fieldtwin.conformance.clients.canopen.cases import SILENT as CANOPEN_SILENT
-from fieldtwin.conformance.clients.canopen.hostile_node import CanopenStage
+from fieldtwin.conformance.clients.canopen.hostile_node import HostileNode
 from fieldtwin.conformance.clients.modbus.cases import CASES, SILENT
-from fieldtwin.conformance.clients.modbus.hostile_server import Stage, traits, wire_for
+from fieldtwin.conformance.clients.modbus.hostile_server import HostileServer, traits, wire_for
 from fieldtwin.conformance.clients.modbus.pty_line import PtyLine
 from fieldtwin.conformance.clients.probe import Classifier, MarkedOutputProbe, OutputProbe, Probe, RegisterProbe
 from fieldtwin.conformance.clients.program import OnText, Program
-from fieldtwin.conformance.clients.run import C, MasterRun, Plan
+from fieldtwin.conformance.clients.run import C, ClientTestOptions, MasterRun
 from fieldtwin.conformance.core.observation import Event, Word
 from fieldtwin.conformance.core.results import CaseResult
 from fieldtwin.emulators.endpoints.ports import OsPorts
@@ -42,7 +42,7 @@ class Options:
     """
 
     listen: Endpoint
-    plan: Plan
+    plan: ClientTestOptions
     words: tuple[int, int, int]
     probe: str = ""
     stands_for_none: frozenset[str] = frozenset()
@@ -77,7 +77,7 @@ async def judge_modbus_master(options: Options, listener: Listener) -> list[Case
         raise UsageError("Modbus ASCII needs a serial line", expected="pty:PATH or ascii:PORT", got=str(options.listen))
     line = options.listen.is_serial or options.listen.scheme == "pty"
     scheme = "ascii" if in_ascii else "rtu" if line else options.listen.scheme
-    stage = Stage(wire_for(scheme), options.words, options.held)
+    stage = HostileServer(wire_for(scheme), options.words, options.held)
     async with AsyncExitStack() as closing:
         nursery = await closing.enter_async_context(Nursery())
         theirs = await _open(options.listen, stage, nursery, closing, "ascii" if in_ascii else "rtu")
@@ -92,7 +92,7 @@ async def judge_canopen_master(options: Options, listener: Listener) -> list[Cas
     if not options.listen.is_can:
         expected = "can:fieldtwin/HOST:PORT or can:socketcan/INTERFACE"
         raise UsageError("the endpoint for the client or master", expected=expected, got=str(options.listen))
-    stage = CanopenStage(
+    stage = HostileNode(
         options.words,
         size=options.size,
         held=dict(options.objects),
@@ -135,7 +135,9 @@ async def _judged(
                 listener.say(f"  {line}")
 
 
-async def _open(listen: Endpoint, stage: Stage, nursery: Nursery, closing: AsyncExitStack, framing: str) -> Endpoint:
+async def _open(
+    listen: Endpoint, stage: HostileServer, nursery: Nursery, closing: AsyncExitStack, framing: str
+) -> Endpoint:
     """Serve `listen`; returns the master's side of it."""
     if listen.scheme in ("tcp", "rtu+tcp"):
         server = await OsPorts().listen(listen, stage.serve, MAX_CLIENTS)

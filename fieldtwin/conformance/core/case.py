@@ -17,7 +17,7 @@ TRAIL_S = 0.3
 """Default time that a case continues after the master has recovered, so that late effects are seen."""
 
 
-class Danger(Enum):
+class Impact(Enum):
     """Impact level of a case on the equipment behind the master, in rising order."""
 
     OBSERVE = "observe"
@@ -31,7 +31,7 @@ class Danger(Enum):
 
     @property
     def rank(self) -> int:
-        return list(Danger).index(self)
+        return list(Impact).index(self)
 
 
 class Basis(Enum):
@@ -91,7 +91,7 @@ def inconclusive(reason: str) -> Finding:
     return Finding(Verdict.INCONCLUSIVE, reason)
 
 
-Judge = Callable[[Observation], Finding]
+CheckFunction = Callable[[Observation], Finding]
 """Pure: the same observation, the same finding."""
 
 
@@ -108,7 +108,7 @@ class About:
     id: str
     title: str
     clause: str
-    danger: Danger
+    danger: Impact
     does: str
     must: str
     basis: Basis = field(kw_only=True)
@@ -160,4 +160,4 @@ class About:
 class Case(About):
     """A case for masters, with its check."""
 
-    judge: Judge
+    judge: CheckFunction

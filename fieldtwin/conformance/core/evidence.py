@@ -7,7 +7,17 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from fieldtwin.conformance.core.observation import Asked, Came, Ended, Event, Garbled, Left, Sent, Shown, Told
+from fieldtwin.conformance.core.observation import (
+    Came,
+    Ended,
+    Event,
+    Garbled,
+    Left,
+    ReplySent,
+    RequestSeen,
+    Sent,
+    ValuePublished,
+)
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.clock import NS_PER_MS
 from fieldtwin.gateway.protocols.canopen import cob_id
@@ -51,9 +61,9 @@ def lines(events: Iterable[Event], begun_ns: int) -> tuple[Line, ...]:
 def line_of(event: Event) -> tuple[str, str, str]:
     """Return the sender, the frame, and a description in words."""
     match event:
-        case Asked():
+        case RequestSeen():
             return "master", event.frame or event.target.hex(" "), _request(event)
-        case Told():
+        case ReplySent():
             text = _abort(event.data) if "#" in event.frame else ""
             return (
                 "device",
@@ -74,13 +84,13 @@ def line_of(event: Event) -> tuple[str, str, str]:
             )
         case Left():
             return ("device" if event.by_us else "master"), "", f"closes connection {event.client}"
-        case Shown():
+        case ValuePublished():
             return "probe", "", f"published {event.text or 'no value'} ({event.word.value})"
         case Ended():
             return "program", "", f"ended, exit code {event.status}"
 
 
-def _request(asked: Asked) -> str:
+def _request(asked: RequestSeen) -> str:
     return f"transaction {asked.tag}" if asked.tag else ""
 
 

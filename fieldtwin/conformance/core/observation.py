@@ -14,7 +14,7 @@ from fieldtwin.gateway.core.clock import NS_PER_S
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class RequestSeen:
     """A whole request of the master.
 
     `target` is the shape of a request: equal for one that is repeated (Modbus: unit ID and PDU; SDO: node ID and the
@@ -30,7 +30,7 @@ class Asked:
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
+class ReplySent:
     """A reply of the device; `good` if it was a true answer in a correct frame.
 
     `asked_ns` is the time of the request that it answers, 0 where that is not known. `frame` is a CAN frame in candump
@@ -99,7 +99,7 @@ class Word(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Shown:
+class ValuePublished:
     """A value that the master publishes, as the probe reports it. `text` is the text that was read."""
 
     t_ns: int
@@ -115,8 +115,8 @@ class Ended:
     status: int
 
 
-Event = Asked | Told | Sent | Garbled | Came | Left | Shown | Ended
-E = TypeVar("E", Asked, Told, Sent, Garbled, Came, Left, Shown, Ended)
+Event = RequestSeen | ReplySent | Sent | Garbled | Came | Left | ValuePublished | Ended
+E = TypeVar("E", RequestSeen, ReplySent, Sent, Garbled, Came, Left, ValuePublished, Ended)
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,7 @@ from fieldtwin.conformance.core.results import CaseResult
 from fieldtwin.gateway.core.connection import Direction
 
 W = TypeVar("W")
-Play = Callable[[W], Awaitable[Finding]]
+CaseProcedure = Callable[[W], Awaitable[Finding]]
 """Runs a case on a connection and returns the finding."""
 
 
@@ -26,7 +26,7 @@ class DeviceCase(About, Generic[W]):
     (``holding``, ``coil``, ``object``: by ``--write``; ``eds``; ``i-know``).
     """
 
-    play: Play[W]
+    play: CaseProcedure[W]
     wires: tuple[str, ...] = ()
     needs: tuple[str, ...] = ()
 

@@ -36,7 +36,7 @@ from fieldtwin.gateway.core.endpoint import Endpoint
 CELLS = 0x1_0000
 
 
-def modbus_on_paper(options: ModbusOptions) -> Checked:
+def modbus_dry_run(options: ModbusOptions) -> Checked:
     """Run the check on a simulated device that has everything that the options name."""
     loop = VirtualLoop()
     with asyncio.Runner(loop_factory=lambda: loop) as runner:
@@ -88,7 +88,7 @@ def _streams(endpoint: Endpoint, units: dict[int, ModbusUnit], clock: VirtualClo
 # -- CANopen -----------------------------------------------------------------------------------------------------------
 
 
-def canopen_on_paper(options: CanopenOptions) -> Checked:
+def canopen_dry_run(options: CanopenOptions) -> Checked:
     """Run the check on a simulated node as the EDS describes it, or on one with everything that the cases need."""
     loop = VirtualLoop()
 

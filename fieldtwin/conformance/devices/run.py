@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
-from fieldtwin.conformance.core.case import OTHER_WIRE, Danger, Finding, failed, inconclusive, skipped
+from fieldtwin.conformance.core.case import OTHER_WIRE, Finding, Impact, failed, inconclusive, skipped
 from fieldtwin.conformance.devices.device_case import DeviceCase, DeviceResult, NotHere, Spoken, Unsaid
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.clock import NS_PER_S, Clock
@@ -26,7 +26,7 @@ MOST_LOST = 3
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class DeviceTestOptions:
     """The limits of a check.
 
     `has`: the inputs that the user gave (``holding``, ``coil``, ``object``, ``eds``, ``i-know``); `at_most` the highest
@@ -34,7 +34,7 @@ class Plan:
     """
 
     only: frozenset[str] = frozenset()
-    at_most: Danger = Danger.READ
+    at_most: Impact = Impact.READ
     has: frozenset[str] = frozenset()
     for_s: float = 0.0
 
@@ -42,7 +42,7 @@ class Plan:
 class Settling(Protocol):
     """The interface of a connection for a run."""
 
-    danger: Danger
+    danger: Impact
     traits: frozenset[str]
 
     async def settle(self) -> bool: ...
@@ -79,7 +79,7 @@ class Transcript(Tap):
 W = TypeVar("W", bound=Settling)
 
 
-def why_not(case: DeviceCase[W], plan: Plan, traits: frozenset[str]) -> str:
+def why_not(case: DeviceCase[W], plan: DeviceTestOptions, traits: frozenset[str]) -> str:
     """Return the reason for which the case is not run with that plan on that transport; empty if it is run."""
     if case.wires and not traits & set(case.wires):
         return OTHER_WIRE
@@ -103,7 +103,7 @@ HOW_TO_GIVE = {
 async def play(
     wire: W,
     cases: Sequence[DeviceCase[W]],
-    plan: Plan,
+    plan: DeviceTestOptions,
     transcript: Transcript,
     clock: Clock,
     tell: Callable[[DeviceResult], None] = lambda result: None,
@@ -134,7 +134,7 @@ async def play(
 
 async def _case(wire: W, case: DeviceCase[W], transcript: Transcript) -> tuple[Finding, bool]:
     """Return the finding of a case, and whether the device answered normally before it."""
-    wire.danger = Danger.READ
+    wire.danger = Impact.READ
     if not await wire.settle():
         return inconclusive("the state before the test case was not normal: the normal request got no answer"), False
     transcript.begin()
@@ -148,4 +148,4 @@ async def _case(wire: W, case: DeviceCase[W], transcript: Transcript) -> tuple[F
     except Unreachable as e:
         return failed(f"accepts no connection any more: {e.message}"), True
     finally:
-        wire.danger = Danger.READ
+        wire.danger = Impact.READ

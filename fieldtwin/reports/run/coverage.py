@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
 from fieldtwin.capture.decoding.decoder import Decoder
-from fieldtwin.capture.decoding.exchange import Exchange
+from fieldtwin.capture.decoding.exchange import DecodedExchange
 from fieldtwin.gateway.core.errors import ModbusExceptionReply
 from fieldtwin.gateway.core.files.profile import RegisterRange
 from fieldtwin.gateway.devices.config import DeviceConfig
@@ -47,12 +47,12 @@ class Collector:
         self.add(self._decoder.finish())
         return self.counts
 
-    def add(self, exchanges: Iterable[Exchange]) -> None:
+    def add(self, exchanges: Iterable[DecodedExchange]) -> None:
         """Take exchanges that were finished by the end of a trace."""
         for exchange in exchanges:
             self._exchange(exchange)
 
-    def take(self, event: Event, exchanges: Iterable[Exchange]) -> None:
+    def take(self, event: Event, exchanges: Iterable[DecodedExchange]) -> None:
         """Take an event that the caller has already decoded into `exchanges`."""
         if event.kind is Kind.FRAME:
             self.add(exchanges)
@@ -61,7 +61,7 @@ class Collector:
         elif event.kind is Kind.FAULT:
             self._fault(event.where, str(event.data.get("name", event.where)), bool(event.data.get("on")))
 
-    def _exchange(self, exchange: Exchange) -> None:
+    def _exchange(self, exchange: DecodedExchange) -> None:
         counts, device = self.counts, exchange.device or f"{exchange.bus} {exchange.unit}"
         _count(counts.services, (device, exchange.service))
         if exchange.problem:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 
-from fieldtwin.capture.decoding.exchange import Exchange
+from fieldtwin.capture.decoding.exchange import DecodedExchange
 from fieldtwin.capture.decoding.tags import show_value
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.files.profile import Tag
@@ -159,7 +159,7 @@ def _words(words: list[tuple[int, float, float, str, str]]) -> list[Markup]:
     return marks
 
 
-def _row(exchange: Exchange) -> int:
+def _row(exchange: DecodedExchange) -> int:
     """Return the row of an exchange: requests above, messages below."""
     return 0 if exchange.latency_ns is not None or exchange.problem == "no reply" else 1
 
@@ -181,13 +181,13 @@ def _scan_lane(axis: Axis, window: Window, system: System | None) -> list[tuple[
     return [(34.0, marks)]
 
 
-def _kind(exchange: Exchange) -> str:
+def _kind(exchange: DecodedExchange) -> str:
     if exchange.ok:
         return "message" if exchange.latency_ns is None else "asked" if not exchange.writes() else "wrote"
     return {"no reply": "lost", "exception": "refused", "abort": "refused"}.get(exchange.problem, "broken")
 
 
-def _short(exchange: Exchange) -> str:
+def _short(exchange: DecodedExchange) -> str:
     """Return a short description: the service and its place, or the problem."""
     if exchange.problem == "exception" and exchange.exception is not None:
         return f"exception {exchange.exception:02X}"
@@ -206,7 +206,7 @@ def _short(exchange: Exchange) -> str:
     return said if len(said) <= 46 else said[:45] + "…"
 
 
-def _tooltip(exchange: Exchange) -> str:
+def _tooltip(exchange: DecodedExchange) -> str:
     took = f", {exchange.latency_ns / 1e6:.3g} ms" if exchange.latency_ns is not None else ""
     answer = f"\n{exchange.reply_text}{took}" if exchange.reply_text else ""
     return f"{seconds(exchange.t_ns)}  {exchange.text}{answer}"[:240]

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from fieldtwin.capture.decoding.decoder import Decoder
-from fieldtwin.capture.decoding.exchange import SECRET, Exchange
+from fieldtwin.capture.decoding.exchange import SECRET, DecodedExchange
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.reports.run.coverage import Collector
 from fieldtwin.results.model import CheckResult, Counts, Report, ScenarioResult
@@ -70,7 +70,7 @@ class Window:
     end_ns: int
     at_ns: int
     lost: bool = False
-    exchanges: list[Exchange] = field(default_factory=list)
+    exchanges: list[DecodedExchange] = field(default_factory=list)
     states: dict[str, list[Step]] = field(default_factory=dict)
     tags: dict[str, list[Step]] = field(default_factory=dict)
     faults: list[FaultBar] = field(default_factory=list)
@@ -161,7 +161,7 @@ class Study:
 
     def _event(self, event: Event, inside: list[Window], windows: list[Window]) -> None:
         data = event.data
-        done: tuple[Exchange, ...] = ()
+        done: tuple[DecodedExchange, ...] = ()
         if event.kind is Kind.FRAME:
             if inside:
                 decoded = self._decoder.decode(event)
@@ -185,7 +185,7 @@ class Study:
             self._fault(event)
         self._collector.take(event, done)
 
-    def _exchange(self, exchange: Exchange, windows: list[Window]) -> None:
+    def _exchange(self, exchange: DecodedExchange, windows: list[Window]) -> None:
         for window in windows:
             if exchange.t_ns <= window.end_ns and exchange.end_ns >= window.start_ns:
                 window.exchanges.append(exchange)

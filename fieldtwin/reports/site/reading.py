@@ -26,7 +26,7 @@ MOST_ROWS = 200
 SUFFIXES = (".json", ".jsonl")
 
 
-class NotTaken(FileInvalid):
+class UnknownFileKind(FileInvalid):
     """The file is of a kind that does not belong into the document."""
 
 
@@ -46,7 +46,7 @@ def read_site(
         for file in sorted(p for p in path.rglob("*") if p.suffix in SUFFIXES and p.is_file()):
             try:
                 pieces.append((file, read_piece(file)))
-            except NotTaken as e:
+            except UnknownFileKind as e:
                 left_out.append(str(e))
     if not pieces:
         raise UsageError(
@@ -86,18 +86,20 @@ def read_piece(path: Path) -> Piece:
             if b'"fieldtwin_dump"' in head:
                 return dump_piece(path)
             if head.startswith(b'{"started"'):
-                raise NotTaken("a log of sent frames", path=str(path))
+                raise UnknownFileKind("a log of sent frames", path=str(path))
             raw = head + file.read(MOST_BYTES)
     except OSError as e:
         raise FileInvalid(f"cannot be read: {e.strerror or e}", path=str(path)) from e
     try:
         data = json.loads(raw)
     except (ValueError, RecursionError) as e:
-        raise NotTaken("not JSON", path=str(path), got=str(e)[:60]) from e
+        raise UnknownFileKind("not JSON", path=str(path), got=str(e)[:60]) from e
     kind = data.get("kind") if isinstance(data, dict) else None
     if kind not in READERS:
         known = ", ".join(f"the JSON of `{name}`" for name in READERS)
-        raise NotTaken("not suitable for a document", path=str(path), expected=f"a dump, {known}", got=repr(kind)[:60])
+        raise UnknownFileKind(
+            "not suitable for a document", path=str(path), expected=f"a dump, {known}", got=repr(kind)[:60]
+        )
     try:
         return READERS[kind](data)
     except (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError) as e:

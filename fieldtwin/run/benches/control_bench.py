@@ -19,9 +19,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from fieldtwin.conformance.core.case import Danger
+from fieldtwin.conformance.core.case import Impact
 from fieldtwin.gateway.core.clock import NS_PER_S
-from fieldtwin.gateway.core.concurrency.async_resource import Started
+from fieldtwin.gateway.core.concurrency.async_resource import AsyncResource
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.control import ControlClient, RemoteError
 from fieldtwin.gateway.core.endpoint import Endpoint
@@ -40,9 +40,9 @@ from fieldtwin.run.benches.host_lateness import HostLateness
 from fieldtwin.run.benches.probes import Probes
 from fieldtwin.run.processes.field_contact import check_same, connect_control, reachable
 from fieldtwin.run.processes.states import state_words
-from fieldtwin.run.processes.topside import Shore
+from fieldtwin.run.processes.topside import TopsideController
 from fieldtwin.run.processes.with_program import environment_from
-from fieldtwin.scenarios.bench import Can, Reading, Stopped, variable
+from fieldtwin.scenarios.bench import Can, Stopped, TagReading, variable
 from fieldtwin.scenarios.language.probe_form import Probe
 from fieldtwin.twin.plant.physical import attached, gateway_lost_ms, image_layout
 from fieldtwin.twin.prototype.field_status import FieldStatus
@@ -82,10 +82,10 @@ class Where:
     """The controller is a user's program: there is no fieldtwin gateway to query."""
     env: Mapping[str, str] = field(default_factory=dict)
     """The environment variables that tell that program the endpoints; endpoints of probes may refer to them."""
-    allowed: Danger = Danger.DISRUPT
+    allowed: Impact = Impact.DISRUPT
 
 
-class ControlBench(Started):
+class ControlBench(AsyncResource):
     """A bench: ``async with ControlBench(system, where, trace, target="local", names=[...]) as bench``.
 
     `names` are the tags and variables to read. `fresh` is called with the bench's abilities and returns whether the
@@ -122,7 +122,7 @@ class ControlBench(Started):
         self._gateway: ControlClient | None = None
         self._plc: ControlClient | None = None
         self._field: ControlClient | None = None
-        self._shore: Shore | None = None
+        self._shore: TopsideController | None = None
         self._outputs: RegionReader | None = None
         self._tail: CaptureTail | None = None
         self._probe = probes
@@ -162,7 +162,7 @@ class ControlBench(Started):
             )
         far = Endpoint.parse(where.far) if where.far else await self._far_of_field()
         device = next((d.name for d in self.system.devices.values() if d.profile.inbox is not None), None)
-        if far is not None and device is not None and where.allowed.rank >= Danger.WRITE.rank:
+        if far is not None and device is not None and where.allowed.rank >= Impact.WRITE.rank:
             can.add(Can.SEND_COMMAND)
         can |= {Can.SEE_WIRE} if where.capture is not None else set()
         can |= {Can.PROBE} if self._probe else set()
@@ -175,7 +175,7 @@ class ControlBench(Started):
             assert self.lease is not None
             await make_fresh(self.lease, self._gateway, self._plc)
         if far is not None and device is not None and Can.SEND_COMMAND in self.can:
-            self._shore = Shore(self.system, device, far, self._clock)
+            self._shore = TopsideController(self.system, device, far, self._clock)
             self._shore.on_send = self._commanded
             nursery.start(self._shore.run([]), "far end")
         if where.capture is not None:
@@ -287,7 +287,7 @@ class ControlBench(Started):
     def names(self) -> list[str]:
         return list(self._names)
 
-    def reading(self, name: str) -> Reading | None:
+    def reading(self, name: str) -> TagReading | None:
         if self._probes is not None and name in self._probes.names:
             return self._probes.reading(name)
         if name in self._asked:
@@ -295,7 +295,7 @@ class ControlBench(Started):
             if value is None and not self._updates.get(name):
                 return None
             age_s = (self._seen_ns - t_ns) / NS_PER_S if t_ns else float("inf")
-            return Reading(value, quality, reason.replace(" ", "_"), age_s, self._updates.get(name, 0))
+            return TagReading(value, quality, reason.replace(" ", "_"), age_s, self._updates.get(name, 0))
         if name not in self._names:
             raise UsageError(f"no tag or variable {name!r}", expected="DEVICE.TAG or PROGRAM.VARIABLE")
         value = self._states.get(name)

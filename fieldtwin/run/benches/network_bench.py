@@ -10,17 +10,17 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
-from fieldtwin.conformance.core.case import Danger
+from fieldtwin.conformance.core.case import Impact
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.results.fault_counts import struck_of
 from fieldtwin.results.model import Struck
 from fieldtwin.results.trace import Kind, Trace
-from fieldtwin.run.processes.topside import Shore
-from fieldtwin.scenarios.bench import Bench, Can, Reading, Stopped
+from fieldtwin.run.processes.topside import TopsideController
+from fieldtwin.scenarios.bench import Bench, Can, Stopped, TagReading
 from fieldtwin.twin.network.faults import placed
 from fieldtwin.twin.network.network import WATER, Network
-from fieldtwin.twin.network.water_faults import WaterFaults
+from fieldtwin.twin.network.water_faults import AcousticFaults
 
 
 class MemberTrace(Trace):
@@ -63,13 +63,13 @@ class NetworkBench:
     `parts` by the names of the network's members; `shore` sends from the topside modem.
     """
 
-    def __init__(self, network: Network, trace: Trace, target: str, faults: WaterFaults) -> None:
+    def __init__(self, network: Network, trace: Trace, target: str, faults: AcousticFaults) -> None:
         self.network = network
         self.trace = trace
         self.target = target
-        self.allowed = Danger.DISRUPT
+        self.allowed = Impact.DISRUPT
         self.parts: dict[str, Part] = {}
-        self.shore: Shore | None = None
+        self.shore: TopsideController | None = None
         self.faults = faults
         self._where: dict[str, str] = {}
         """For each fault: its system, or the acoustic channel."""
@@ -101,7 +101,7 @@ class NetworkBench:
     def names(self) -> list[str]:
         return [f"{member}.{name}" for member, part in self.parts.items() for name in part.bench.names()]
 
-    def reading(self, name: str) -> Reading | None:
+    def reading(self, name: str) -> TagReading | None:
         part, local = self._part(name)
         return part.bench.reading(local)
 

@@ -17,7 +17,7 @@ from fieldtwin.gateway.devices.register_device import RegisterDriver
 from fieldtwin.gateway.runtime.buses.modbus_bus import ModbusBus
 from fieldtwin.gateway.runtime.tags import TagTable
 from fieldtwin.results.trace import Event, Kind
-from fieldtwin.scenarios.bench import Reading
+from fieldtwin.scenarios.bench import TagReading
 from fieldtwin.scenarios.language.probe_form import Probe
 
 MOST_EVENTS = 50_000
@@ -65,14 +65,14 @@ class Probes:
                 nursery.start(bus.run(), f"probe {bus.config.name}")
             await nursery.wait()
 
-    def reading(self, name: str) -> Reading | None:
+    def reading(self, name: str) -> TagReading | None:
         """Return the current reading; None if the register was never read."""
         now_ns = self._clock.monotonic_ns()
         seen = self._tags.current(name, now_ns)
         if seen.value is None:
             return None
         value = seen.value.hex() if isinstance(seen.value, bytes) else seen.value
-        return Reading(
+        return TagReading(
             value,
             seen.quality.name.lower(),
             seen.reason.name.lower(),

@@ -10,12 +10,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from fieldtwin.conformance.core.case import Danger
+from fieldtwin.conformance.core.case import Impact
 from fieldtwin.emulators.models.packet_link import ModemEnd
 from fieldtwin.emulators.virtual.loop import VirtualLoop
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
-from fieldtwin.gateway.core.concurrency.async_resource import Started
+from fieldtwin.gateway.core.concurrency.async_resource import AsyncResource
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.connection import Direction
 from fieldtwin.gateway.core.endpoint import Endpoint
@@ -29,8 +29,8 @@ from fieldtwin.results.model import Struck
 from fieldtwin.results.trace import FAR_END, Kind, Trace, refusal_data
 from fieldtwin.run.benches.probes import Probes
 from fieldtwin.run.processes.states import state_words
-from fieldtwin.run.processes.topside import Scripted, Shore
-from fieldtwin.scenarios.bench import Can, Reading, Stopped, variable
+from fieldtwin.run.processes.topside import Scripted, TopsideController
+from fieldtwin.scenarios.bench import Can, Stopped, TagReading, variable
 from fieldtwin.scenarios.language.probe_form import Probe
 from fieldtwin.twin.prototype.file import Prototype
 from fieldtwin.twin.prototype.virtual import VirtualPrototype
@@ -42,7 +42,7 @@ _REASONS = {reason: reason.name.lower() for reason in Reason}
 _FRAME, _TAG, _SENT = Kind.FRAME, Kind.TAG, Direction.SENT  # an Enum's members are slow to look up
 
 
-class VirtualBench(Started):
+class VirtualBench(AsyncResource):
     """A bench: ``async with VirtualBench(system, prototype, loop, run_dir, trace, seed=7) as bench``, inside `loop`.
 
     `commands` are those that the remote client sends by itself; a scenario uses `send` instead. `far_end` False omits
@@ -78,7 +78,7 @@ class VirtualBench(Started):
             on_refusal=self._refused,
             water=water,
         )
-        self.shore: Shore | None = None
+        self.shore: TopsideController | None = None
         self._commands = commands or []
         self._far_end = far_end
         self._probe = probes
@@ -93,7 +93,7 @@ class VirtualBench(Started):
         }
 
     target = "virtual"
-    allowed = Danger.DISRUPT
+    allowed = Impact.DISRUPT
     can = frozenset(
         {
             Can.INJECT_FAULT,
@@ -112,7 +112,9 @@ class VirtualBench(Started):
         self.run.gateway.tags.subscribe(self._put)
         device = next(iter(self.run.field.far), None)
         if device is not None and self._far_end:
-            self.shore = Shore(self.system, device, self.run.field.far[device], self.run.clock, self.run.net)
+            self.shore = TopsideController(
+                self.system, device, self.run.field.far[device], self.run.clock, self.run.net
+            )
             self.shore.on_send = self._commanded
             nursery = await self._stack.enter_async_context(Nursery())
             nursery.start(self.shore.run(self._commands), "far end")
@@ -190,7 +192,7 @@ class VirtualBench(Started):
         probed = self._probes.names if self._probes is not None else []
         return [*self.run.gateway.tags.names, *self.run.plc.outputs.last(), *probed]
 
-    def reading(self, name: str) -> Reading | None:
+    def reading(self, name: str) -> TagReading | None:
         if self._probes is not None and name in self._probes.names:
             return self._probes.reading(name)
         outputs = self.run.plc.outputs.last()
@@ -204,7 +206,7 @@ class VirtualBench(Started):
         seen = self.run.gateway.tags.current(name, now_ns)
         if not self._updates.get(name) and seen.value is None:
             return None
-        return Reading(
+        return TagReading(
             seen.value,
             seen.quality.name.lower(),
             seen.reason.name.lower(),

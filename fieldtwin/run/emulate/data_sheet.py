@@ -8,7 +8,7 @@ from tempfile import TemporaryDirectory
 
 from fieldtwin.capture.formats.candump import read_log
 from fieldtwin.capture.recordings.log_sheet import LogSheet, nodes_of
-from fieldtwin.console import talk
+from fieldtwin.console import stderr
 from fieldtwin.emulators.canopen.dictionary import Dictionary, load_eds
 from fieldtwin.emulators.canopen.lss import UNCONFIGURED
 from fieldtwin.emulators.canopen.node import CanopenNode, NodeContext
@@ -50,7 +50,7 @@ async def run_data_sheet(
     options = options or NodeOptions()
     dictionary = load_eds(path, parameter_values=options.parameter_values)
     for note in dictionary.notes:
-        talk.print(f"{path.name}, {note}", soft_wrap=True)
+        stderr.print(f"{path.name}, {note}", soft_wrap=True)
     wires = [Endpoint.parse(url) for url in endpoints]
     wire = only_bus(wires)
     node = _node(dictionary, node_id or dictionary.node_id or DEFAULT_NODE_ID, log, options)
@@ -62,7 +62,7 @@ async def run_data_sheet(
         async with Nursery() as nursery:  # inside: servers stop before their connections close
             connection, where = await stand_on_bus(wire, bitrate or dictionary.bit_rate, path.stem, closing)
             nursery.start(serve_node(connection, node, WallClock()), f"node on {wire}")
-            talk.print(f"{_named(node)} on {where}", soft_wrap=True)
+            stderr.print(f"{_named(node)} on {where}", soft_wrap=True)
             await until_stopped(nursery, stop)
     finally:
         for thing in reversed(closing):
@@ -83,7 +83,7 @@ async def run_log(path: Path, endpoints: tuple[str, ...], node_id: int | None, b
         raise UsageError(f"{path.name}: the node is not given", expected=f"--node, one of {', '.join(map(str, there))}")
     node_id = node_id or there[0]
     text = LogSheet(frames(), node_id).eds(path.stem)
-    talk.print(f"node {node_id} has what {path.name} has of it; names and meanings are not known", soft_wrap=True)
+    stderr.print(f"node {node_id} has what {path.name} has of it; names and meanings are not known", soft_wrap=True)
     with TemporaryDirectory(prefix="fieldtwin-") as folder:
         sheet = Path(folder) / f"{path.stem}.eds"
         sheet.write_text(text, encoding="utf-8")
@@ -98,7 +98,7 @@ def print_remarks(name: str, found: Iterable[Remark]) -> None:
             advice = " (--defaults starts with the DefaultValues)"
         elif remark.model:
             advice = " (--model 402 chooses a model, --model none means it)"
-        talk.print(f"{name}: {remark.text}{advice}", soft_wrap=True, markup=False)
+        stderr.print(f"{name}: {remark.text}{advice}", soft_wrap=True, markup=False)
 
 
 def _node(dictionary: Dictionary, node_id: int, log: Path | None, options: NodeOptions) -> CanopenNode:

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from fieldtwin.capture.recordings.rotating_file import exchanges_of, header_of, oldest_part
-from fieldtwin.console import talk
+from fieldtwin.console import stderr
 from fieldtwin.emulators.canopen.serve import serve_node
-from fieldtwin.emulators.context import WhenUsedUp
+from fieldtwin.emulators.context import EndOfRecording
 from fieldtwin.emulators.device_faults import DeviceFaults
 from fieldtwin.emulators.distorted_registers import DistortedRegisters
 from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
@@ -34,7 +34,7 @@ from fieldtwin.emulators.modbus.rtu import RtuSlave
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.emulators.models.emulated_node import NodeOptions, emulated_node
 from fieldtwin.emulators.models.mailbox_modem import ModemPair
-from fieldtwin.emulators.models.register_device import StatedRegisters, add_own_functions
+from fieldtwin.emulators.models.register_device import ProfileRegisters, add_own_functions
 from fieldtwin.emulators.models.sampled_sensor import SampledSensor
 from fieldtwin.emulators.recorded_device import load_replay
 from fieldtwin.emulators.replay.can_log import SUFFIX, CanLog
@@ -77,7 +77,7 @@ async def run_device(
     bitrate: int | None = None,
     *,
     unknown: NeverRecorded = NeverRecorded.EXCEPTION,
-    at_end: WhenUsedUp = WhenUsedUp.HOLD,
+    at_end: EndOfRecording = EndOfRecording.HOLD,
     options: NodeOptions | None = None,
     extras: Extras | None = None,
 ) -> int:
@@ -113,7 +113,7 @@ async def run_device(
     finally:
         await host.aclose()
         for active in host.put_in:
-            talk.print(struck(active), soft_wrap=True, markup=False)
+            stderr.print(struck(active), soft_wrap=True, markup=False)
     return 0
 
 
@@ -163,16 +163,16 @@ class DeviceHost:
         Without either, the device is built from its profile alone.
         """
         if recording is None and self._recording_of(profile) is None:
-            talk.print(f"{profile.name}: no recording; every register of its profile begins with 0", soft_wrap=True)
+            stderr.print(f"{profile.name}: no recording; every register of its profile begins with 0", soft_wrap=True)
             return self._stated(profile, {})
         path = find_recording(str(recording or f"{Path(profile.path).stem}.jsonl"))
         replay, recorded = load_replay(profile, path)
-        talk.print(f"{profile.name} plays {shown(path)}", soft_wrap=True)
+        stderr.print(f"{profile.name} plays {shown(path)}", soft_wrap=True)
         return ProfiledReplay(profile, replay, recorded)
 
     def _stated(self, profile: DeviceProfile, values: Mapping[str, float | str]) -> ModbusUnit:
         """Return a device that is defined by its profile and the initial values of its tags alone."""
-        bank = StatedRegisters(profile, values, self._clock.monotonic_ns())
+        bank = ProfileRegisters(profile, values, self._clock.monotonic_ns())
         seen = DistortedRegisters(bank, bank.peek, profile, bank.journal)
         unit = ModbusUnit(seen, unit_limits(profile), name=profile.name, **parts_of(profile))
         add_own_functions(unit, bank, profile)
@@ -192,7 +192,7 @@ class DeviceHost:
         return self._faults.put_in if self._faults is not None else []
 
     def replayed(
-        self, path: Path, unit_id: int | None, unknown: NeverRecorded, at_end: WhenUsedUp
+        self, path: Path, unit_id: int | None, unknown: NeverRecorded, at_end: EndOfRecording
     ) -> dict[int, ModbusUnit]:
         """Return the units of a recording of exchanges, or only the requested one. A single unit answers any unit ID."""
         if header_of(path).kind != "exchanges":
@@ -204,9 +204,9 @@ class DeviceHost:
         replay = ExchangeReplay(exchanges_of(path), never_recorded=unknown, when_used_up=at_end)
         if not replay.units:
             raise UsageError("the recording holds no exchange", where=str(path))
-        talk.print(f"plays {shown(oldest_part(path))}", soft_wrap=True)
+        stderr.print(f"plays {shown(oldest_part(path))}", soft_wrap=True)
         if replay.context.dropped:
-            talk.print(
+            stderr.print(
                 f"  the recording is too long: the oldest {replay.context.dropped} exchanges are left out",
                 soft_wrap=True,
             )
@@ -234,8 +234,8 @@ class DeviceHost:
             raise UsageError(f"{profile.name} needs a recording", hint="--recording FILE")
         path = find_recording(str(name))
         track = SignalTrack.load(path)
-        talk.print(f"{profile.name} plays {shown(path)}", soft_wrap=True)
-        return SignalPlayer(track, self._clock.monotonic_ns(), speed=self._speed, at_end=WhenUsedUp.LOOP)
+        stderr.print(f"{profile.name} plays {shown(path)}", soft_wrap=True)
+        return SignalPlayer(track, self._clock.monotonic_ns(), speed=self._speed, at_end=EndOfRecording.LOOP)
 
     async def serve(self, nursery: Nursery, units: dict[int, ModbusUnit], wire: Endpoint) -> None:
         """Serve Modbus units on a serial port, real or virtual, a serial line over a socket, or Modbus over TCP, UDP or TLS.
@@ -260,7 +260,7 @@ class DeviceHost:
             datagrams = end if faults is None else FaultyDatagrams(end, faults)
             self._closing.append(datagrams)
             nursery.start(serve_udp(datagrams, self._mbap(units), self._clock, as_recorded()), f"units on {wire}")
-            talk.print(f"units {_list(units)} on {end.bound}", soft_wrap=True)
+            stderr.print(f"units {_list(units)} on {end.bound}", soft_wrap=True)
         else:
             raise UsageError(
                 f"cannot emulate on {wire}",
@@ -273,7 +273,7 @@ class DeviceHost:
         end = self._behind_faults(await OsConnector().open_bytes(wire), line)
         self._closing.append(end)
         nursery.start(serve_rtu(end, line, self._clock, as_recorded(wire.serial)), f"units on {wire}")
-        talk.print(
+        stderr.print(
             f"units {_list(units)} on the port {wire.path} ({wire.serial.baudrate} {wire.serial.frame})", soft_wrap=True
         )
 
@@ -287,7 +287,7 @@ class DeviceHost:
         serving = serve_rtu(end, line, self._clock, as_recorded(plant.serial), echo=echo)
         nursery.start(serving, f"units on {wire}")
         framing = f"{plant.serial.baudrate} {plant.serial.frame}" + (", ASCII" if scheme == "ascii" else "")
-        talk.print(f"units {_list(units)} on {wire.path} ({framing})", soft_wrap=True)
+        stderr.print(f"units {_list(units)} on {wire.path} ({framing})", soft_wrap=True)
 
     async def _listen(
         self, wire: Endpoint, units: dict[int, ModbusUnit], on_client: OnClient, max_clients: int
@@ -297,7 +297,7 @@ class DeviceHost:
             on_client = _behind(self._faults.on_wire(framing), on_client)
         listener = await SocketListener.open(wire, on_client, max_clients)
         self._closing.append(listener)
-        talk.print(f"units {_list(units)} on {listener.bound}", soft_wrap=True)
+        stderr.print(f"units {_list(units)} on {listener.bound}", soft_wrap=True)
 
     def _mbap(self, units: dict[int, ModbusUnit]) -> MbapSlave:
         return MbapSlave(units, any_unit=self._extras.any_unit)
@@ -322,7 +322,7 @@ class DeviceHost:
         played: SignalPlayer | CanLog | None = None
         if recording is not None and recording.suffix == SUFFIX:
             played = CanLog(find_recording(str(recording)))
-            talk.print(f"{profile.name} plays {played.path.name} (a log of a CAN bus)", soft_wrap=True)
+            stderr.print(f"{profile.name} plays {played.path.name} (a log of a CAN bus)", soft_wrap=True)
         elif recording or self._recording_of(profile):
             played = self._player(profile, recording)
         number, now_ns = node_id or profile.form.factory.node, self._clock.monotonic_ns()
@@ -335,7 +335,7 @@ class DeviceHost:
         finally:
             self._closing += opened
         nursery.start(serve_node(connection, node, self._clock), f"node on {wire}")
-        talk.print(f"node {node.node_id} on {where}", soft_wrap=True)
+        stderr.print(f"node {node.node_id} on {where}", soft_wrap=True)
 
     async def aclose(self) -> None:
         for thing in reversed(self._closing):

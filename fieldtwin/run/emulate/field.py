@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from fieldtwin.console import talk
+from fieldtwin.console import stderr
 from fieldtwin.twin.plant.child import allow_open_files
 from fieldtwin.twin.plant.instance import Instance
 from fieldtwin.twin.prototype.field import FieldSide
@@ -49,19 +49,19 @@ async def run_field(options: FieldOptions) -> int:
 
 
 def _say(side: FieldSide, process: FieldProcess, options: FieldOptions) -> None:
-    talk.print(f"[bold]field simulator[/bold] of {side.system.name}")
+    stderr.print(f"[bold]field simulator[/bold] of {side.system.name}")
     for bus, endpoint in side.listening.items():
         devices = ", ".join(d.name for d in side.system.devices_on(bus))
-        talk.print(f"  {bus}: {endpoint}  ({devices})", soft_wrap=True)
+        stderr.print(f"  {bus}: {endpoint}  ({devices})", soft_wrap=True)
     for name, emulated in side.devices.items():
-        talk.print(f"  {name}: from {emulated.plays}", soft_wrap=True)
+        stderr.print(f"  {name}: from {emulated.plays}", soft_wrap=True)
         for remark in emulated.remarks:
-            talk.print(f"  {name}: {remark}", soft_wrap=True, markup=False)
+            stderr.print(f"  {name}: {remark}", soft_wrap=True, markup=False)
     for device, endpoint in side.far.items():
-        talk.print(f"  topside end of {device}: {endpoint}", soft_wrap=True)
+        stderr.print(f"  topside end of {device}: {endpoint}", soft_wrap=True)
     host = options.control.rpartition(":")[0]
     where = (
         "" if host in ("", "127.0.0.1", "localhost") and process.control_port == 7420 else f":{process.control_port}"
     )
     here = "localhost" if host in ("", "127.0.0.1", "localhost") else "THIS-HOST"
-    talk.print(f"  now: fieldtwin run {side.system.name} --prototype --field {here}{where}", soft_wrap=True)
+    stderr.print(f"  now: fieldtwin run {side.system.name} --prototype --field {here}{where}", soft_wrap=True)

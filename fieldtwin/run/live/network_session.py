@@ -13,17 +13,17 @@ from typing import Any
 
 from fieldtwin.emulators.endpoints.acoustic_end import AcousticServer
 from fieldtwin.emulators.endpoints.ports import OsPorts
-from fieldtwin.gateway.core.concurrency.async_resource import Started
+from fieldtwin.gateway.core.concurrency.async_resource import AsyncResource
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.run.live.options import RunOptions
 from fieldtwin.run.live.session import RunSession
-from fieldtwin.run.processes.topside import Scripted, Shore
+from fieldtwin.run.processes.topside import Scripted, TopsideController
 from fieldtwin.twin.network.faults import placed_all
 from fieldtwin.twin.network.network import WATER, Network
-from fieldtwin.twin.network.ship import Ship
-from fieldtwin.twin.network.water_faults import WaterFaults
+from fieldtwin.twin.network.ship import TopsideModem
+from fieldtwin.twin.network.water_faults import AcousticFaults
 from fieldtwin.twin.plant.instance import Instance
 
 
@@ -48,7 +48,7 @@ class NetworkOptions:
     """The address on which each system's thread listens, at a free port. Empty for none."""
 
 
-class NetworkSession(Started):
+class NetworkSession(AsyncResource):
     """``async with NetworkSession(network, options) as it: await it.wait()``. `sessions` by the names of the members."""
 
     def __init__(self, network: Network, options: NetworkOptions) -> None:
@@ -57,11 +57,11 @@ class NetworkSession(Started):
         self.options = options
         self.seed = network.seed if options.seed is None else options.seed
         self.clock = WallClock()
-        self.faults = WaterFaults(network, self.seed)
+        self.faults = AcousticFaults(network, self.seed)
         self.medium = network.medium(self.seed, self.faults.spoils)
         self.instance = Instance(options.instance or network.name)
         self.sessions: dict[str, RunSession] = {}
-        self.shore: Shore | None = None
+        self.shore: TopsideController | None = None
         self.ship: Endpoint | None = None
         self.stopped = asyncio.Event()
         self.started_ns = 0
@@ -76,7 +76,7 @@ class NetworkSession(Started):
         await self._stack.enter_async_context(self._nursery)
         self._nursery.start(server.run(), "water")
         if self.network.ship is not None:
-            ship = Ship(self.network, self.medium, self.clock)
+            ship = TopsideModem(self.network, self.medium, self.clock)
             self.ship = await ship.open(OsPorts())
             self._stack.push_async_callback(ship.aclose)
         await self._start_systems(socket)
@@ -85,7 +85,7 @@ class NetworkSession(Started):
             self.faults.inject(fault)
         if self.ship is not None:
             like = next(iter(self.network.members.values()))
-            self.shore = Shore(like.system, like.modem, self.ship, self.clock)
+            self.shore = TopsideController(like.system, like.modem, self.ship, self.clock)
             self._nursery.start(self.shore.run(list(self.options.commands)), "ship")
 
     async def _stop(self) -> None:

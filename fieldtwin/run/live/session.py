@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import msgspec
 
-from fieldtwin.conformance.core.case import Danger
-from fieldtwin.console import talk
+from fieldtwin.conformance.core.case import Impact
+from fieldtwin.console import stderr
 from fieldtwin.gateway.core.clock import NS_PER_S
-from fieldtwin.gateway.core.concurrency.async_resource import Started
+from fieldtwin.gateway.core.concurrency.async_resource import AsyncResource
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.control import ControlClient, OtherVersion
 from fieldtwin.gateway.core.endpoint import Endpoint
@@ -35,7 +35,7 @@ from fieldtwin.run.processes.field_return import FieldReturn, is_loss
 from fieldtwin.run.processes.reloading import Reloaded, reload
 from fieldtwin.run.processes.states import StateWatch, expected_states
 from fieldtwin.run.processes.thread_return import ThreadReturn
-from fieldtwin.run.processes.topside import Shore, script
+from fieldtwin.run.processes.topside import TopsideController, script
 from fieldtwin.twin.plant.controller import ControllerConfig
 from fieldtwin.twin.plant.instance import Instance
 from fieldtwin.twin.plant.mapping import mapping_to_json
@@ -69,7 +69,7 @@ FIELD_LINGER_S = 1.5
 T = TypeVar("T")
 
 
-class RunSession(Started):
+class RunSession(AsyncResource):
     """One run. ``async with RunSession(options) as run: await run.wait()``, then `summary`.
 
     `gateway_status`, `plc_status` and `field_status` hold the latest of each, `None` while a process does not answer.
@@ -81,7 +81,7 @@ class RunSession(Started):
         self.clock = WallClock()
         self.system: System = load_system(options.system, options.profiles)
         self.twin = PhysicalTwin(self.system)
-        self.lent = self._lent_to_the_thread()
+        self.delegated = self._lent_to_the_thread()
         if options.prototype and not options.field_host:
             from fieldtwin.twin.prototype.field_process import (
                 resolve,  # here and below: a plant has no emulators installed
@@ -105,7 +105,7 @@ class RunSession(Started):
             self.invariants = InvariantWatch(self.system)
         self._judging: asyncio.Task[None] | None = None
         self.states = StateWatch(self.system)
-        self.shore: Shore | None = None
+        self.shore: TopsideController | None = None
         self.gateway_status: dict[str, Any] | None = None
         self.plc_status: PlcStatus | None = None
         self.field_status: FieldStatus | None = None
@@ -131,17 +131,19 @@ class RunSession(Started):
     def _lent_to_the_thread(self) -> str:
         """Return the transmitter whose mailboxes the thread uses, if any. Raises `UsageError` if that is not possible."""
         o = self.options
-        lent = lent_transmitter(o.thread, self.system)
-        if lent and not o.prototype and not o.allow_writes:
+        delegated = lent_transmitter(o.thread, self.system)
+        if delegated and not o.prototype and not o.allow_writes:
             raise UsageError(
-                f"a thread over {lent!r} writes into its mailbox", expected="--allow-writes", got=f"--thread {o.thread}"
+                f"a thread over {delegated!r} writes into its mailbox",
+                expected="--allow-writes",
+                got=f"--thread {o.thread}",
             )
-        if lent and o.commands:
+        if delegated and o.commands:
             raise UsageError(
-                f"the topside end of {lent!r} belongs to the digital twin", expected="--commands none",
+                f"the topside end of {delegated!r} belongs to the digital twin", expected="--commands none",
                 hint="`fieldtwin twin ... --command 1` commands over the thread",
             )  # fmt: skip
-        return lent
+        return delegated
 
     @property
     def disturbed(self) -> bool:
@@ -181,7 +183,7 @@ class RunSession(Started):
                 outputs_confirmed_safe=self.outputs_confirmed_safe,
                 field_contact=self.field_return.describe() if self.field_return is not None else None,
                 thread=self.thread_status,
-                delegated=self.lent,
+                delegated=self.delegated,
             )
         )
 
@@ -205,7 +207,7 @@ class RunSession(Started):
             mapping=mapping_to_json(self.mapping) if self.options.prototype else None,
             profiles=tuple(str(p.resolve()) for p in self.options.profiles),
             capture=str(self.options.capture.resolve()) if self.options.capture else "",
-            lent=(self.lent,) if self.lent else (),
+            delegated=(self.delegated,) if self.delegated else (),
         )
         await self._start_child("gateway", "fieldtwin.twin.plant.controller", self._write("gateway.json", gateway))
         self._stack.enter_context(self.states.attached(ecs.layout, run_dir / "image"))
@@ -232,18 +234,18 @@ class RunSession(Started):
             profiles=tuple(str(p.resolve()) for p in o.profiles),
             mapping=mapping_to_json(self.mapping) if o.prototype else None,
             every_ms=round(
-                1000 * (o.thread_every_s if o.thread_every_s is not None else MODEM_EVERY_S if self.lent else 0)
+                1000 * (o.thread_every_s if o.thread_every_s is not None else MODEM_EVERY_S if self.delegated else 0)
             ),
         )
         client = await self._start_child(
             "thread", "fieldtwin.twin.thread.plant_thread", self._write("thread.json", config)
         )
         self.thread_place = str((await client.call("get"))["place"])
-        if not self.lent:  # the address for a restart, even if the port was chosen freely
+        if not self.delegated:  # the address for a restart, even if the port was chosen freely
             config = msgspec.structs.replace(config, place=self.thread_place)
         self._keep_thread(config)
-        if self.lent in self.far:
-            self.thread_place = f"{MODEM}{self.far[self.lent]}"
+        if self.delegated in self.far:
+            self.thread_place = f"{MODEM}{self.far[self.delegated]}"
 
     def _keep_thread(self, config: PlantThreadConfig) -> None:
         def another() -> Child:
@@ -307,7 +309,7 @@ class RunSession(Started):
         self.mapping, self.far = self._field.mapping, self._field.far
         self.counted_before, self.clients_before = self._field.counted_before, self._field.clients_before
         for remark in self._field.remarks:
-            talk.print(remark, soft_wrap=True, markup=False)
+            stderr.print(remark, soft_wrap=True, markup=False)
 
     async def _lay_cables(self, run_dir: Path) -> None:
         """Make a cable for each bridge that listens on a serial line. The plant's own ports are not opened."""
@@ -345,7 +347,7 @@ class RunSession(Started):
         if device is not None and self.options.prototype and self.options.commands:
             # Without commands another client uses the remote end (`fieldtwin shore`): two clients would divide the
             # responses.
-            self.shore = Shore(self.system, device, self.far[device], self.clock)
+            self.shore = TopsideController(self.system, device, self.far[device], self.clock)
             commands = script(self.options.commands, self.options.duration_s or 20.0)
             self._nursery.start(self.shore.run(commands), "far end")
 
@@ -369,7 +371,7 @@ class RunSession(Started):
         """Check the invariants of the system file until the gateway or the PLC ends, or the run is stopped."""
         from fieldtwin.run.benches.control_bench import ControlBench, Where
 
-        where = Where(self.instance.dir, plant=True, allowed=Danger.OBSERVE)
+        where = Where(self.instance.dir, plant=True, allowed=Impact.OBSERVE)
         try:
             async with ControlBench(self.system, where, Trace(1), target="real", names=invariants.names) as bench:
                 await invariants.run(bench, INVARIANTS_S)

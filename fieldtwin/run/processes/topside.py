@@ -66,7 +66,7 @@ def parse_periods(text: str) -> tuple[int, ...]:
     return periods
 
 
-class Shore:
+class TopsideController:
     """The remote end of one transmitter of `system`, reached at `endpoint`."""
 
     def __init__(

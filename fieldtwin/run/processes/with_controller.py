@@ -19,7 +19,7 @@ from pathlib import Path
 
 import msgspec
 
-from fieldtwin.gateway.core.concurrency.async_resource import Started
+from fieldtwin.gateway.core.concurrency.async_resource import AsyncResource
 from fieldtwin.gateway.core.errors import FieldtwinError, UsageError
 from fieldtwin.run.processes.children import Child, ChildFailed
 from fieldtwin.run.processes.field_contact import contact_here
@@ -37,7 +37,7 @@ class ControllerEnded(FieldtwinError):
     """The user's control program ended during the test."""
 
 
-class WithController(Started):
+class WithController(AsyncResource):
     """Both processes: ``async with WithController(system, config, argv, name) as both``.
 
     `name` is the run directory's; it is removed at the end. Raises `UsageError` for a program that does not exist,

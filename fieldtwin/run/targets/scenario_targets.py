@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
 
-from fieldtwin.conformance.core.case import Danger
+from fieldtwin.conformance.core.case import Impact
 from fieldtwin.gateway.core.errors import FieldtwinError
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.reports.run.coverage import Collector
@@ -58,7 +58,7 @@ class Target:
     token: str = field(default="", repr=False)
     far: str = ""
     capture: Path | None = None
-    allow: Danger = Danger.READ
+    allow: Impact = Impact.READ
     can: str = ""
     controller: tuple[str, ...] = ()
 
@@ -204,7 +204,7 @@ async def _run(scenario: Scenario, target: Target, trace: Trace) -> ScenarioResu
                 capture=session.options.capture,
                 own=target.name == "local",
                 plant=target.name == "real",
-                allowed=target.allow if target.name == "real" else Danger.DISRUPT,
+                allowed=target.allow if target.name == "real" else Impact.DISRUPT,
             )
 
             def ended() -> FieldtwinError | None:
@@ -251,7 +251,7 @@ def _session(scenario: Scenario, target: Target) -> RunSession:
     options = RunOptions(
         system=str(scenario.system.path),
         prototype=not plant,
-        allow_writes=plant and target.allow.rank >= Danger.WRITE.rank,
+        allow_writes=plant and target.allow.rank >= Impact.WRITE.rank,
         instance=name,
         profiles=scenario.profiles,
         prototype_file=prototype_of(scenario),
@@ -295,5 +295,5 @@ async def _running(scenario: Scenario, target: Target) -> Where:
         far=target.far,
         capture=target.capture,
         plant=plant,
-        allowed=target.allow if plant else Danger.DISRUPT,
+        allowed=target.allow if plant else Impact.DISRUPT,
     )

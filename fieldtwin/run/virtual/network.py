@@ -13,21 +13,21 @@ from fieldtwin.emulators.endpoints.memory_ports import MemoryNet
 from fieldtwin.emulators.models.acoustic_link import AcousticLink
 from fieldtwin.emulators.virtual.clock import VirtualClock
 from fieldtwin.emulators.virtual.loop import VirtualLoop
-from fieldtwin.gateway.core.concurrency.async_resource import Started
+from fieldtwin.gateway.core.concurrency.async_resource import AsyncResource
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.results.trace import FAR_END, Kind, Trace
 from fieldtwin.run.benches.network_bench import MemberTrace, NetworkBench, Part
 from fieldtwin.run.benches.virtual_bench import VirtualBench
-from fieldtwin.run.processes.topside import Scripted, Shore
+from fieldtwin.run.processes.topside import Scripted, TopsideController
 from fieldtwin.twin.network.network import Network
-from fieldtwin.twin.network.ship import Ship
-from fieldtwin.twin.network.water_faults import WaterFaults
+from fieldtwin.twin.network.ship import TopsideModem
+from fieldtwin.twin.network.water_faults import AcousticFaults
 
 SEEDS_APART = 1_000_003
 """Distance between the seeds of a run's systems, so that none repeats the random numbers of another."""
 
 
-class VirtualNetwork(Started):
+class VirtualNetwork(AsyncResource):
     """A network: ``async with VirtualNetwork(network, loop, folder, trace, seed=7) as it``, inside `loop`.
 
     `it.bench` is a scenario's bench. `folder` takes each system's audit log. `commands` are those that the topside
@@ -47,7 +47,7 @@ class VirtualNetwork(Started):
         super().__init__()
         self.network = network
         self.trace = trace
-        self.faults = WaterFaults(network, seed)
+        self.faults = AcousticFaults(network, seed)
         self.medium = network.medium(seed, self.faults.spoils)
         self.bench = NetworkBench(network, trace, "virtual", self.faults)
         self.systems: dict[str, VirtualBench] = {}
@@ -85,10 +85,10 @@ class VirtualNetwork(Started):
     async def _board(self) -> None:
         """Open the topside modem and its controller."""
         clock, net = VirtualClock(self._loop), MemoryNet(self._loop)
-        ship = Ship(self.network, self.medium, clock)
+        ship = TopsideModem(self.network, self.medium, clock)
         endpoint = await ship.open(net)
         self._stack.push_async_callback(ship.aclose)
-        self.bench.shore = shore = Shore(ship.like.system, ship.like.modem, endpoint, clock, net)
+        self.bench.shore = shore = TopsideController(ship.like.system, ship.like.modem, endpoint, clock, net)
         shore.on_send = self._commanded
         nursery = await self._stack.enter_async_context(Nursery())
         nursery.start(shore.run(self._commands), "ship")

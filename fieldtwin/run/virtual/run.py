@@ -28,7 +28,7 @@ from fieldtwin.run.benches.invariant_watch import InvariantWatch
 from fieldtwin.run.benches.virtual_bench import VirtualBench
 from fieldtwin.run.live.summary import RunFacts, summarise
 from fieldtwin.run.processes.states import StateWatch, expected_states
-from fieldtwin.run.processes.topside import Shore, script
+from fieldtwin.run.processes.topside import TopsideController, script
 from fieldtwin.run.virtual.age_oracle import AgeOracle
 from fieldtwin.run.virtual.driven import DrivenRun
 from fieldtwin.run.virtual.fault_schedule import RandomFaults, random_schedule
@@ -110,7 +110,7 @@ class VirtualRun(DrivenRun):
         self.outputs_confirmed_safe: bool | None = None
         self.mapping: dict[Endpoint, Endpoint] = {}
         self.far: dict[str, Endpoint] = {}
-        self.shore: Shore | None = None
+        self.shore: TopsideController | None = None
         self._numbers: dict[str, int] = {}
         self._emulated: frozenset[str] = frozenset()
 

@@ -1,6 +1,6 @@
 """The process that answers a question: ``python -m fieldtwin.run.what_if.asked``. It reads one JSON object and writes one.
 
-Input, as `Asked`: a system, its known state, a command and the requirements. Output: ``{"objection": TEXT}``, empty if
+Input, as `QuestionMessage`: a system, its known state, a command and the requirements. Output: ``{"objection": TEXT}``, empty if
 nothing speaks against the command. With ``"only_check": true`` nothing is run, and the objection is an error in the
 question.
 """
@@ -15,17 +15,17 @@ import msgspec
 
 from fieldtwin.gateway.core.errors import FieldtwinError
 from fieldtwin.run.processes.topside import Scripted
-from fieldtwin.run.what_if.asking import Asked
+from fieldtwin.run.what_if.asking import QuestionMessage
 from fieldtwin.run.what_if.fork import Fork, answer, check
-from fieldtwin.run.what_if.outcome import Outcome
-from fieldtwin.run.what_if.plan import Plan
+from fieldtwin.run.what_if.outcome import PlanOutcome
+from fieldtwin.run.what_if.plan import WhatIfPlan
 from fieldtwin.run.what_if.state import KnownState
 
 NICE = 5
 """Niceness of the process: a plant or twin on the same computer has priority."""
 
 
-def objection(asked: Asked) -> str:
+def objection(asked: QuestionMessage) -> str:
     """Return the prototype's objection to the command; empty if all requirements hold."""
     fork = Fork(
         asked.system,
@@ -35,7 +35,7 @@ def objection(asked: Asked) -> str:
         Path(asked.prototype_file) if asked.prototype_file else None,
         settle_s=asked.settle_s,
     )
-    plan = Plan("the command", (Scripted(0.0, asked.period_s),), (), asked.require, asked.finally_)
+    plan = WhatIfPlan("the command", (Scripted(0.0, asked.period_s),), (), asked.require, asked.finally_)
     try:
         if asked.only_check:
             check(fork, plan)
@@ -45,7 +45,7 @@ def objection(asked: Asked) -> str:
         return str(e)
 
 
-def told(outcome: Outcome) -> str:
+def told(outcome: PlanOutcome) -> str:
     """Return why a plan must not be followed: its fork failed, or the first requirement that does not hold."""
     if outcome.error:
         return f"the prototype failed: {outcome.error}"
@@ -63,7 +63,7 @@ def main() -> int:
         os.nice(NICE)
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # output of control logic must not mix with the answer
-    asked = msgspec.json.decode(sys.stdin.buffer.read(), type=Asked)
+    asked = msgspec.json.decode(sys.stdin.buffer.read(), type=QuestionMessage)
     with answers:
         answers.write(msgspec.json.encode({"objection": objection(asked)}) + b"\n")
     return 0

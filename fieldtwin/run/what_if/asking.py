@@ -32,7 +32,7 @@ MOST_KEPT = 1 << 16
 """Bytes of the process's output that are kept."""
 
 
-class Asked(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class QuestionMessage(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A question as it is sent to the process `fieldtwin.run.what_if.asked`.
 
     `require`, `finally_`, `horizon_s` and `settle_s` are as in `fieldtwin.twin.model.mape.what_if.Question`.
@@ -128,9 +128,9 @@ class Asking:
             found = str(e)
         return f"simulated: {found}" if found else ""
 
-    def _form(self, question: Question, command: COMMAND | None = None, *, only_check: bool = False) -> Asked:
+    def _form(self, question: Question, command: COMMAND | None = None, *, only_check: bool = False) -> QuestionMessage:
         state = self.known.state("")
-        return Asked(
+        return QuestionMessage(
             str(self._subject.system.path),
             question.horizon_s,
             question.require,
@@ -144,7 +144,7 @@ class Asking:
             only_check,
         )
 
-    async def _process(self, asked: Asked) -> str:
+    async def _process(self, asked: QuestionMessage) -> str:
         """Return the objection of a separate process. Raises `Unreachable` if it took too long or died."""
         try:
             process = await asyncio.create_subprocess_exec(

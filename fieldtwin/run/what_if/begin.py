@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from fieldtwin.emulators.distorted_registers import DistortedRegisters
-from fieldtwin.emulators.models.register_device import StatedRegisters
+from fieldtwin.emulators.models.register_device import ProfileRegisters
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.gateway.core.statemachine import encode_period
 from fieldtwin.run.what_if.state import KnownState, Number
@@ -70,7 +70,7 @@ def _begin_device(run: VirtualPrototype, name: str, values: Mapping[str, Number]
     bank = device.unit.bank if device.unit is not None and hasattr(device.unit, "bank") else None
     if isinstance(bank, DistortedRegisters):
         bank = bank.bank
-    if isinstance(bank, StatedRegisters):
+    if isinstance(bank, ProfileRegisters):
         tags = device.emulated.profile.tags
         sets = [(tags[tag], float(v)) for tag, v in values.items() if not tags[tag].is_text and not isinstance(v, str)]
         bank.set(sets, now_ns)

@@ -25,10 +25,10 @@ from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.plc.publishing import Change
 from fieldtwin.plc.task import StopReason
 from fieldtwin.run.processes.states import state_words
-from fieldtwin.run.processes.topside import Shore
+from fieldtwin.run.processes.topside import TopsideController
 from fieldtwin.run.what_if.begin import begin, otherwise, retain_for
-from fieldtwin.run.what_if.outcome import Outcome, Requirement
-from fieldtwin.run.what_if.plan import Plan
+from fieldtwin.run.what_if.outcome import PlanOutcome, Requirement
+from fieldtwin.run.what_if.plan import WhatIfPlan
 from fieldtwin.run.what_if.state import KnownState
 from fieldtwin.scenarios.language.expression import Expression
 from fieldtwin.twin.prototype.field_process import FieldConfig, resolve
@@ -58,7 +58,7 @@ class Fork:
     settle_s: float = 5.0
 
 
-def answer(fork: Fork, plan: Plan) -> Outcome:
+def answer(fork: Fork, plan: WhatIfPlan) -> PlanOutcome:
     """Run `plan` in a fork.
 
     A failure inside it is in the outcome's `error`. Raises `FileInvalid` or `UsageError` if the fork cannot be started
@@ -73,7 +73,7 @@ def answer(fork: Fork, plan: Plan) -> Outcome:
     return run.outcome
 
 
-def check(fork: Fork, plan: Plan) -> None:
+def check(fork: Fork, plan: WhatIfPlan) -> None:
     """Check that a fork can be started and that the plan's requirements can be evaluated; nothing is run.
 
     Raises like `answer`.
@@ -88,7 +88,7 @@ def _check_horizon(fork: Fork) -> None:
 
 
 class _ForkRun:
-    def __init__(self, fork: Fork, plan: Plan) -> None:
+    def __init__(self, fork: Fork, plan: WhatIfPlan) -> None:
         config = FieldConfig(
             system=fork.system,
             run_dir="",
@@ -98,7 +98,7 @@ class _ForkRun:
         twin = resolve(config)
         self.fork, self.plan = fork, plan
         self.system, self.prototype = twin.ecs.system, twin.prototype
-        self.outcome = Outcome(plan.name, fork.horizon_s)
+        self.outcome = PlanOutcome(plan.name, fork.horizon_s)
         self._words = {
             f"{p}.state": words for p, words in state_words(twin.ecs.layout, self.system.plc.programs).items()
         }
@@ -158,12 +158,12 @@ class _ForkRun:
             for requirement, expression in self._at_the_end:
                 self._judge(requirement, expression)
 
-    def _shore(self) -> Shore:
+    def _shore(self) -> TopsideController:
         assert self._run is not None
         device = next(iter(self._run.field.far), None)
         if device is None:
             raise UsageError("this system cannot be commanded", expected="a transmitter with a topside end")
-        return Shore(self.system, device, self._run.field.far[device], self._run.clock, self._run.net)
+        return TopsideController(self.system, device, self._run.field.far[device], self._run.clock, self._run.net)
 
     async def _watch(self, run: VirtualPrototype, loop: VirtualLoop) -> None:
         end_ns = run.started_ns + round(self.fork.horizon_s * NS_PER_S)
@@ -244,5 +244,5 @@ class _ForkRun:
         return seen.value
 
 
-Progress = Callable[[Outcome], None]
+Progress = Callable[[PlanOutcome], None]
 """Called with each outcome as soon as it is available."""

@@ -7,11 +7,13 @@ from concurrent.futures import Future, as_completed
 
 from fieldtwin.run.processes.workers import Workers
 from fieldtwin.run.what_if.fork import Fork, Progress, answer
-from fieldtwin.run.what_if.outcome import Outcome
-from fieldtwin.run.what_if.plan import Plan
+from fieldtwin.run.what_if.outcome import PlanOutcome
+from fieldtwin.run.what_if.plan import WhatIfPlan
 
 
-def answers(fork: Fork, plans: Sequence[Plan], jobs: int, progress: Progress = lambda outcome: None) -> list[Outcome]:
+def answers(
+    fork: Fork, plans: Sequence[WhatIfPlan], jobs: int, progress: Progress = lambda outcome: None
+) -> list[PlanOutcome]:
     """Return the outcome of each plan, in their order. One job or one plan runs in this process. Raises like `answer`."""
     if jobs <= 1 or len(plans) == 1:
         found = []
@@ -20,8 +22,8 @@ def answers(fork: Fork, plans: Sequence[Plan], jobs: int, progress: Progress = l
             progress(found[-1])
         return found
     with Workers(min(jobs, len(plans))) as pool:
-        waiting: dict[Future[Outcome], int] = {pool.submit(answer, fork, plan): n for n, plan in enumerate(plans)}
-        outcomes: dict[int, Outcome] = {}
+        waiting: dict[Future[PlanOutcome], int] = {pool.submit(answer, fork, plan): n for n, plan in enumerate(plans)}
+        outcomes: dict[int, PlanOutcome] = {}
         for done in as_completed(waiting):
             outcomes[waiting[done]] = done.result()
             progress(done.result())

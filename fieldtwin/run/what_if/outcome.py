@@ -92,7 +92,7 @@ class Requirement:
 
 
 @dataclass
-class Outcome:
+class PlanOutcome:
     """The outcome of one plan.
 
     `error` says why there is none. `not_taken` names devices and programs that could not start from their known state.

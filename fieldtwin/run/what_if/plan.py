@@ -50,7 +50,7 @@ class PlansForm(_Strict):
 
 
 @dataclass(frozen=True)
-class Plan:
+class WhatIfPlan:
     """A plan. `require` are expressions that must hold all the time, `finally_` at the end.
 
     `faults` are as in a fault file.
@@ -91,7 +91,7 @@ def _time(time_s: float) -> str:
     return f"{time_s:g} s"
 
 
-def load_plans(path: Path) -> tuple[str, list[Plan]]:
+def load_plans(path: Path) -> tuple[str, list[WhatIfPlan]]:
     """Return the system that a file of plans is for, and the plans. Raises `FileInvalid`."""
     file = load(path)
     form = validate(file, PlansForm)
@@ -102,14 +102,14 @@ def load_plans(path: Path) -> tuple[str, list[Plan]]:
     return form.what_if, [_plan(file, form, n, plan) for n, plan in enumerate(form.plans)]
 
 
-def _plan(file: YamlFile, form: PlansForm, number: int, plan: PlanForm) -> Plan:
+def _plan(file: YamlFile, form: PlansForm, number: int, plan: PlanForm) -> WhatIfPlan:
     commands = []
     for n, each in enumerate(plan.commands):
         try:
             commands.append(command(f"{each.period_s}@{each.at}"))
         except UsageError as e:
             raise file.error(("plans", number, "commands", n), e.message, expected=e.expected, got=e.got) from e
-    return Plan(
+    return WhatIfPlan(
         plan.name,
         tuple(commands),
         tuple(plan.faults),

@@ -9,11 +9,11 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from fieldtwin.capture.decoding.exchange import SECRET, Exchange
+from fieldtwin.capture.decoding.exchange import SECRET, DecodedExchange
 from fieldtwin.emulators.faults.schema import seconds
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.devices.codec import decode, decode_little
-from fieldtwin.scenarios.bench import Bench, Reading
+from fieldtwin.scenarios.bench import Bench, TagReading
 from fieldtwin.scenarios.language.words import Bounds, Expect, WireForm
 from fieldtwin.twin.site.system import System
 
@@ -33,7 +33,7 @@ class Watched:
     system: System
     since_s: float
     stimulus_s: float
-    exchanges: Iterable[Exchange]
+    exchanges: Iterable[DecodedExchange]
     updates: dict[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -66,7 +66,7 @@ def is_secret(system: System, name: str) -> bool:
     return found is not None and found.secret
 
 
-async def _judge_value(expect: Expect, watched: Watched, reading: Reading) -> Said:
+async def _judge_value(expect: Expect, watched: Watched, reading: TagReading) -> Said:
     assert expect.tag is not None
     if expect.quality is not None and reading.value is None:  # it has not turned bad: it never had a value
         return f"{expect.tag} {expect.quality}", f"no value yet, {reading.quality} ({reading.reason.replace('_', ' ')})"
@@ -137,7 +137,7 @@ def judge_wire(expect: Expect, watched: Watched) -> Said:
     return None
 
 
-def wire_matches(form: Expect | WireForm, exchange: Exchange) -> bool:
+def wire_matches(form: Expect | WireForm, exchange: DecodedExchange) -> bool:
     """Return whether an exchange has the form's function, access, register and value, as far as the form names them.
 
     A stray frame is not a request, so it never matches.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
 
-from fieldtwin.capture.decoding.exchange import Exchange
+from fieldtwin.capture.decoding.exchange import DecodedExchange
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.results.model import CheckResult, Verdict
 
@@ -14,7 +14,7 @@ MOST = 10
 """Largest number of exchanges that are shown: the last ones. The first line says how many were left out."""
 
 
-def last_exchanges(exchanges: Iterable[Exchange], check: CheckResult, devices: Collection[str]) -> list[str]:
+def last_exchanges(exchanges: Iterable[DecodedExchange], check: CheckResult, devices: Collection[str]) -> list[str]:
     """Return the exchanges on the bus in the last `SECONDS` until `check` was decided, a heading first, ordered by
     request.
 
@@ -35,7 +35,7 @@ def last_exchanges(exchanges: Iterable[Exchange], check: CheckResult, devices: C
     return [heading, *map(line_of, found[-MOST:])]
 
 
-def line_of(exchange: Exchange) -> str:
+def line_of(exchange: DecodedExchange) -> str:
     """Return an exchange as ``12.340 s  ctd: read pressure -> ctd: pressure 1.2 dbar``."""
     at = f"{exchange.t_ns / NS_PER_S:.3f} s"
     if exchange.is_stray:

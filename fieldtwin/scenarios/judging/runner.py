@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from fieldtwin.capture.decoding.decoder import Decoder
-from fieldtwin.capture.decoding.exchange import Exchange
+from fieldtwin.capture.decoding.exchange import DecodedExchange
 from fieldtwin.emulators.faults.schema import seconds
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.errors import FieldtwinError, UsageError
@@ -130,7 +130,7 @@ class Runner:
         self.bench = bench
         self.results: list[CheckResult] = []
         self.faults: list[Struck] = []
-        self.exchanges: deque[Exchange] = deque(maxlen=KEPT)
+        self.exchanges: deque[DecodedExchange] = deque(maxlen=KEPT)
         self._decoder = Decoder(scenario.system)
         self._dropped = 0
         self._remark = ""

@@ -10,7 +10,7 @@ from collections import Counter, deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from fieldtwin.capture.decoding.exchange import Exchange
+from fieldtwin.capture.decoding.exchange import DecodedExchange
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.results.model import CheckResult, Verdict
 from fieldtwin.scenarios.bench import Bench, Part
@@ -47,7 +47,7 @@ class Standing:
                 self._wires.append(_NeverOnWire(number, one, unless, where))
         self._expressions += [always_rule(stated) for stated in invariants.stated]
 
-    def saw(self, exchange: Exchange) -> None:
+    def saw(self, exchange: DecodedExchange) -> None:
         """Take an exchange that was seen on a device's bus."""
         for rule in self._wires:
             rule.watched.append(exchange)
@@ -150,7 +150,7 @@ class _NeverOnWire:
     form: WireForm
     unless: Expression | None
     where: str
-    watched: deque[Exchange] = field(default_factory=deque)
+    watched: deque[DecodedExchange] = field(default_factory=deque)
     """Exchanges seen since the last look."""
     _excused: bool = False
 

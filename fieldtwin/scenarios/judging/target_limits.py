@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
-from fieldtwin.conformance.core.case import Danger
+from fieldtwin.conformance.core.case import Impact
 from fieldtwin.scenarios.bench import Can
-from fieldtwin.scenarios.language.about import dangers
+from fieldtwin.scenarios.language.about import impacts
 from fieldtwin.scenarios.language.form import Scenario, needs_of
 
 NO_FRESH_START = (
@@ -15,7 +15,7 @@ NO_FRESH_START = (
 )
 
 
-def refusal(scenario: Scenario, target: str, can: Collection[Can], allowed: Danger) -> str:
+def refusal(scenario: Scenario, target: str, can: Collection[Can], allowed: Impact) -> str:
     """Return why a target lacks a capability for the scenario, or why its impact level is not permitted; empty if all
     is well.
     """
@@ -29,7 +29,7 @@ def refusal(scenario: Scenario, target: str, can: Collection[Can], allowed: Dang
         said = f" (step{'s' if len(steps) > 1 else ''} {', '.join(steps[:5])})" if steps else ""
         why = f": {NO_FRESH_START}" if Can.FRESH_START.value in lacking else ""
         return f"the target {target} cannot {', '.join(lacking)}{said}{why}"
-    for danger, what in dangers(scenario):
+    for danger, what in impacts(scenario):
         if danger.rank > allowed.rank:
             said = f"{what} has the impact level {danger.value}, and the target {target} allows {allowed.value}"
             return f"{said} (--allow {danger.value})"

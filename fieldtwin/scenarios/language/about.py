@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from fieldtwin.conformance.core.case import Danger
+from fieldtwin.conformance.core.case import Impact
 from fieldtwin.results.model import ScenarioResult, Verdict
 from fieldtwin.scenarios.language.form import Scenario
 from fieldtwin.scenarios.language.words import Step, word_of
@@ -17,7 +17,7 @@ from fieldtwin.scenarios.language.words import Step, word_of
 SUFFIX = ".scenario.yaml"
 ROLE = "controller"
 """The role under test: the gateway and PLC of the system, or the controller that the scenario's probes read."""
-_DANGER = {"send": Danger.WRITE, "set": Danger.WRITE, "fault": Danger.DISRUPT, "clear": Danger.DISRUPT}
+_DANGER = {"send": Impact.WRITE, "set": Impact.WRITE, "fault": Impact.DISRUPT, "clear": Impact.DISRUPT}
 """Impact levels of steps; all other steps observe."""
 
 
@@ -26,21 +26,21 @@ def case_of(path: Path) -> str:
     return path.name.removesuffix(SUFFIX)
 
 
-def dangers(scenario: Scenario) -> Iterator[tuple[Danger, str]]:
+def impacts(scenario: Scenario) -> Iterator[tuple[Impact, str]]:
     """Yield each step and probe as its impact level and a description for people."""
     for n, step in enumerate(scenario.form.steps, 1):
         yield _danger_of(step), f"step {n}"
     for probe in scenario.probes:
-        yield Danger.READ, f"the probe {probe.name}"
+        yield Impact.READ, f"the probe {probe.name}"
 
 
-def _danger_of(step: Step) -> Danger:
-    return _DANGER.get(word_of(step), Danger.OBSERVE)
+def _danger_of(step: Step) -> Impact:
+    return _DANGER.get(word_of(step), Impact.OBSERVE)
 
 
-def danger_of(scenario: Scenario) -> Danger:
+def impact_of(scenario: Scenario) -> Impact:
     """Return the highest impact level of all its steps and probes."""
-    return max((danger for danger, _ in dangers(scenario)), key=lambda d: d.rank, default=Danger.OBSERVE)
+    return max((danger for danger, _ in impacts(scenario)), key=lambda d: d.rank, default=Impact.OBSERVE)
 
 
 def result_of(scenario: Scenario, target: str, verdict: Verdict, **more: Any) -> ScenarioResult:
@@ -54,6 +54,6 @@ def result_of(scenario: Scenario, target: str, verdict: Verdict, **more: Any) ->
         target=target,
         case=case_of(scenario.path),
         role=ROLE,
-        danger=danger_of(scenario).value,
+        danger=impact_of(scenario).value,
         **more,
     )

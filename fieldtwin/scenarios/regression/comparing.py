@@ -47,7 +47,7 @@ class Allowed:
 
 
 @dataclass(frozen=True, slots=True)
-class Difference:
+class RunDifference:
     """A difference.
 
     `what` is field, value, quality, order, time, latency or problem; `where` the field, or the device and the request; `times`
@@ -68,11 +68,11 @@ class Difference:
 
 
 @dataclass(frozen=True)
-class Verdict:
+class RunComparison:
     """The number of `compared` fields and services, the `differences`, and the runs' lengths in seconds."""
 
     compared: int
-    differences: tuple[Difference, ...]
+    differences: tuple[RunDifference, ...]
     old_s: float = 0.0
     new_s: float = 0.0
 
@@ -87,11 +87,11 @@ class Verdict:
         return bool(self.compared) and not self.differences
 
 
-def compare(old: Story, new: Story, allowed: Allowed | None = None) -> Verdict:
+def compare(old: Story, new: Story, allowed: Allowed | None = None) -> RunComparison:
     """Compare `new` with `old`. Events of the longer run after the end of the shorter one are ignored."""
     allowed = allowed or Allowed()
     end_ns = min(old.end_ns, new.end_ns)
-    found: list[Difference] = []
+    found: list[RunDifference] = []
     compared = 0
     for before, after, judge in ((old.states, new.states, _states), (old.tags, new.tags, _values)):
         for name in sorted(before | after):
@@ -103,13 +103,13 @@ def compare(old: Story, new: Story, allowed: Allowed | None = None) -> Verdict:
             compared += 1
             if bool(one) != bool(other):
                 there, missing = "there", "not there"
-                found.append(Difference("field", name, there if one else missing, there if other else missing))
+                found.append(RunDifference("field", name, there if one else missing, there if other else missing))
             else:
                 window_ns = max(round(allowed.window_s * NS_PER_S), old.pace_ns(name), new.pace_ns(name))
                 found += judge(name, one, other, end_ns, window_ns, allowed)
     compared += sum(bool(times) and bool(new.latency_ns.get(key)) for key, times in old.latency_ns.items())
     found += _latencies(old, new, allowed) + _problems(old, new, allowed)
-    return Verdict(compared, tuple(found[:MOST_SHOWN]), old.end_ns / NS_PER_S, new.end_ns / NS_PER_S)
+    return RunComparison(compared, tuple(found[:MOST_SHOWN]), old.end_ns / NS_PER_S, new.end_ns / NS_PER_S)
 
 
 def _until(changes: list[Change], end_ns: int) -> list[Change]:
@@ -118,14 +118,14 @@ def _until(changes: list[Change], end_ns: int) -> list[Change]:
 
 def _states(
     name: str, old: list[Change], new: list[Change], end_ns: int, window_ns: int, allowed: Allowed
-) -> list[Difference]:
+) -> list[RunDifference]:
     """Compare states: the same values in the same order, each in time.
 
     In the last window, one of the runs may have one more.
     """
     for one, other in zip(old, new, strict=False):
         if not allowed.near(name, one.value, other.value):
-            return [Difference("order", name, str(one), str(other), other.t_ns / NS_PER_S)]
+            return [RunDifference("order", name, str(one), str(other), other.t_ns / NS_PER_S)]
         if abs(one.t_ns - other.t_ns) > window_ns:
             return [_otherwhen(name, one, other)]
     rest = old[len(new) :] or new[len(old) :]
@@ -134,15 +134,15 @@ def _states(
         missing = len(old) > len(new)
         said = str(rest[0])
         return [
-            Difference(
+            RunDifference(
                 "order", name, said if missing else nothing, nothing if missing else said, rest[0].t_ns / NS_PER_S
             )
         ]
     return []
 
 
-def _otherwhen(name: str, one: Change, other: Change) -> Difference:
-    return Difference(
+def _otherwhen(name: str, one: Change, other: Change) -> RunDifference:
+    return RunDifference(
         "time",
         name,
         f"{one} at {one.t_ns / NS_PER_S:.3f} s",
@@ -153,7 +153,7 @@ def _otherwhen(name: str, one: Change, other: Change) -> Difference:
 
 def _values(
     name: str, old: list[Change], new: list[Change], end_ns: int, window_ns: int, allowed: Allowed
-) -> list[Difference]:
+) -> list[RunDifference]:
     """Compare values: each value of one run occurred in the other one within the window."""
     for one, other, swapped in ((old, new, False), (new, old, True)):
         unmatched = list(_unmatched(name, one, other, end_ns, window_ns, allowed))
@@ -163,7 +163,7 @@ def _values(
         what = "value" if near_by is not None and near_by.quality == first.quality else "quality"
         there, here = str(first), "nothing" if near_by is None else str(near_by)
         expected, got = (here, there) if swapped else (there, here)
-        return [Difference(what, name, expected, got, first.t_ns / NS_PER_S, len(unmatched))]
+        return [RunDifference(what, name, expected, got, first.t_ns / NS_PER_S, len(unmatched))]
     return []
 
 
@@ -197,7 +197,7 @@ def _between(name: str, change: Change, around: Sequence[Change]) -> bool:
     return len(seen) >= 2 and min(seen) <= value <= max(seen)
 
 
-def _latencies(old: Story, new: Story, allowed: Allowed) -> list[Difference]:
+def _latencies(old: Story, new: Story, allowed: Allowed) -> list[RunDifference]:
     """Compare the medians of response times: only a slower one is worse."""
     found = []
     for key, before in sorted(old.latency_ns.items()):
@@ -206,15 +206,15 @@ def _latencies(old: Story, new: Story, allowed: Allowed) -> list[Difference]:
             continue
         where = " ".join(key)
         if not after:
-            found.append(Difference("latency", where, f"{len(before)} answers", "none"))
+            found.append(RunDifference("latency", where, f"{len(before)} answers", "none"))
             continue
         was, now = median(before) / 1e6, median(after) / 1e6
         if now > was + max(allowed.latency_ms, allowed.latency_share * was):
-            found.append(Difference("latency", where, f"{was:.1f} ms", f"{now:.1f} ms"))
+            found.append(RunDifference("latency", where, f"{was:.1f} ms", f"{now:.1f} ms"))
     return found
 
 
-def _problems(old: Story, new: Story, allowed: Allowed) -> list[Difference]:
+def _problems(old: Story, new: Story, allowed: Allowed) -> list[RunDifference]:
     """Compare requests without a good answer: a new or much more frequent problem is a difference."""
     found = []
     for key, now in sorted(new.problems.items()):
@@ -223,6 +223,6 @@ def _problems(old: Story, new: Story, allowed: Allowed) -> list[Difference]:
         if allowed.leaves_out(key[0]) or now <= was or share <= before * 1.5 + 0.01:
             continue
         found.append(
-            Difference("problem", " ".join(key[:2]), f"{key[2]} {was} times", f"{now} times of {new.asked[key[:2]]}")
+            RunDifference("problem", " ".join(key[:2]), f"{key[2]} {was} times", f"{now} times of {new.asked[key[:2]]}")
         )
     return found

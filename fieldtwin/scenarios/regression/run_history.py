@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from fieldtwin.capture.decoding.decoder import Decoder
-from fieldtwin.capture.decoding.exchange import Exchange
+from fieldtwin.capture.decoding.exchange import DecodedExchange
 from fieldtwin.gateway.core.statemachine import encode_period
 from fieldtwin.results.trace import FAR_END, Event, Kind
 from fieldtwin.twin.site.system import System
@@ -95,7 +95,7 @@ def story_of(system: System, events: Iterable[Event]) -> Story:
     sent: list[Came] = []
     boxes: dict[str, tuple[int, ...]] = {}
 
-    def take(exchanges: Iterable[Exchange]) -> None:
+    def take(exchanges: Iterable[DecodedExchange]) -> None:
         for exchange in exchanges:
             _count(story, exchange)
             _mailbox(story, system, boxes, exchange)
@@ -129,7 +129,7 @@ def story_of(system: System, events: Iterable[Event]) -> Story:
     return story
 
 
-def _is_measured(system: System, exchange: Exchange, tag: str) -> bool:
+def _is_measured(system: System, exchange: DecodedExchange, tag: str) -> bool:
     """Return whether the tag is a measurement: not a message, of which each occurs once, and not a sensor without a sample."""
     config = system.devices.get(exchange.device)
     if config is None or tag not in config.profile.tags:
@@ -138,7 +138,7 @@ def _is_measured(system: System, exchange: Exchange, tag: str) -> bool:
     return sampled is None or exchange.tags.get(sampled.count) != 0
 
 
-def _count(story: Story, exchange: Exchange) -> None:
+def _count(story: Story, exchange: DecodedExchange) -> None:
     key = exchange.device or f"{exchange.bus}/{exchange.unit}", exchange.service
     story.asked[key] += 1
     if exchange.problem:
@@ -147,7 +147,7 @@ def _count(story: Story, exchange: Exchange) -> None:
         story.latency_ns[key].append(exchange.latency_ns)
 
 
-def _mailbox(story: Story, system: System, boxes: dict[str, tuple[int, ...]], exchange: Exchange) -> None:
+def _mailbox(story: Story, system: System, boxes: dict[str, tuple[int, ...]], exchange: DecodedExchange) -> None:
     """Decode a message in an inbox: sequence, length in bytes, payload, two bytes per register.
 
     Each sequence number is one command.

@@ -19,7 +19,7 @@ from fieldtwin.__about__ import __version__
 from fieldtwin.gateway.core.control import MAX_LINE, ControlServer
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.wallclock import WallClock
-from fieldtwin.run.template import Stranger, agree
+from fieldtwin.run.template import ForeignParts, agree
 from fieldtwin.testing.worker.bench import Bench, new_folder
 from fieldtwin.testing.worker.one_device import Wanted, write_system
 from fieldtwin.testing.worker.running_plc import RunningPlc
@@ -232,7 +232,7 @@ class Host:
         agree(self._trusts, system.path, [(system, None)], plant=True)
         return system.plc.programs[program].source, (str(system.path.parent),)
 
-    def _trusts(self, template: Stranger) -> bool:
+    def _trusts(self, template: ForeignParts) -> bool:
         return self._trust
 
     def _stepped(self, args: dict[str, Any]) -> SteppedProgram:

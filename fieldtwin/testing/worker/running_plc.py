@@ -18,7 +18,7 @@ from fieldtwin.gateway.core.control import ControlClient, RemoteError
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.run.processes.children import Child
 from fieldtwin.run.processes.plc_client import step_and_wait
-from fieldtwin.run.processes.topside import Shore
+from fieldtwin.run.processes.topside import TopsideController
 from fieldtwin.twin.plant.controller import ControllerConfig
 from fieldtwin.twin.plant.mapping import mapped_endpoint, mapping_to_json
 from fieldtwin.twin.plant.physical import PhysicalTwin
@@ -44,7 +44,7 @@ class RunningPlc:
         self._stack = AsyncExitStack()
         self._children: list[Child] = []
         self._plc: ControlClient | None = None
-        self._shore: Shore | None = None
+        self._shore: TopsideController | None = None
 
     async def open(self, profiles: tuple[str, ...] = ()) -> None:
         """Start both processes. Raises `ChildFailed` with the output of a process that does not start."""
@@ -75,7 +75,7 @@ class RunningPlc:
         await self._start("gateway", "fieldtwin.twin.plant.controller", config)
         device = next(iter(self._field.far), None)
         if device is not None:
-            self._shore = Shore(system, device, self._field.far[device], self._clock)
+            self._shore = TopsideController(system, device, self._field.far[device], self._clock)
             nursery = await self._stack.enter_async_context(Nursery())
             nursery.start(self._shore.run([]), "far end")
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from fieldtwin.capture.decoding.decoder import Decoder
-from fieldtwin.capture.decoding.exchange import Exchange
+from fieldtwin.capture.decoding.exchange import DecodedExchange
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.clock import Clock
 from fieldtwin.results.trace import Event, Kind
@@ -41,7 +41,7 @@ class WireLog:
         self._clock = clock
         self._start_ns = clock.monotonic_ns()
         self._lines: dict[tuple[str, int], _Line] = {}
-        self._kept: deque[tuple[int, Exchange]] = deque(maxlen=MOST)
+        self._kept: deque[tuple[int, DecodedExchange]] = deque(maxlen=MOST)
         self.number = 0
         """The number of the latest exchange, counted from 1."""
 
@@ -67,7 +67,7 @@ class WireLog:
         line.last_ns = self._clock.monotonic_ns()
         self._take(line.decoder.feed(Event(line.last_ns - self._start_ns, Kind.FRAME, bus, data)))
 
-    def _take(self, exchanges: list[Exchange]) -> None:
+    def _take(self, exchanges: list[DecodedExchange]) -> None:
         for exchange in exchanges:
             self.number += 1
             self._kept.append((self.number, exchange))
@@ -100,7 +100,7 @@ class WireLog:
         return (self._clock.monotonic_ns() - self._start_ns) / 1e9
 
 
-def _plain(number: int, exchange: Exchange) -> dict[str, Any]:
+def _plain(number: int, exchange: DecodedExchange) -> dict[str, Any]:
     return {
         "number": number,
         "t_s": exchange.t_ns / 1e9,

@@ -7,7 +7,7 @@ from contextlib import AsyncExitStack
 from typing import Self
 
 
-class Started(ABC):
+class AsyncResource(ABC):
     """An asynchronous context manager whose parts are started in `_start`, which puts each on `_stack`.
 
     If `_start` fails, the parts that were started are ended, and the error is raised. On leaving, `_stop` runs first,

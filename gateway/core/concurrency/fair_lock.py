@@ -18,7 +18,7 @@ from collections import deque
 from contextlib import suppress
 
 
-class Turn:
+class FairLock:
     """A fair lock for the tasks of one event loop. Not for threads."""
 
     __slots__ = ("_taken", "_waiting")

@@ -11,7 +11,9 @@ import asyncio
 from collections.abc import Callable
 
 
-def alarm(loop: asyncio.AbstractEventLoop, delay_s: float) -> tuple[asyncio.Future[None], Callable[[], None] | None]:
+def start_timeout(
+    loop: asyncio.AbstractEventLoop, delay_s: float
+) -> tuple[asyncio.Future[None], Callable[[], None] | None]:
     """Return a future that is done after `delay_s` seconds, or earlier if the caller sets its result.
 
     The second value is a function to call after the future was awaited, or None if there is nothing to call.

@@ -85,7 +85,7 @@ class RecordingHeader(msgspec.Struct, frozen=True, forbid_unknown_fields=True, o
     signals: dict[str, SignalInfo] = {}
 
 
-class Exchange(msgspec.Struct, frozen=True, gc=False):
+class RecordedExchange(msgspec.Struct, frozen=True, gc=False):
     """One request and its result. `reply` is None exactly when `error` gives the reason.
 
     This is a struct, not a dataclass: a recording of a day has millions, and a struct is made in a third of the time.
@@ -128,7 +128,7 @@ def encode_header(header: RecordingHeader) -> bytes:
     return _encoder.encode(header) + b"\n"
 
 
-def encode_exchange(exchange: Exchange) -> bytes:
+def encode_exchange(exchange: RecordedExchange) -> bytes:
     """Return an exchange's line, newline included."""
     line: dict[str, object] = {"t": exchange.t_s, "unit": exchange.unit, "req": exchange.request.hex()}
     if exchange.reply is not None:
@@ -183,12 +183,12 @@ class RecordingReader:
         """Close the file; closing twice does nothing."""
         self._file.close()
 
-    def exchanges(self) -> Iterator[Exchange]:
+    def exchanges(self) -> Iterator[RecordedExchange]:
         """Yield the exchanges that follow. The recording must be of kind `exchanges`."""
         self._expect("exchanges")
         return self._exchanges()
 
-    def _exchanges(self) -> Iterator[Exchange]:
+    def _exchanges(self) -> Iterator[RecordedExchange]:
         """Decode whole blocks of lines while they are valid; from an invalid block on, line by line, to report the line
         number.
         """
@@ -308,7 +308,7 @@ class RecordingWriter:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
         self.close()
 
-    def exchange(self, exchange: Exchange) -> None:
+    def exchange(self, exchange: RecordedExchange) -> None:
         """Append one exchange."""
         if self.header.kind != "exchanges" or (exchange.reply is None) == (exchange.error is None):
             raise Bug("no exchange for this recording", expected="reply or error, in a recording of exchanges")
@@ -350,12 +350,12 @@ class RecordingWriter:
         self._size += len(line)
 
 
-def _read_exchange(line: bytes) -> Exchange:
+def _read_exchange(line: bytes) -> RecordedExchange:
     """Return the exchange of one line. Raises ValueError."""
     return _exchange_of(_exchange_decoder.decode(line))
 
 
-def _exchange_of(raw: _ExchangeLine) -> Exchange:
+def _exchange_of(raw: _ExchangeLine) -> RecordedExchange:
     if (raw.rep is None) == (raw.err is None):
         raise ValueError("exactly one of rep and err is needed")
     if not 0 <= raw.unit <= 255:
@@ -366,7 +366,7 @@ def _exchange_of(raw: _ExchangeLine) -> Exchange:
     if not request:
         raise ValueError("the request is empty")
     reply = None if raw.rep is None else bytes.fromhex(raw.rep)
-    return Exchange(raw.t, raw.unit, request, reply, raw.lat, raw.err)
+    return RecordedExchange(raw.t, raw.unit, request, reply, raw.lat, raw.err)
 
 
 def _read_row(line: bytes, width: int) -> SignalRow:

@@ -12,8 +12,8 @@ from functools import lru_cache
 from typing import Any, NamedTuple, Self, TypeVar
 
 from fieldtwin.gateway.core.clock import NS_PER_S, Clock
-from fieldtwin.gateway.core.concurrency.fair_lock import Turn
-from fieldtwin.gateway.core.connection import ByteConnection, closed_here
+from fieldtwin.gateway.core.concurrency.fair_lock import FairLock
+from fieldtwin.gateway.core.connection import ByteConnection, closed_locally
 from fieldtwin.gateway.core.endpoint import Endpoint, SerialSettings
 from fieldtwin.gateway.core.errors import (
     ConnectionLost,
@@ -164,7 +164,7 @@ class ModbusClient:
         """The number of `timeouts` that were of units with a shortened timeout."""
         self.not_waited = 0.0
         """The sum of the time saved by shortened timeouts, each as a fraction of the unit's normal timeout."""
-        self._turn = Turn()
+        self._turn = FairLock()
         self._closed = False
         self.counters = ClientCounters()
         self.latency = Latencies()  # of replies and exceptions; a caller that keeps it across connections sets its own
@@ -348,7 +348,7 @@ class ModbusClient:
             await self._turn.wait()
         try:
             if self._closed:
-                raise closed_here(self._connection.endpoint)
+                raise closed_locally(self._connection.endpoint)
             if self._spaced_ns or self._held:
                 await self._await_spacing(unit)
                 self._held.pop(unit, None)

@@ -25,7 +25,7 @@ NO_PATH = 0x0A
 NO_RESPONSE = 0x0B
 
 READ_FUNCTIONS = frozenset({0x01, 0x02, 0x03, 0x04, 0x07, 0x0B, 0x0C, 0x11, 0x14, 0x18, 0x2B})
-"""Functions that do not change a unit. Of 2Bh only the device identification (0Eh) is one: see `Asked.changes`."""
+"""Functions that do not change a unit. Of 2Bh only the device identification (0Eh) is one: see `ServerRequest.changes`."""
 
 WRITE_FUNCTIONS = frozenset({0x05, 0x06, 0x0F, 0x10, 0x15, 0x16, 0x17})
 
@@ -49,7 +49,7 @@ class Access:
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class ServerRequest:
     """A well-formed request. `reply_bytes` is the size of its normal reply PDU, 0 if it does not follow from the
     request.
 
@@ -68,7 +68,7 @@ def exception_pdu(error: ModbusExceptionReply) -> bytes:
     return bytes([error.function & 0x7F | 0x80, error.code])
 
 
-def examine(pdu: bytes) -> Asked:
+def examine(pdu: bytes) -> ServerRequest:
     """Read a request PDU. Raises `ModbusExceptionReply` with the code that the server has to answer: 01, 02 or 03.
 
     A function code of 0, or from 80h on, is refused with 01 (case MB-035: one fixed choice).
@@ -76,7 +76,7 @@ def examine(pdu: bytes) -> Asked:
     if not pdu or not 1 <= pdu[0] <= 0x7F:
         raise refusal(pdu[0] if pdu else 0, ILLEGAL_FUNCTION)
     reader = _READERS.get(pdu[0])
-    return Asked(pdu[0], changes=True) if reader is None else reader(pdu)
+    return ServerRequest(pdu[0], changes=True) if reader is None else reader(pdu)
 
 
 def word(pdu: bytes, at: int) -> int:
@@ -101,89 +101,89 @@ def _addressed(pdu: bytes, *accesses: Access) -> tuple[Access, ...]:
     return accesses
 
 
-def _read_bits(pdu: bytes) -> Asked:
+def _read_bits(pdu: bytes) -> ServerRequest:
     _require(pdu, len(pdu) == 5)
     count = word(pdu, 3)
     access = _access(pdu, "coil" if pdu[0] == 0x01 else "discrete", word(pdu, 1), count, 2000)
-    return Asked(pdu[0], False, _addressed(pdu, access), 2 + (count + 7) // 8)
+    return ServerRequest(pdu[0], False, _addressed(pdu, access), 2 + (count + 7) // 8)
 
 
-def _read_registers(pdu: bytes) -> Asked:
+def _read_registers(pdu: bytes) -> ServerRequest:
     _require(pdu, len(pdu) == 5)
     count = word(pdu, 3)
     access = _access(pdu, "holding" if pdu[0] == 0x03 else "input", word(pdu, 1), count, 125)
-    return Asked(pdu[0], False, _addressed(pdu, access), 2 + 2 * count)
+    return ServerRequest(pdu[0], False, _addressed(pdu, access), 2 + 2 * count)
 
 
-def _write_single(pdu: bytes) -> Asked:
+def _write_single(pdu: bytes) -> ServerRequest:
     coil = pdu[0] == 0x05
     _require(pdu, len(pdu) == 5 and (not coil or pdu[3:] in (b"\x00\x00", b"\xff\x00")))
-    return Asked(pdu[0], True, (Access("coil" if coil else "holding", word(pdu, 1), 1, True),), 5)
+    return ServerRequest(pdu[0], True, (Access("coil" if coil else "holding", word(pdu, 1), 1, True),), 5)
 
 
-def _write_coils(pdu: bytes) -> Asked:
+def _write_coils(pdu: bytes) -> ServerRequest:
     _require(pdu, len(pdu) >= 6)
     count = word(pdu, 3)
     access = _access(pdu, "coil", word(pdu, 1), count, 1968, write=True)
     _require(pdu, pdu[5] == (count + 7) // 8 and len(pdu) == 6 + pdu[5])
-    return Asked(pdu[0], True, _addressed(pdu, access), 5)
+    return ServerRequest(pdu[0], True, _addressed(pdu, access), 5)
 
 
-def _write_registers(pdu: bytes) -> Asked:
+def _write_registers(pdu: bytes) -> ServerRequest:
     _require(pdu, len(pdu) >= 6)
     count = word(pdu, 3)
     access = _access(pdu, "holding", word(pdu, 1), count, 123, write=True)
     _require(pdu, pdu[5] == 2 * count and len(pdu) == 6 + pdu[5])
-    return Asked(pdu[0], True, _addressed(pdu, access), 5)
+    return ServerRequest(pdu[0], True, _addressed(pdu, access), 5)
 
 
-def _mask_write(pdu: bytes) -> Asked:
+def _mask_write(pdu: bytes) -> ServerRequest:
     _require(pdu, len(pdu) == 7)
-    return Asked(pdu[0], True, (Access("holding", word(pdu, 1), 1, True),), 7)
+    return ServerRequest(pdu[0], True, (Access("holding", word(pdu, 1), 1, True),), 7)
 
 
-def _read_write(pdu: bytes) -> Asked:
+def _read_write(pdu: bytes) -> ServerRequest:
     _require(pdu, len(pdu) >= 10)
     read = _access(pdu, "holding", word(pdu, 1), word(pdu, 3), 125)
     written = _access(pdu, "holding", word(pdu, 5), word(pdu, 7), 121, write=True)
     _require(pdu, pdu[9] == 2 * written.count and len(pdu) == 10 + pdu[9])
-    return Asked(pdu[0], True, _addressed(pdu, written, read), 2 + 2 * read.count)  # write before read: MB-042
+    return ServerRequest(pdu[0], True, _addressed(pdu, written, read), 2 + 2 * read.count)  # write before read: MB-042
 
 
-def _fifo(pdu: bytes) -> Asked:
+def _fifo(pdu: bytes) -> ServerRequest:
     _require(pdu, len(pdu) == 3)
-    return Asked(pdu[0], False, (Access("holding", word(pdu, 1), 1),))
+    return ServerRequest(pdu[0], False, (Access("holding", word(pdu, 1), 1),))
 
 
-def _diagnostics(pdu: bytes) -> Asked:
+def _diagnostics(pdu: bytes) -> ServerRequest:
     _require(pdu, len(pdu) >= 5 and len(pdu) % 2 == 1)
-    return Asked(pdu[0], word(pdu, 1) not in _HARMLESS_DIAGNOSTICS, (), len(pdu))
+    return ServerRequest(pdu[0], word(pdu, 1) not in _HARMLESS_DIAGNOSTICS, (), len(pdu))
 
 
-def _file_records(pdu: bytes) -> Asked:
+def _file_records(pdu: bytes) -> ServerRequest:
     _require(pdu, len(pdu) >= 9 and len(pdu) == 2 + pdu[1])
     writes = pdu[0] == 0x15
     _require(pdu, writes or pdu[1] % 7 == 0)
-    return Asked(pdu[0], writes, (), len(pdu) if writes else 0)
+    return ServerRequest(pdu[0], writes, (), len(pdu) if writes else 0)
 
 
-def _encapsulated(pdu: bytes) -> Asked:
+def _encapsulated(pdu: bytes) -> ServerRequest:
     _require(pdu, len(pdu) >= 2)
     if pdu[1] != _IDENTIFICATION:  # CANopen and others in a Modbus frame may change the unit
-        return Asked(pdu[0], True)
+        return ServerRequest(pdu[0], True)
     _require(pdu, len(pdu) == 4)
-    return Asked(pdu[0], False)
+    return ServerRequest(pdu[0], False)
 
 
-def _bare(reply_bytes: int) -> Callable[[bytes], Asked]:
-    def read(pdu: bytes) -> Asked:
+def _bare(reply_bytes: int) -> Callable[[bytes], ServerRequest]:
+    def read(pdu: bytes) -> ServerRequest:
         _require(pdu, len(pdu) == 1)
-        return Asked(pdu[0], False, (), reply_bytes)
+        return ServerRequest(pdu[0], False, (), reply_bytes)
 
     return read
 
 
-_READERS: dict[int, Callable[[bytes], Asked]] = {
+_READERS: dict[int, Callable[[bytes], ServerRequest]] = {
     0x01: _read_bits,
     0x02: _read_bits,
     0x03: _read_registers,

@@ -12,7 +12,7 @@ from fieldtwin.gateway.core.errors import VerifyFailed
 from fieldtwin.gateway.protocols.modbus.crc import crc16
 from fieldtwin.gateway.protocols.modbus.replies import Reply
 from fieldtwin.gateway.protocols.modbus.request import IMPOSSIBLE, MAX_PDU, NEED_MORE, Request
-from fieldtwin.gateway.protocols.modbus.server import BROADCAST_FUNCTIONS, Asked
+from fieldtwin.gateway.protocols.modbus.server import BROADCAST_FUNCTIONS, ServerRequest
 
 _COUNTED = frozenset({0x0C, 0x11, 0x14})
 """Functions whose reply has its length in the second byte."""
@@ -41,7 +41,7 @@ class Forwarded(Request[ForwardedReply]):
 
     __slots__ = ("_asked", "_heard_out", "_length", "_on_line", "_pdu", "_unit")
 
-    def __init__(self, unit: int, pdu: bytes, asked: Asked, *, on_line: bool) -> None:
+    def __init__(self, unit: int, pdu: bytes, asked: ServerRequest, *, on_line: bool) -> None:
         self._unit = unit
         self._pdu = pdu
         self._asked = asked

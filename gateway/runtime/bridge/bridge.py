@@ -38,7 +38,7 @@ from fieldtwin.gateway.protocols.modbus.server import (
     NO_RESPONSE,
     SERVER_BUSY,
     SERVER_FAILURE,
-    Asked,
+    ServerRequest,
     examine,
     exception_pdu,
 )
@@ -51,7 +51,7 @@ from fieldtwin.gateway.runtime.bridge.line import LineFront
 from fieldtwin.gateway.runtime.bridge.policy import Policy
 from fieldtwin.gateway.runtime.bridge.tcp import Answer, Caller, TcpFront
 from fieldtwin.gateway.runtime.buses.backoff import Backoff
-from fieldtwin.gateway.runtime.buses.bridge_queue import Guest
+from fieldtwin.gateway.runtime.buses.bridge_queue import BridgeRequest
 from fieldtwin.gateway.runtime.buses.modbus_bus import ModbusBus
 
 LAST_LINE_UNIT = 247
@@ -200,7 +200,7 @@ class Bridge:
         except ModbusExceptionReply as e:
             return exception_pdu(e)
 
-    def _judged(self, caller: Caller, unit: int, pdu: bytes) -> tuple[Asked, Route | None]:
+    def _judged(self, caller: Caller, unit: int, pdu: bytes) -> tuple[ServerRequest, Route | None]:
         """Return the parsed request and its route; a route of None is a broadcast. Raises the exception to answer
         with."""
         function = pdu[0] if pdu else 0
@@ -242,7 +242,7 @@ class Bridge:
     def _place(self, unit: int, route: Route | None) -> str:
         return f"{route.bus}/{route.unit}" if route is not None else f"{self.config.name}/{unit}"
 
-    def _forward(self, caller: Caller, route: Route, pdu: bytes, asked: Asked) -> Answer:
+    def _forward(self, caller: Caller, route: Route, pdu: bytes, asked: ServerRequest) -> Answer:
         bus, now_ns = self._buses[route.bus], self._clock.monotonic_ns()
         kept = None if asked.changes else self.cache.get(route.bus, route.unit, pdu, now_ns)
         if kept is not None:
@@ -271,10 +271,10 @@ class Bridge:
         caller: Caller,
         route: Route,
         pdu: bytes,
-        asked: Asked,
+        asked: ServerRequest,
         promise: asyncio.Future[bytes | None],
         attempts: int,
-    ) -> Guest:
+    ) -> BridgeRequest:
         def before() -> None:
             if asked.changes:
                 self._record.asked(caller.on_record, self._place(0, route), route.unit, pdu)
@@ -290,7 +290,9 @@ class Bridge:
                 promise.set_result(response)
 
         now_ns = self._clock.monotonic_ns()
-        return Guest(caller.name, route.unit, pdu, asked, attempts, now_ns, done, lambda: not promise.done(), before)
+        return BridgeRequest(
+            caller.name, route.unit, pdu, asked, attempts, now_ns, done, lambda: not promise.done(), before
+        )
 
     def _ended(self, bus: str) -> None:
         self._under_way[bus] -= 1
@@ -298,7 +300,7 @@ class Bridge:
     # -- answers ----------------------------------------------------------------------------------------------------
 
     def _response(
-        self, route: Route, pdu: bytes, asked: Asked, result: ForwardedReply | FieldtwinError
+        self, route: Route, pdu: bytes, asked: ServerRequest, result: ForwardedReply | FieldtwinError
     ) -> bytes | None:
         """Return the response PDU, and note what the result shows about the unit."""
         if isinstance(result, ForwardedReply):
@@ -330,7 +332,7 @@ class Bridge:
             case _:
                 return SERVER_FAILURE
 
-    def _broadcast(self, caller: Caller, pdu: bytes, asked: Asked) -> list[asyncio.Future[bytes | None]]:
+    def _broadcast(self, caller: Caller, pdu: bytes, asked: ServerRequest) -> list[asyncio.Future[bytes | None]]:
         """Send a broadcast to every serial line, once, without a retry; units do not answer it (case MB-028). Return a
         future for each line."""
         sent = []

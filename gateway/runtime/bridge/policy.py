@@ -1,7 +1,7 @@
 """The allow-list of a bridge: which client networks and roles may use which units, functions and address ranges. Every
 other request is refused.
 
-Pure: clients' addresses and roles are text, requests are `Asked`. This module does not know connections, buses or time.
+Pure: clients' addresses and roles are text, requests are `ServerRequest`. This module does not know connections, buses or time.
 """
 
 from __future__ import annotations
@@ -12,7 +12,13 @@ from functools import lru_cache
 from ipaddress import IPv4Network, IPv6Address, IPv6Network, ip_address, ip_network
 
 from fieldtwin.gateway.core.errors import UsageError
-from fieldtwin.gateway.protocols.modbus.server import ILLEGAL_ADDRESS, ILLEGAL_FUNCTION, NO_PATH, READ_FUNCTIONS, Asked
+from fieldtwin.gateway.protocols.modbus.server import (
+    ILLEGAL_ADDRESS,
+    ILLEGAL_FUNCTION,
+    NO_PATH,
+    READ_FUNCTIONS,
+    ServerRequest,
+)
 
 Network = IPv4Network | IPv6Network
 
@@ -67,7 +73,7 @@ class AllowRule:
     def is_for(self, role: str) -> bool:
         return self.roles is None or role in self.roles
 
-    def judge(self, unit: int, asked: Asked) -> int:
+    def judge(self, unit: int, asked: ServerRequest) -> int:
         """Return `ALLOWED`, or the exception code of the first check that fails: unit, function, address."""
         if self.units is not None and unit not in self.units:
             return NO_PATH
@@ -100,7 +106,7 @@ class Policy:
         """Return whether a client from `peer` may connect at all."""
         return any(rule.admits(peer) for rule in self.rules)
 
-    def judge(self, peer: str, unit: int, asked: Asked, role: str = "") -> int:
+    def judge(self, peer: str, unit: int, asked: ServerRequest, role: str = "") -> int:
         """Return `ALLOWED`, or the exception code to answer with: 0A for a unit, 01 for a function or a role (MBTLS
         8.5), 02 for an address."""
         verdicts = {

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 
 from fieldtwin.gateway.core.errors import ConnectionLost, EndpointBusy, FieldtwinError, WireError
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient
-from fieldtwin.gateway.protocols.modbus.server import Asked
+from fieldtwin.gateway.protocols.modbus.server import ServerRequest
 from fieldtwin.gateway.protocols.modbus.server_forward import Forwarded, ForwardedReply
 
 MAX_WAIT_NS = 10_000_000_000
@@ -21,7 +21,7 @@ MAX_WAIT_NS = 10_000_000_000
 
 
 @dataclass(eq=False)
-class Guest:
+class BridgeRequest:
     """A request for `unit`. `attempts` is the number of attempts left; each attempt waits for its own turn.
 
     `done` is called once, with the reply or the error, unless `wanted` returns False: then the client has gone.
@@ -30,7 +30,7 @@ class Guest:
     client: str
     unit: int
     pdu: bytes
-    asked: Asked
+    asked: ServerRequest
     attempts: int
     queued_ns: int
     done: Callable[[ForwardedReply | FieldtwinError], None]
@@ -41,7 +41,7 @@ class Guest:
 
 
 @dataclass
-class GuestCounters:
+class BridgeCounters:
     """The outcomes of the requests on one bus. `full`: no room; `gone`: the client had gone; `stale`: waited too
     long."""
 
@@ -52,17 +52,17 @@ class GuestCounters:
 
 
 @dataclass
-class GuestQueue:
+class BridgeQueue:
     """At most `limit` requests of all clients together; clients take turns. `on_put` wakes the bus."""
 
     limit: int = 64
     on_put: Callable[[], None] = lambda: None
-    counters: GuestCounters = field(default_factory=GuestCounters)
-    _waiting: dict[str, deque[Guest]] = field(default_factory=dict)
+    counters: BridgeCounters = field(default_factory=BridgeCounters)
+    _waiting: dict[str, deque[BridgeRequest]] = field(default_factory=dict)
     size: int = 0
     """How many requests wait."""
 
-    def put(self, guest: Guest) -> None:
+    def put(self, guest: BridgeRequest) -> None:
         """Queue a request. If the queue is full, the request fails at once with `EndpointBusy`."""
         if self.size >= self.limit:
             self._drop_gone()
@@ -74,7 +74,7 @@ class GuestQueue:
         self.size += 1
         self.on_put()
 
-    def take(self, now_ns: int) -> Guest | None:
+    def take(self, now_ns: int) -> BridgeRequest | None:
         """Return the next request to carry out, from the client whose turn it is."""
         while self._waiting:
             client, line = next(iter(self._waiting.items()))
@@ -92,7 +92,7 @@ class GuestQueue:
                 return guest
         return None
 
-    async def carry_out(self, guest: Guest, client: ModbusClient, on_line: bool) -> None:
+    async def carry_out(self, guest: BridgeRequest, client: ModbusClient, on_line: bool) -> None:
         """Carry out one attempt. A request that was lost on the bus is queued again while attempts are left. Raises
         only `ConnectionLost`."""
         guest.attempts -= 1

@@ -14,7 +14,7 @@ from fieldtwin.gateway.core.errors import FieldtwinError, NotAllowed
 from fieldtwin.gateway.core.latency import Latencies
 from fieldtwin.gateway.core.values import COMMAND
 from fieldtwin.gateway.devices.config import BusConfig
-from fieldtwin.gateway.runtime.buses.pending_config import Coming
+from fieldtwin.gateway.runtime.buses.pending_config import PendingConfig
 
 Ended = Callable[[str, FieldtwinError | None], None]
 """Called once for each tag with the result of its write: None, or the error; `HeldBack` for a tag that was not sent."""
@@ -67,7 +67,7 @@ class Bus(Protocol):
         """
         ...
 
-    def reconfigure(self, coming: Coming) -> None:
+    def reconfigure(self, coming: PendingConfig) -> None:
         """Take over a new configuration, each device's part between two of its polls."""
         ...
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.devices.config import DeviceConfig
-from fieldtwin.gateway.devices.register_device import Reading, RegisterDriver
+from fieldtwin.gateway.devices.register_device import GroupReading, RegisterDriver
 from fieldtwin.gateway.runtime.buses.backoff import Backoff
 from fieldtwin.gateway.runtime.buses.poll_schedule import PollSchedule, Rate, spread
 from fieldtwin.gateway.runtime.buses.probing import MARGIN_NS, Probing
@@ -35,7 +35,7 @@ class DeviceState:
     next_try_ns: int = 0
     busy_until_ns: int = 0
     """The device answered "busy" and is given time until then."""
-    reading: Reading | None = None
+    reading: GroupReading | None = None
     """The group that is being read, with some transactions left; it has been due since `reading_due_ns`."""
     reading_due_ns: int = 0
     triggered: set[str] = field(default_factory=set)

@@ -47,7 +47,7 @@ from fieldtwin.gateway.runtime.buses.bus import Ended
 from fieldtwin.gateway.runtime.buses.bus_turns import rates_of
 from fieldtwin.gateway.runtime.buses.modbus_bus import MOST_LOCALS, reason_of
 from fieldtwin.gateway.runtime.buses.node_writes import Done, InOrder, NodeWrites
-from fieldtwin.gateway.runtime.buses.pending_config import Coming
+from fieldtwin.gateway.runtime.buses.pending_config import PendingConfig
 from fieldtwin.gateway.runtime.buses.poll_schedule import PollSchedule
 from fieldtwin.gateway.runtime.tags import TagTable
 
@@ -126,7 +126,7 @@ class CanopenBus:
         self.locals: deque[str] = deque(maxlen=MOST_LOCALS)
         """The local addresses of the connections so far, latest last; an empty text for a medium without addresses."""
         self.error = ""
-        self._coming: Coming | None = None
+        self._coming: PendingConfig | None = None
         self._nursery: Nursery | None = None
         self._stopping = False
         self._not_produced = 0
@@ -146,7 +146,7 @@ class CanopenBus:
         schedule = PollSchedule(rates_of([d.config for d in drivers])[driver.config.name], ())
         return NodeStatus(driver, NodeWrites(driver, clock, self.config.timeout_s), schedule)
 
-    def reconfigure(self, coming: Coming) -> None:
+    def reconfigure(self, coming: PendingConfig) -> None:
         """Take over a new configuration between two polls: each node's part when no group of it is being read."""
         self._coming = coming
         for status in self.nodes.values():

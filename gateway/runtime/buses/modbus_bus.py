@@ -19,7 +19,7 @@ from functools import partial
 from typing import TypeVar
 
 from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S, Clock
-from fieldtwin.gateway.core.concurrency.timeout import alarm, ring
+from fieldtwin.gateway.core.concurrency.timeout import ring, start_timeout
 from fieldtwin.gateway.core.connection import Connector
 from fieldtwin.gateway.core.errors import (
     ConnectionLost,
@@ -41,10 +41,10 @@ from fieldtwin.gateway.protocols.modbus.framings import framing_of
 from fieldtwin.gateway.protocols.modbus.refusals import Acknowledged, GatewayRefusal, ServerBusy
 from fieldtwin.gateway.protocols.modbus.server import NO_RESPONSE
 from fieldtwin.gateway.runtime.buses.backoff import Backoff
-from fieldtwin.gateway.runtime.buses.bridge_queue import GuestQueue
+from fieldtwin.gateway.runtime.buses.bridge_queue import BridgeQueue
 from fieldtwin.gateway.runtime.buses.bus import Ended, not_sent
 from fieldtwin.gateway.runtime.buses.bus_turns import DeviceState, Turns, rates_of, restate, states_of
-from fieldtwin.gateway.runtime.buses.pending_config import Coming
+from fieldtwin.gateway.runtime.buses.pending_config import PendingConfig
 from fieldtwin.gateway.runtime.buses.unanswered import MOST_UNANSWERED, Unanswered
 from fieldtwin.gateway.runtime.tags import TagTable
 
@@ -111,7 +111,7 @@ class ModbusBus:
         self.error = ""
         self.down: FieldtwinError | None = None
         """Why the last attempt to open the bus failed; None while the bus is open, or was open until just now."""
-        self.guests = GuestQueue()
+        self.guests = BridgeQueue()
         self.guests.on_put = self._wake
         self._guest_was_last = False
         line = config.endpoint
@@ -122,7 +122,7 @@ class ModbusBus:
         self._tags = tags
         self._on_offline = on_offline
         self._offset = offset
-        self._coming: Coming | None = None
+        self._coming: PendingConfig | None = None
         self._jobs: deque[Job] = deque()
         self._awake = False
         """Set when the bus has new work to look at, whether `_serve` sleeps or not."""
@@ -189,7 +189,7 @@ class ModbusBus:
             self._jobs.append(job)
             self._wake()
 
-    def reconfigure(self, coming: Coming) -> None:
+    def reconfigure(self, coming: PendingConfig) -> None:
         """Take over a new configuration between two polls: each device's part when no group of it is being read."""
         self._coming = coming
         if self._client is None:
@@ -368,7 +368,7 @@ class ModbusBus:
             self._sleeper = loop.create_future()
         else:
             left_s = (until_ns - self._clock.monotonic_ns()) / NS_PER_S
-            self._sleeper, end = alarm(loop, left_s if left_s > 0.0 else 0.0)
+            self._sleeper, end = start_timeout(loop, left_s if left_s > 0.0 else 0.0)
         try:
             await self._sleeper
         finally:

@@ -14,7 +14,7 @@ AnyDriver = RegisterDriver | CanopenDriver
 
 
 @dataclass
-class Coming:
+class PendingConfig:
     """`bus` and `devices`, all on that bus, by name: the same buses and devices as before, at the same addresses.
 
     `taken` is called with each driver as soon as it has its new configuration; `done` is set when all have.

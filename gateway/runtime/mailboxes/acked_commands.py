@@ -19,7 +19,7 @@ MOST_BYTES = 1_000_000
 """Our files are never larger; a larger file is not read."""
 
 
-class TakenFile:
+class AckedCommandStore:
     """The file at `path`; with None, nothing is kept beyond this process."""
 
     def __init__(self, path: Path | None) -> None:

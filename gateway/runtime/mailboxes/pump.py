@@ -18,7 +18,7 @@ from fieldtwin.gateway.core.values import COMMAND, DATA, RESPONSE
 from fieldtwin.gateway.devices.transmitter import TransmitterDriver
 from fieldtwin.gateway.runtime.audit_log import AuditLog
 from fieldtwin.gateway.runtime.buses.modbus_bus import ModbusBus
-from fieldtwin.gateway.runtime.mailboxes.acked_commands import TakenFile
+from fieldtwin.gateway.runtime.mailboxes.acked_commands import AckedCommandStore
 from fieldtwin.gateway.runtime.mailboxes.mailboxes import Mailboxes
 from fieldtwin.gateway.runtime.outputs.refusals import Cause, Refusals, cause_of
 
@@ -37,8 +37,8 @@ class MailboxPump:
         *,
         allow_writes: bool,
         remote: bool,
-        lent: bool = False,
-        taken: TakenFile | None = None,
+        delegated: bool = False,
+        taken: AckedCommandStore | None = None,
         journal: Refusals | None = None,
     ) -> None:
         """`journal` receives the messages that do not reach the transmitter, and the commands that are refused."""
@@ -47,10 +47,10 @@ class MailboxPump:
         self._withheld: tuple[str, object] | None = None
         """The last report to the journal about a plant that must not be written, so that each message is reported
         once."""
-        self._taken = taken or TakenFile(None)
+        self._taken = taken or AckedCommandStore(None)
         driver.taken_before = self._taken.of(driver.config.name)
         self.inbox: Consumer[DATA] = Consumer(driver.emitter.event, capacity=64)
-        if not lent:
+        if not delegated:
             driver.emitter.subscribe(self.inbox)
         self.commands_refused = 0
         self.remote = remote
@@ -59,7 +59,7 @@ class MailboxPump:
         self._bus = bus
         self._audit = audit
         self._allow_writes = allow_writes
-        self._lent = lent
+        self._lent = delegated
         self._sending = 0
         self._next_ns = self._now_ns = 0
         self._recorded: tuple[str, object] | None = None
@@ -86,7 +86,7 @@ class MailboxPump:
             self.driver.consumer.observe(RESPONSE(payload))
 
     @property
-    def untaken(self) -> int:
+    def undelivered(self) -> int:
         """How many messages of the control logic have not reached the transmitter's mailbox yet."""
         return len(self.driver.consumer.queue) + self._sending
 

@@ -8,11 +8,11 @@ from pathlib import Path
 
 from fieldtwin.conformance.clients.canopen.cases import CASES as CANOPEN_CASES
 from fieldtwin.conformance.clients.canopen.cases import SILENT as CANOPEN_SILENT
-from fieldtwin.conformance.clients.canopen.hostile_node import CanopenStage
+from fieldtwin.conformance.clients.canopen.hostile_node import HostileNode
 from fieldtwin.conformance.clients.modbus.cases import CASES, SILENT
-from fieldtwin.conformance.clients.modbus.hostile_server import Stage, traits, wire_for
+from fieldtwin.conformance.clients.modbus.hostile_server import HostileServer, traits, wire_for
 from fieldtwin.conformance.clients.probe import Classifier
-from fieldtwin.conformance.clients.run import MasterRun, Plan
+from fieldtwin.conformance.clients.run import ClientTestOptions, MasterRun
 from fieldtwin.conformance.core.observation import Word
 from fieldtwin.conformance.core.results import CaseResult
 from fieldtwin.emulators.endpoints.memory_ports import MemoryNet
@@ -78,8 +78,8 @@ def judge(
     async def main() -> list[CaseResult]:
         net, plant, told = MemoryNet(loop), Endpoint.parse(url), Told()
         clock = VirtualClock(loop)
-        stage = Stage(wire_for(plant.scheme), WORDS, {})
-        plan = Plan(frozenset(only), timeout_s=timeout_s, patience_s=5.0)
+        stage = HostileServer(wire_for(plant.scheme), WORDS, {})
+        plan = ClientTestOptions(frozenset(only), timeout_s=timeout_s, patience_s=5.0)
         run = MasterRun(stage, CASES, SILENT, plan, traits(plant.scheme), told if probed else None)
         async with Nursery() as nursery:
             if plant.is_serial:
@@ -142,8 +142,8 @@ def judge_canopen(master: Master, *only: str, timeout_s: float = TIMEOUT_S) -> d
     async def main() -> list[CaseResult]:
         net, told, clock = MemoryNet(loop), Told(), VirtualClock(loop)
         bus = await net.can_bus(Endpoint.parse("can:fieldtwin/127.0.0.1:0"), 125_000, paced=True)
-        stage = CanopenStage(WORDS, nodes=(5,))
-        plan = Plan(frozenset(only), timeout_s=timeout_s, patience_s=5.0)
+        stage = HostileNode(WORDS, nodes=(5,))
+        plan = ClientTestOptions(frozenset(only), timeout_s=timeout_s, patience_s=5.0)
         run = MasterRun(stage, CANOPEN_CASES, CANOPEN_SILENT, plan, frozenset({"can", "heartbeat"}), told)
         async with Nursery() as nursery:
             nursery.start(stage.serve(await bus.join("nodes")), "nodes")

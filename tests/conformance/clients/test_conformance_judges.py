@@ -15,9 +15,8 @@ from fieldtwin.conformance.clients.habits import (
     no_broadcast_reads,
 )
 from fieldtwin.conformance.clients.modbus.cases import CASES
-from fieldtwin.conformance.core.case import Judge
+from fieldtwin.conformance.core.case import CheckFunction
 from fieldtwin.conformance.core.observation import (
-    Asked,
     Came,
     Ended,
     Event,
@@ -25,9 +24,10 @@ from fieldtwin.conformance.core.observation import (
     Habit,
     Left,
     Observation,
+    ReplySent,
+    RequestSeen,
     Sent,
-    Shown,
-    Told,
+    ValuePublished,
     Word,
 )
 from fieldtwin.gateway.core.clock import NS_PER_S
@@ -50,22 +50,22 @@ def _at(s: float) -> int:
 def _good() -> list[Event]:
     """The client asks, gets an odd answer, asks again, and publishes the second answer."""
     return [
-        Asked(_at(0), 1, READ),
-        Told(_at(0.1), 1, b"odd", False),
-        Asked(_at(2), 1, READ),
-        Told(_at(2.1), 1, b"good", True),
-        Shown(_at(2.2), Word.SECOND, "2222"),
+        RequestSeen(_at(0), 1, READ),
+        ReplySent(_at(0.1), 1, b"odd", False),
+        RequestSeen(_at(2), 1, READ),
+        ReplySent(_at(2.1), 1, b"good", True),
+        ValuePublished(_at(2.2), Word.SECOND, "2222"),
     ]
 
 
 @pytest.mark.parametrize(
     ("more", "says"),
     [
-        ([Shown(_at(0.5), Word.POISON, "3333")], "published 3333, the value of the bad frame, 0.50 s"),
-        ([Shown(_at(0.5), Word.OTHER, "0")], "published 0, which no correct answer contained"),
+        ([ValuePublished(_at(0.5), Word.POISON, "3333")], "published 3333, the value of the bad frame, 0.50 s"),
+        ([ValuePublished(_at(0.5), Word.OTHER, "0")], "published 0, which no correct answer contained"),
         ([Garbled(_at(3), 1, b"\xff\xff")], "2 bytes that are no request: ff ff"),
         ([Ended(_at(0.7), 3)], "the master ended, exit code 3, 0.70 s"),
-        ([Asked(_at(1 + i / 10), 1, READ) for i in range(40)], "41 requests in 5.0 s"),
+        ([RequestSeen(_at(1 + i / 10), 1, READ) for i in range(40)], "41 requests in 5.0 s"),
         ([Came(_at(1 + i / 10), i) for i in range(40)], "40 connections in 5.0 s"),
     ],
 )
@@ -77,7 +77,7 @@ def test_forbidden_actions_of_a_client_fail(more: list[Event], says: str) -> Non
 
 
 def test_a_good_client_passes_and_earlier_traffic_does_not_count() -> None:
-    before = Shown(_at(-1), Word.POISON, "3333")
+    before = ValuePublished(_at(-1), Word.POISON, "3333")
     assert judges.rejects(_seen(before, *_good())).verdict is Verdict.PASSED
 
 
@@ -94,7 +94,7 @@ def test_a_client_that_never_publishes_again_fails_only_if_a_probe_observes_it()
 
 
 def test_a_correct_odd_frame_is_accepted_before_the_plain_one_arrives() -> None:
-    taken = Shown(_at(0.3), Word.SECOND, "2222")
+    taken = ValuePublished(_at(0.3), Word.SECOND, "2222")
     assert judges.accepts(_seen(*_good()[:2], taken, *_good()[2:])).verdict is Verdict.PASSED
     assert "were not accepted" in judges.accepts(_seen(*_good())).reason
 
@@ -103,13 +103,13 @@ def test_a_correct_odd_frame_is_accepted_before_the_plain_one_arrives() -> None:
     ("gap_s", "verdict"), [(0.2, Verdict.PASSED), (0.95, Verdict.INCONCLUSIVE), (0.6, Verdict.PASSED)]
 )
 def test_a_short_frame_is_seen_at_once(gap_s: float, verdict: Verdict) -> None:
-    events = [Asked(_at(0), 1, READ), Told(_at(0), 1, b"x", False), Asked(_at(gap_s), 1, READ)]
+    events = [RequestSeen(_at(0), 1, READ), ReplySent(_at(0), 1, b"x", False), RequestSeen(_at(gap_s), 1, READ)]
     habit = Habit(longest_gap_s=0.3, silent_gap_s=1.0, rate_per_s=5)
     assert judges.short_frame(_seen(*events, over_s=0, habit=habit, probed=False)).verdict is verdict
 
 
 def test_a_client_that_polls_slower_than_its_timeout_gives_no_verdict_on_it() -> None:
-    events = [Asked(_at(0), 1, READ), Told(_at(0), 1, b"x", False), Asked(_at(1), 1, READ)]
+    events = [RequestSeen(_at(0), 1, READ), ReplySent(_at(0), 1, b"x", False), RequestSeen(_at(1), 1, READ)]
     habit = Habit(longest_gap_s=1.0, silent_gap_s=1.0)
     assert judges.short_frame(_seen(*events, over_s=0, habit=habit, probed=False)).verdict is Verdict.INCONCLUSIVE
 
@@ -128,8 +128,8 @@ def test_a_client_that_polls_slower_than_its_timeout_gives_no_verdict_on_it() ->
         (broadcasts_wait, "11 06 00 00 00 01", Verdict.SKIPPED),
     ],
 )
-def test_requests_against_the_standard(judge: Judge, target: str, verdict: Verdict) -> None:
-    assert judge(_seen(Asked(_at(0), 1, bytes.fromhex(target)))).verdict is verdict
+def test_requests_against_the_standard(judge: CheckFunction, target: str, verdict: Verdict) -> None:
+    assert judge(_seen(RequestSeen(_at(0), 1, bytes.fromhex(target)))).verdict is verdict
 
 
 @pytest.mark.parametrize(
@@ -137,7 +137,9 @@ def test_requests_against_the_standard(judge: Judge, target: str, verdict: Verdi
 )
 def test_units_get_time_for_a_broadcast(pause_s: float, verdict: Verdict) -> None:
     broadcast = bytes.fromhex("00 06 00 00 00 01")
-    assert broadcasts_wait(_seen(Asked(_at(0), 1, broadcast), Asked(_at(pause_s), 1, READ))).verdict is verdict
+    assert (
+        broadcasts_wait(_seen(RequestSeen(_at(0), 1, broadcast), RequestSeen(_at(pause_s), 1, READ))).verdict is verdict
+    )
 
 
 def test_nmt_and_sync_against_the_standard() -> None:
@@ -178,7 +180,7 @@ def test_every_row_of_the_list_has_a_case_or_does_not_concern_clients(
 
 
 def test_a_master_that_gives_the_connection_up_needs_no_quarantine() -> None:
-    events: list[Event] = [Asked(_at(0), 1, READ), Left(_at(0.2), 1), Came(_at(0.3), 2), *_good()[2:]]
+    events: list[Event] = [RequestSeen(_at(0), 1, READ), Left(_at(0.2), 1), Came(_at(0.3), 2), *_good()[2:]]
     assert judges.late_same_shape(_seen(*events)).verdict is Verdict.PASSED
     events[1] = Left(_at(0.2), 1, by_us=True)
     assert judges.late_same_shape(_seen(*events)).verdict is Verdict.INCONCLUSIVE
@@ -199,6 +201,6 @@ def test_a_client_that_forbids_the_switch_may_refuse_an_ordinary_upload(
     threshold: str, word: Word, verdict: Verdict
 ) -> None:
     request = bytes.fromhex(f"05 a4 00 20 00 7f {threshold} 00 00")
-    events: list[Event] = [Asked(_at(0.001 * n), 1, request) for n in range(1, 100)]
-    found = takes_the_switch(_seen(*events, Shown(_at(0.15), word, "?"), *_good()[2:]))
+    events: list[Event] = [RequestSeen(_at(0.001 * n), 1, request) for n in range(1, 100)]
+    found = takes_the_switch(_seen(*events, ValuePublished(_at(0.15), word, "?"), *_good()[2:]))
     assert found.verdict is verdict, found.reason

@@ -17,7 +17,7 @@ from xml.etree import ElementTree as ET
 import pytest
 from test_strange_masters_judged import CANOPEN, environment
 
-from fieldtwin.capture.decoding.canopen_bus import CanopenWire
+from fieldtwin.capture.decoding.canopen_bus import CanopenBusDecoder
 from fieldtwin.conformance.core.evidence import reproduce
 from fieldtwin.gateway.core.canframe import CanFrame
 
@@ -131,7 +131,7 @@ def test_canopens_aborts_are_decoded_in_the_evidence(tmp_path: Path) -> None:
 
 
 def test_an_abort_of_a_client_that_names_no_object_ends_the_open_transfer() -> None:
-    wire = CanopenWire("can0", [])
+    wire = CanopenBusDecoder("can0", [])
     done = []
     for t_ns, (number, data) in enumerate(
         [(0x605, "4000200000000000"), (0x585, "410020000a000000"), (0x605, "8000000000000305")]

@@ -12,13 +12,13 @@ from click.testing import CliRunner, Result
 from devices_in_memory import make_unit, on_modbus
 
 from fieldtwin.cli.test.check_command import command
-from fieldtwin.conformance.core.case import Danger
+from fieldtwin.conformance.core.case import Impact
 from fieldtwin.conformance.devices.device_case import DeviceResult
-from fieldtwin.conformance.devices.dry_run import canopen_on_paper, modbus_on_paper
+from fieldtwin.conformance.devices.dry_run import canopen_dry_run, modbus_dry_run
 from fieldtwin.conformance.devices.modbus.cases import CASES
-from fieldtwin.conformance.devices.modbus.connection import READS, WRITES, ModbusWire
+from fieldtwin.conformance.devices.modbus.connection import READS, WRITES, DeviceConnection
 from fieldtwin.conformance.devices.modbus.session import ModbusOptions, check_modbus
-from fieldtwin.conformance.devices.run import Plan
+from fieldtwin.conformance.devices.run import DeviceTestOptions
 from fieldtwin.emulators.endpoints.memory_ports import MemoryNet
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.emulators.virtual.clock import VirtualClock
@@ -41,7 +41,7 @@ class Listening(ModbusUnit):
         return super().respond(pdu, now_ns)
 
 
-def check(unit: ModbusUnit, plan: Plan, url: str = URL, **options: Any) -> list[DeviceResult]:
+def check(unit: ModbusUnit, plan: DeviceTestOptions, url: str = URL, **options: Any) -> list[DeviceResult]:
     async def use(net: MemoryNet, url: str, clock: VirtualClock) -> list[DeviceResult]:
         to_do = ModbusOptions(url, 1, plan, connector=net, clock=clock, **options)
         return (await check_modbus(to_do)).results
@@ -55,11 +55,11 @@ def check(unit: ModbusUnit, plan: Plan, url: str = URL, **options: Any) -> list[
 def test_without_permission_only_reads_are_sent(url: str) -> None:
     unit = Listening()
     before = bytes(unit.bank.peek("holding", at) & 0xFF for at in range(200))  # type: ignore[attr-defined]
-    results = check(unit, Plan(), url)
+    results = check(unit, DeviceTestOptions(), url)
     assert len(unit.asked) > 20
     assert {pdu[0] for pdu in unit.asked} <= READS
     assert before == bytes(unit.bank.peek("holding", at) & 0xFF for at in range(200))  # type: ignore[attr-defined]
-    assert all(not r.spoken for r in results if r.case.danger.rank > Danger.READ.rank)
+    assert all(not r.spoken for r in results if r.case.danger.rank > Impact.READ.rank)
 
 
 def test_with_write_permission_only_the_given_cells_change_and_are_restored() -> None:
@@ -67,14 +67,14 @@ def test_with_write_permission_only_the_given_cells_change_and_are_restored() ->
     unit.bank.poke("holding", 199, 4711)  # type: ignore[attr-defined]
     unit.bank.poke("coil", 3, 1)  # type: ignore[attr-defined]
     held = [unit.bank.peek("holding", at) for at in range(200)]  # type: ignore[attr-defined]
-    plan = Plan(at_most=Danger.WRITE, has=frozenset({"holding", "coil"}))
+    plan = DeviceTestOptions(at_most=Impact.WRITE, has=frozenset({"holding", "coil"}))
     results = check(unit, plan, may_write={"holding": (199, 1), "coil": (3, 1)})
     assert {pdu[0] for pdu in unit.asked} <= READS | WRITES
     aimed = {pdu[1:3] for pdu in unit.asked if pdu[0] in WRITES}
     assert aimed == {(199).to_bytes(2), (3).to_bytes(2)}
     assert [unit.bank.peek("holding", at) for at in range(200)] == held  # type: ignore[attr-defined]
     assert unit.bank.peek("coil", 3) == 1  # type: ignore[attr-defined]
-    assert all(r.verdict is Verdict.PASSED for r in results if r.case.danger is Danger.WRITE)
+    assert all(r.verdict is Verdict.PASSED for r in results if r.case.danger is Impact.WRITE)
 
 
 def test_a_wire_refuses_requests_above_the_impact_level() -> None:
@@ -82,11 +82,11 @@ def test_a_wire_refuses_requests_above_the_impact_level() -> None:
         raise AssertionError
 
     async def use(net: MemoryNet, url: str, clock: VirtualClock) -> None:
-        wire = ModbusWire(never, clock, "mbap", 1)
+        wire = DeviceConnection(never, clock, "mbap", 1)
         for pdu in (b"\x06\0\0\0\0", b"\x2b\x0d\0", b"\x08\0\0\0\0", b"\x64", b"\x83\0\0\0\x01"):
             with pytest.raises(Bug):
                 await wire.ask(pdu)
-        wire.danger = Danger.WRITE
+        wire.danger = Impact.WRITE
         with pytest.raises(Bug):
             await wire.ask(b"\x08\0\0\0\0")
 
@@ -96,7 +96,7 @@ def test_a_wire_refuses_requests_above_the_impact_level() -> None:
 def test_a_missing_device_is_unreachable() -> None:
     async def use(net: MemoryNet, url: str, clock: VirtualClock) -> None:
         with pytest.raises(Unreachable, match="unit 7"):
-            await check_modbus(ModbusOptions(url, 7, Plan(), connector=net, clock=clock))
+            await check_modbus(ModbusOptions(url, 7, DeviceTestOptions(), connector=net, clock=clock))
 
     on_modbus("rtu:/virtual/line?baudrate=19200&frame=8E1", use)
 
@@ -111,7 +111,7 @@ def test_nothing_is_sent_on_a_line_with_foreign_traffic() -> None:
             await end.write(bytes.fromhex("05 03 00 00 00 01 85 8E"))
 
     async def use(net: MemoryNet, url: str, clock: VirtualClock) -> None:
-        options = ModbusOptions(url, 1, Plan(), connector=net, clock=clock)
+        options = ModbusOptions(url, 1, DeviceTestOptions(), connector=net, clock=clock)
         with pytest.raises(NotAllowed, match="--share-bus"):
             await check_modbus(options)
 
@@ -122,7 +122,9 @@ def test_nothing_is_sent_on_a_line_with_foreign_traffic() -> None:
 def test_a_rate_is_kept() -> None:
     async def use(net: MemoryNet, url: str, clock: VirtualClock) -> float:
         began_ns = clock.monotonic_ns()
-        checked = await check_modbus(ModbusOptions(url, 1, Plan(), spacing_s=0.5, connector=net, clock=clock))
+        checked = await check_modbus(
+            ModbusOptions(url, 1, DeviceTestOptions(), spacing_s=0.5, connector=net, clock=clock)
+        )
         sent = len(checked.before) // 2
         assert sent > 5
         return (clock.monotonic_ns() - began_ns) / 1e9 - 0.5 * sent
@@ -176,15 +178,15 @@ def test_a_dry_run_shows_every_case_that_would_run_and_opens_nothing() -> None:
 
 @pytest.mark.parametrize("wire", ["ascii:/x", "tcp://h:1", "rtu+tcp://h:1", "udp://h:1"])
 def test_a_dry_run_on_every_wire(wire: str) -> None:
-    checked = modbus_on_paper(ModbusOptions(wire, 9, Plan()))
+    checked = modbus_dry_run(ModbusOptions(wire, 9, DeviceTestOptions()))
     assert [r.case.id for r in checked.results if r.verdict is Verdict.FAILED] == []
 
 
 def test_a_dry_run_of_a_node(tmp_path: Path) -> None:
     from fieldtwin.conformance.devices.canopen.session import CanopenOptions
 
-    plan = Plan(at_most=Danger.DISRUPT, has=frozenset({"object", "i-know"}))
-    checked = canopen_on_paper(CanopenOptions("can:socketcan/can0", 5, plan, may_write=((0x2000, 0), (0x2100, 3))))
+    plan = DeviceTestOptions(at_most=Impact.DISRUPT, has=frozenset({"object", "i-know"}))
+    checked = canopen_dry_run(CanopenOptions("can:socketcan/can0", 5, plan, may_write=((0x2000, 0), (0x2100, 3))))
     assert [r.case.id for r in checked.results if r.verdict is Verdict.FAILED] == []
     assert sum(bool(r.spoken) for r in checked.results) > 30
 

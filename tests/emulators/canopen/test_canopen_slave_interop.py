@@ -17,7 +17,7 @@ from fieldtwin.emulators.canopen.dictionary import load_eds
 from fieldtwin.emulators.canopen.node import CanopenNode, NmtState, NodeContext
 from fieldtwin.emulators.canopen.serve import serve_node
 from fieldtwin.gateway.core.canframe import CanFrame
-from fieldtwin.gateway.core.connection import CANConnection, CanConnection, closed_here
+from fieldtwin.gateway.core.connection import CANConnection, CanConnection, closed_locally
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import ConnectionLost
 from fieldtwin.gateway.wallclock import WallClock
@@ -51,7 +51,7 @@ class VirtualEnd(CanConnection):
         self._closing.set()
         await asyncio.to_thread(self._thread.join)
         self._bus.shutdown()
-        self.feed_lost(closed_here(self.endpoint))
+        self.feed_lost(closed_locally(self.endpoint))
 
 
 def test_the_canopen_package_s_client() -> None:

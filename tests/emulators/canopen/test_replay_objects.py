@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from fieldtwin.emulators.canopen.dictionary import parse_eds
 from fieldtwin.emulators.canopen.node import NodeContext
-from fieldtwin.emulators.context import UsedUp, WhenUsedUp
+from fieldtwin.emulators.context import EndOfRecording, UsedUp
 from fieldtwin.emulators.replay.can_log import CanLog, read_can_log
 from fieldtwin.emulators.replay.objects import RecordedObjects, recorded_objects
 from fieldtwin.emulators.virtual.loop import VirtualLoop
@@ -43,7 +43,7 @@ LOG = """\
 """
 
 
-def recorded(policy: WhenUsedUp = WhenUsedUp.HOLD) -> tuple[Rig, RecordedObjects]:
+def recorded(policy: EndOfRecording = EndOfRecording.HOLD) -> tuple[Rig, RecordedObjects]:
     objects = RecordedObjects(read_can_log(LOG.splitlines()), parse_eds(RICH), 5, policy)
     return Rig(RICH, NodeContext(source=objects, factory=objects.initial)), objects
 
@@ -70,7 +70,7 @@ def test_a_write_of_the_recorded_master_is_a_setting() -> None:
     assert rig.read(0x2006) == 7
 
 
-def answered(values: str, policy: WhenUsedUp = WhenUsedUp.HOLD) -> Rig:
+def answered(values: str, policy: EndOfRecording = EndOfRecording.HOLD) -> Rig:
     """A log in which 2002h was uploaded once a second with these bytes, each time with a different object in between."""
     lines = []
     for second, value in enumerate(values.split()):
@@ -81,8 +81,8 @@ def answered(values: str, policy: WhenUsedUp = WhenUsedUp.HOLD) -> Rig:
     return Rig(RICH, NodeContext(source=objects, factory=objects.initial))
 
 
-@pytest.mark.parametrize(("policy", "then"), [(WhenUsedUp.HOLD, [3, 3]), (WhenUsedUp.LOOP, [1, 2])])
-def test_requested_values_answer_read_by_read_at_any_rate(policy: WhenUsedUp, then: list[int]) -> None:
+@pytest.mark.parametrize(("policy", "then"), [(EndOfRecording.HOLD, [3, 3]), (EndOfRecording.LOOP, [1, 2])])
+def test_requested_values_answer_read_by_read_at_any_rate(policy: EndOfRecording, then: list[int]) -> None:
     rig = answered("01 02 02 03", policy)
     assert [rig.read(0x2002) for _ in range(4)] == [1, 2, 2, 3], "all at one instant"
     assert rig.read(0x2006) == 0x63, "each object on its own"
@@ -90,7 +90,7 @@ def test_requested_values_answer_read_by_read_at_any_rate(policy: WhenUsedUp, th
 
 
 def test_requested_values_are_used_up() -> None:
-    rig = answered("01 02", WhenUsedUp.ERROR)
+    rig = answered("01 02", EndOfRecording.ERROR)
     rig.advance(100)
     assert [rig.read(0x2002), rig.read(0x2002)] == [1, 2]
     with pytest.raises(UsedUp, match="2002h:00"):
@@ -175,14 +175,14 @@ def test_a_log_is_for_nodes(tmp_path: Path) -> None:
 
 
 def test_at_the_end() -> None:
-    rig, objects = recorded(WhenUsedUp.LOOP)
+    rig, objects = recorded(EndOfRecording.LOOP)
     assert rig.read(0x2002) == 0x1234
     rig.advance(390)
     assert rig.read(0x2002) == 0x789A
     rig.advance(objects.duration_s * 1000)
     rig.advance(20)
     assert rig.read(0x2002) == 0x1234
-    rig, _ = recorded(WhenUsedUp.ERROR)
+    rig, _ = recorded(EndOfRecording.ERROR)
     assert rig.read(0x2002) == 0x1234
     rig.advance(500)
     with pytest.raises(UsedUp):

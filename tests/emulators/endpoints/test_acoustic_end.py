@@ -9,13 +9,13 @@ import pytest
 from support import eventually, run
 
 from fieldtwin.emulators.endpoints.acoustic_end import ROOM, AcousticEnd, AcousticServer
-from fieldtwin.emulators.wires.acoustic import AcousticMedium, Water
+from fieldtwin.emulators.wires.acoustic import AcousticMedium, AcousticProperties
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.errors import Unreachable
 from fieldtwin.gateway.wallclock import WallClock
 
 PLACES = {"a": (0.0, 0.0), "b": (15.0, 0.0)}
-WATER = Water(range_m=100.0, bytes_per_s=10_000.0)
+WATER = AcousticProperties(range_m=100.0, bytes_per_s=10_000.0)
 
 
 def test_each_end_receives_the_messages_of_the_other(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from fieldtwin.emulators.faults.can_fault import BusFault, CanFault
 from fieldtwin.emulators.faults.engine import WireFaults
-from fieldtwin.emulators.faults.fault import Active, Aim, Hang, Outcome, Piece, ValueFault, WireFault
+from fieldtwin.emulators.faults.fault import Active, Aim, FaultEffect, Hang, Piece, ValueFault, WireFault
 from fieldtwin.emulators.faults.frames import Assembler, Frame, Framing, Way, understood
 from fieldtwin.emulators.faults.registry import FAULTS
 from fieldtwin.emulators.faults.schema import parse_fault
@@ -51,7 +51,7 @@ def made(name: str, **said: Any) -> Any:
     return parse_fault({"name": name, **said}).make()
 
 
-def struck(name: str, data: bytes, framing: Framing = Framing.RTU, /, **said: Any) -> Outcome:
+def struck(name: str, data: bytes, framing: Framing = Framing.RTU, /, **said: Any) -> FaultEffect:
     fault = made(name, **said)
     assert isinstance(fault, WireFault)
     frame = understood(Way.REPLY, framing, data)
@@ -59,7 +59,7 @@ def struck(name: str, data: bytes, framing: Framing = Framing.RTU, /, **said: An
     return fault.strike(frame, Random(7))
 
 
-def pieces(outcome: Outcome) -> list[tuple[bytes, float]]:
+def pieces(outcome: FaultEffect) -> list[tuple[bytes, float]]:
     return [(piece.data, piece.delay_s) for piece in outcome.pieces]
 
 
@@ -162,8 +162,8 @@ def test_an_echo_goes_back_first() -> None:
 
 
 def test_faults_of_a_connection() -> None:
-    assert struck("reset", ON_TCP, Framing.MBAP, at=4) == Outcome((Piece(ON_TCP[:4]),), Hang.RESET)
-    assert struck("half-open", ON_TCP, Framing.MBAP) == Outcome(hang=Hang.HALF_OPEN)
+    assert struck("reset", ON_TCP, Framing.MBAP, at=4) == FaultEffect((Piece(ON_TCP[:4]),), Hang.RESET)
+    assert struck("half-open", ON_TCP, Framing.MBAP) == FaultEffect(hang=Hang.HALF_OPEN)
     assert made("disconnect").appears() is Hang.CLOSE
     assert made("disconnect").refuses
 

@@ -18,7 +18,7 @@ from fieldtwin.emulators.faults.registry import fault_class
 from fieldtwin.emulators.modbus.bank import IllegalAddress
 from fieldtwin.emulators.models.emulated_node import EmulatedNode, emulated_node
 from fieldtwin.emulators.models.mailbox_modem import ModemPair
-from fieldtwin.emulators.models.register_device import StatedRegisters
+from fieldtwin.emulators.models.register_device import ProfileRegisters
 from fieldtwin.emulators.replay.can_log import CanLog
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.clock import NS_PER_S
@@ -51,16 +51,16 @@ def put(distortions: Distortions, name: str, tag: str, **said: Any) -> str:
 
 
 @pytest.fixture
-def tank(tmp_path: Path) -> tuple[StatedRegisters, DistortedRegisters]:
+def tank(tmp_path: Path) -> tuple[ProfileRegisters, DistortedRegisters]:
     (tmp_path / "tank.yaml").write_text(TANK)
     profile = load_profile(tmp_path / "tank.yaml")
     values: dict[str, float | str] = {"level": 1.5, "total": 1000, "alarm": 3, "mode": 2, "ready": 1, "current_sf": -2}
-    bank = StatedRegisters(profile, values, 0)
+    bank = ProfileRegisters(profile, values, 0)
     return bank, DistortedRegisters(bank, bank.peek, profile, bank.journal)
 
 
 def test_registers_of_a_model_hold_the_set_value_and_their_own_again(
-    tank: tuple[StatedRegisters, DistortedRegisters],
+    tank: tuple[ProfileRegisters, DistortedRegisters],
 ) -> None:
     bank, seen = tank
     ids = [
@@ -88,7 +88,7 @@ def test_registers_of_a_model_hold_the_set_value_and_their_own_again(
     assert held == ["8002", "8009", "8002"]  # the oracle has the values of the device
 
 
-def test_a_read_of_a_distorted_tag_has_its_effects_once(tank: tuple[StatedRegisters, DistortedRegisters]) -> None:
+def test_a_read_of_a_distorted_tag_has_its_effects_once(tank: tuple[ProfileRegisters, DistortedRegisters]) -> None:
     _, seen = tank
     put(seen.distortions, "drift", "alarm", per_s=1.0)
     assert list(seen.read("holding", 10, 1, 0)) == [3]

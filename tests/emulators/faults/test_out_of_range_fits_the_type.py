@@ -19,7 +19,7 @@ from fieldtwin.emulators.stated import cells_of
 from fieldtwin.gateway.core.connection import RS232Connection
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.gateway.core.files.profile import load_profile
-from fieldtwin.gateway.core.files.recording import Exchange
+from fieldtwin.gateway.core.files.recording import RecordedExchange
 from fieldtwin.results.model import Verdict
 from fieldtwin.run.targets.scenario_targets import Target, run_scenario
 from fieldtwin.run.virtual.fault_schedule import RandomFaults, random_schedule
@@ -154,7 +154,7 @@ def test_a_fault_of_a_part_of_a_recorded_register_leaves_its_other_bits(tmp_path
     scenario(tmp_path, "")
     profile = load_profile(tmp_path / "tank.yaml")
     read = bytes.fromhex("03 0001 0001")
-    replay = ExchangeReplay([Exchange(0.0, 1, read, bytes.fromhex("03 02 8001"), 0.0)])
+    replay = ExchangeReplay([RecordedExchange(0.0, 1, read, bytes.fromhex("03 02 8001"), 0.0)])
     device = RecordedDevice(profile, replay, 1, RS232Connection, {})
     said = ({"name": "out-of-range", "register": "valve"},)
     DeviceFaults(said, profile, 1, 0).on_values(device.distortions)

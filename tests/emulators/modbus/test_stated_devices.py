@@ -9,14 +9,14 @@ import pytest
 
 from fieldtwin.emulators.emulator import EmulatedUnit
 from fieldtwin.emulators.modbus.unit import ModbusUnit, UnitLimits
-from fieldtwin.emulators.models.register_device import StatedRegisters, add_own_functions
+from fieldtwin.emulators.models.register_device import ProfileRegisters, add_own_functions
 from fieldtwin.emulators.replay.profiled import ProfiledReplay
 from fieldtwin.emulators.replay.replay import ExchangeReplay
 from fieldtwin.emulators.stated import parts_of
 from fieldtwin.gateway.core.connection import RS232Connection
 from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid
 from fieldtwin.gateway.core.files.profile import DeviceProfile, load_profile
-from fieldtwin.gateway.core.files.recording import Exchange
+from fieldtwin.gateway.core.files.recording import RecordedExchange
 from fieldtwin.run.virtual.run import VirtualOptions, VirtualRun
 
 PROFILE = """
@@ -70,7 +70,7 @@ def profile_of(tmp_path: Path, text: str = PROFILE) -> DeviceProfile:
 def stated(tmp_path: Path) -> EmulatedUnit:
     profile = profile_of(tmp_path)
     limits = UnitLimits(functions=frozenset(profile.form.limits.functions or ()))
-    bank = StatedRegisters(profile, VALUES, 0)
+    bank = ProfileRegisters(profile, VALUES, 0)
     unit = EmulatedUnit(bank, profile, RS232Connection, (), limits, "tank", parts_of(profile))
     add_own_functions(unit, bank, profile)
     return unit
@@ -125,7 +125,7 @@ def test_side_effects_of_registers(tmp_path: Path) -> None:
     ask(unit, "64 55AA", 9)
     assert ask(unit, "03 0000 0002") == "03040000007d"
     bank = unit.bank
-    assert isinstance(bank, StatedRegisters)
+    assert isinstance(bank, ProfileRegisters)
     assert [(h.raw.hex(), h.t_ns) for h in bank.journal.since(0) if h.tag == "total"] == [
         ("00002710", 0),
         ("00000000", 5),
@@ -142,7 +142,7 @@ def test_a_recorded_device_behaves_as_its_profile_states(tmp_path: Path) -> None
         ("08 000E 0000", "08 000E 1234"),
     ]
     replay = ExchangeReplay(
-        Exchange(0.0, 1, bytes.fromhex(asked), bytes.fromhex(said), 0.01) for asked, said in recorded
+        RecordedExchange(0.0, 1, bytes.fromhex(asked), bytes.fromhex(said), 0.01) for asked, said in recorded
     )
     unit = ProfiledReplay(profile_of(tmp_path), replay, 1)
     assert ask(unit, "03 000A 0001") == "03020003"
@@ -163,7 +163,7 @@ def test_a_recorded_device_behaves_as_its_profile_states(tmp_path: Path) -> None
 
 @pytest.mark.parametrize("recorded", [False, True])
 def test_busy_as_stated(tmp_path: Path, recorded: bool) -> None:
-    replay = ExchangeReplay([Exchange(0.0, 1, bytes.fromhex("03000a0001"), bytes.fromhex("03020003"), 0.01)])
+    replay = ExchangeReplay([RecordedExchange(0.0, 1, bytes.fromhex("03000a0001"), bytes.fromhex("03020003"), 0.01)])
     unit: ModbusUnit = ProfiledReplay(profile_of(tmp_path), replay, 1) if recorded else stated(tmp_path)
     unit.be_busy_behind(3, 100)
     replies = [ask(unit, "03 000A 0001", now_ns) for now_ns in (0, 1, 2, 3, 101, 102, 103, 104, 105)]
@@ -181,7 +181,7 @@ def test_values_that_cannot_be(tmp_path: Path) -> None:
         ({"model": 5}, "text"),
     ):
         with pytest.raises(FileInvalid, match=told):
-            StatedRegisters(profile, values, 0)
+            ProfileRegisters(profile, values, 0)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from fieldtwin.emulators.modbus.unit import ModbusUnit
-from fieldtwin.emulators.models.register_device import StatedRegisters
+from fieldtwin.emulators.models.register_device import ProfileRegisters
 from fieldtwin.emulators.recorded_device import load_replay
 from fieldtwin.emulators.replay.profiled import ProfiledReplay
 from fieldtwin.gateway.core.errors import FileInvalid
@@ -37,7 +37,7 @@ def profile(undeclared: str) -> DeviceProfile:
 
 
 def stated(undeclared: str) -> ModbusUnit:
-    return ModbusUnit(StatedRegisters(profile(undeclared), {"first": 7, "second": 9}, 0))
+    return ModbusUnit(ProfileRegisters(profile(undeclared), {"first": 7, "second": 9}, 0))
 
 
 def asked(unit: ModbusUnit, pdu: str) -> str:

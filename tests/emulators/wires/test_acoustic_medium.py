@@ -7,13 +7,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fieldtwin.emulators.models.acoustic_link import AcousticLink
-from fieldtwin.emulators.wires.acoustic import HEARD, QUEUE, AcousticMedium, Water
+from fieldtwin.emulators.wires.acoustic import HEARD, QUEUE, AcousticMedium, AcousticProperties
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.errors import UsageError
 
 ROW = {"west": (0.0, 0.0), "middle": (3000.0, 0.0), "east": (6000.0, 0.0)}
 """East and west do not reach each other; the middle receives both, 2 s after they send."""
-WATER = Water(range_m=4000.0, bytes_per_s=20.0, overhead_bytes=8)
+WATER = AcousticProperties(range_m=4000.0, bytes_per_s=20.0, overhead_bytes=8)
 
 
 def s(seconds: float) -> int:
@@ -118,7 +118,7 @@ def test_every_message_is_received_once_or_lost_for_a_reason_independent_of_poll
     said: list[tuple[str, int, bytes]], loss: float, seed: int, looks: int
 ) -> None:
     said = sorted(said, key=lambda one: one[1])
-    water = Water(range_m=4000.0, bytes_per_s=80.0, loss=loss)
+    water = AcousticProperties(range_m=4000.0, bytes_per_s=80.0, loss=loss)
 
     def played(every_s: float) -> tuple[dict[str, list[bytes]], dict[str, dict[str, int]]]:
         sea, heard, t_s = AcousticMedium(water, ROW, seed), {name: list[bytes]() for name in ROW}, 0.0

@@ -16,7 +16,7 @@ from canopen_master_bus import running
 from support import eventually, run
 
 from fieldtwin.gateway.core.canframe import CanFrame
-from fieldtwin.gateway.core.connection import CANConnection, CanConnection, closed_here
+from fieldtwin.gateway.core.connection import CANConnection, CanConnection, closed_locally
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import SdoAborted, UsageError, VerifyFailed
 from fieldtwin.gateway.protocols.canopen.boot import (
@@ -109,7 +109,7 @@ class VirtualEnd(CanConnection):
     async def aclose(self) -> None:
         self._notifier.stop()
         self._bus.shutdown()
-        self.feed_lost(closed_here(self.endpoint))
+        self.feed_lost(closed_locally(self.endpoint))
 
 
 class Pair:

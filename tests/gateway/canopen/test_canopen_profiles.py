@@ -18,7 +18,7 @@ from fieldtwin.emulators.canopen.dictionary import load_eds
 from fieldtwin.emulators.canopen.node import CanopenNode
 from fieldtwin.emulators.canopen.serve import serve_node
 from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
-from fieldtwin.emulators.journal import HeldJournal
+from fieldtwin.emulators.journal import DeviceValueLog
 from fieldtwin.emulators.models.emulated_node import emulated_node
 from fieldtwin.emulators.signals import SignalPlayer, SignalTrack
 from fieldtwin.gateway.connections.os_connector import OsConnector
@@ -192,7 +192,7 @@ class Line:
     driver: CanopenDriver
     tags: TagTable
     node: CanopenNode
-    journal: HeldJournal
+    journal: DeviceValueLog
     track: SignalTrack
 
     def value(self, tag: str) -> object:

@@ -19,7 +19,7 @@ from fieldtwin.gateway.core.connection import (
     Connection,
     RS232Connection,
     TCPConnection,
-    closed_here,
+    closed_locally,
 )
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import Bug, ConnectionLost, DeviceRefused, ModbusExceptionReply
@@ -70,7 +70,7 @@ class End(ByteConnection):
         self.feed(data)
 
     async def aclose(self) -> None:
-        self.feed_lost(closed_here(self.endpoint))
+        self.feed_lost(closed_locally(self.endpoint))
 
 
 def test_the_end_reports_when_it_is_full_and_when_there_is_room() -> None:
@@ -189,7 +189,7 @@ class Node(CanConnection):
         self.feed(frame)
 
     async def aclose(self) -> None:
-        self.feed_lost(closed_here(self.endpoint))
+        self.feed_lost(closed_locally(self.endpoint))
 
 
 def test_a_slow_reader_of_a_bus_loses_the_newest_frames_counted_and_unseen_by_observers() -> None:

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from fieldtwin.gateway.core.errors import Bug, FileInvalid
 from fieldtwin.gateway.core.files.recording import (
     MAX_LINE_BYTES,
-    Exchange,
+    RecordedExchange,
     RecordingHeader,
     RecordingReader,
     RecordingWriter,
@@ -48,9 +48,9 @@ EXCHANGES = RecordingHeader(
 
 times = st.floats(0, 1e9, allow_nan=False)
 exchanges = st.builds(
-    Exchange, times, st.integers(0, 255), st.binary(min_size=1, max_size=253), st.binary(max_size=253), times
+    RecordedExchange, times, st.integers(0, 255), st.binary(min_size=1, max_size=253), st.binary(max_size=253), times
 ) | st.builds(
-    lambda t, unit, request, latency, error: Exchange(t, unit, request, None, latency, error),
+    lambda t, unit, request, latency, error: RecordedExchange(t, unit, request, None, latency, error),
     times,
     st.integers(0, 255),
     st.binary(min_size=1, max_size=253),
@@ -66,7 +66,9 @@ def rows_of(path: Path) -> tuple[list[tuple[float, ...]], bool]:
 
 
 @given(st.lists(exchanges, max_size=20))
-def test_exchanges_come_back_as_they_were(tmp_path_factory: pytest.TempPathFactory, recorded: list[Exchange]) -> None:
+def test_exchanges_come_back_as_they_were(
+    tmp_path_factory: pytest.TempPathFactory, recorded: list[RecordedExchange]
+) -> None:
     path = tmp_path_factory.mktemp("recording") / "r.jsonl"
     with RecordingWriter(path, EXCHANGES) as writer:
         for exchange in recorded:
@@ -94,9 +96,9 @@ def test_rows_come_back_as_they_were(
 
 
 def test_lines_are_as_documented() -> None:
-    exchange = Exchange(1.25, 1, bytes.fromhex("0400000002"), bytes.fromhex("04044148f5c3"), 0.021)
+    exchange = RecordedExchange(1.25, 1, bytes.fromhex("0400000002"), bytes.fromhex("04044148f5c3"), 0.021)
     assert encode_exchange(exchange) == (b'{"t":1.25,"unit":1,"req":"0400000002","rep":"04044148f5c3","lat":0.021}\n')
-    silent = Exchange(2.0, 1, b"\x04\x00\x00\x00\x02", None, 0.3, "timeout")
+    silent = RecordedExchange(2.0, 1, b"\x04\x00\x00\x00\x02", None, 0.3, "timeout")
     assert encode_exchange(silent) == b'{"t":2.0,"unit":1,"req":"0400000002","err":"timeout","lat":0.3}\n'
     assert encode_row(1.25, [10.31, math.nan]) == b"[1.25,10.31,null]\n"
     assert encode_header(SIGNALS).startswith(b'{"fieldtwin_recording":1,"device":"fieldtwin/ctd-reference",')
@@ -209,11 +211,11 @@ def test_writing_an_unreadable_record_is_a_bug(tmp_path: Path) -> None:
         with pytest.raises(Bug):
             writer.row(0.0, [1.0])
         with pytest.raises(Bug):
-            writer.exchange(Exchange(0.0, 1, b"\x03", b""))
+            writer.exchange(RecordedExchange(0.0, 1, b"\x03", b""))
     with pytest.raises(Bug):
         writer.row(0.0, [1.0, 2.0])
     with RecordingWriter(tmp_path / "e.jsonl", EXCHANGES) as writer, pytest.raises(Bug):
-        writer.exchange(Exchange(0.0, 1, b"\x03", None))
+        writer.exchange(RecordedExchange(0.0, 1, b"\x03", None))
 
 
 def test_a_full_disk_leaves_whole_records(tmp_path: Path) -> None:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 from support import run
 
-from fieldtwin.gateway.core.concurrency.async_resource import Started
+from fieldtwin.gateway.core.concurrency.async_resource import AsyncResource
 from fieldtwin.gateway.core.errors import Unreachable
 
 
-class Parts(Started):
+class Parts(AsyncResource):
     """Record its actions. `fails` names the part that does not start, or ``stop``."""
 
     def __init__(self, fails: str = "") -> None:

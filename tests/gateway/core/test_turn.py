@@ -9,15 +9,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fieldtwin.emulators.virtual.loop import VirtualLoop
-from fieldtwin.gateway.core.concurrency.fair_lock import Turn
-from fieldtwin.gateway.core.concurrency.timeout import alarm, ring
+from fieldtwin.gateway.core.concurrency.fair_lock import FairLock
+from fieldtwin.gateway.core.concurrency.timeout import ring, start_timeout
 
 
 @given(st.lists(st.tuples(st.integers(0, 5), st.integers(0, 4), st.booleans()), max_size=12))
 @settings(max_examples=60)
 def test_one_at_a_time_in_the_order_of_requests_despite_cancellations(users: list[tuple[int, int, bool]]) -> None:
     """Each arrives at a time, works for a while, and may be cancelled half a unit after its arrival."""
-    turn, began, spans = Turn(), [], []
+    turn, began, spans = FairLock(), [], []
 
     async def user(number: int, works: int, loop: VirtualLoop) -> None:
         if not turn.take():
@@ -56,7 +56,7 @@ def test_one_at_a_time_in_the_order_of_requests_despite_cancellations(users: lis
 
 
 def test_cancelled_at_the_instant_at_which_it_was_passed_on_it_goes_to_the_next() -> None:
-    turn, had = Turn(), []
+    turn, had = FairLock(), []
 
     async def user(name: str) -> None:
         if not turn.take():
@@ -80,12 +80,12 @@ def test_an_alarm_ends_by_itself_or_is_rung_on_either_loop() -> None:
     async def main() -> tuple[float, float]:
         loop = asyncio.get_running_loop()
         began = loop.time()
-        waiter, end = alarm(loop, 0.02)
+        waiter, end = start_timeout(loop, 0.02)
         await waiter
         alone = loop.time() - began
         if end is not None:
             end()
-        waiter, end = alarm(loop, 3600.0)
+        waiter, end = start_timeout(loop, 3600.0)
         loop.call_soon(ring, waiter)
         await waiter
         ring(waiter)  # a second call has no effect

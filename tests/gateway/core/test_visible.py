@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldtwin.gateway.core.errors import FileInvalid
-from fieldtwin.gateway.core.escaping import visible
+from fieldtwin.gateway.core.escaping import escape_controls
 
 
 @pytest.mark.parametrize(
@@ -20,10 +20,10 @@ from fieldtwin.gateway.core.escaping import visible
     ],
 )
 def test_invisible_characters_are_escaped(text: str, shown: str) -> None:
-    assert visible(text) == shown
+    assert escape_controls(text) == shown
     assert str(FileInvalid("a name", got=text)) == f"a name; got {shown}"
 
 
 @given(text=st.text())
 def test_whatever_comes_can_be_seen(text: str) -> None:
-    assert all(c.isprintable() or c in "\n\t" for c in visible(text))
+    assert all(c.isprintable() or c in "\n\t" for c in escape_controls(text))

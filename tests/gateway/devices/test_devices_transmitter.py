@@ -17,7 +17,7 @@ from support import eventually, run
 
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.emulators.models.mailbox_modem import ModemPair
-from fieldtwin.emulators.models.packet_link import PacketLink, Untamed
+from fieldtwin.emulators.models.packet_link import LinkImpairments, PacketLink
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.concurrency.events import Consumer
 from fieldtwin.gateway.core.errors import ConnectionLost, FieldtwinError, FileInvalid, NotAllowed
@@ -299,13 +299,13 @@ def test_a_mailbox_assigned_to_a_thread_is_neither_read_nor_written(tmp_path: Pa
         modems = pair()
         audit = AuditLog(tmp_path / "audit.jsonl", WallClock())
         async with station(modems, "far") as far, station(modems) as near:
-            pump = MailboxPump(near.driver, near.bus, audit, allow_writes=True, remote=True, lent=True)
+            pump = MailboxPump(near.driver, near.bus, audit, allow_writes=True, remote=True, delegated=True)
             far.driver.consumer.observe(COMMAND(b"\0\5"))
             await far.do("send")
             await near.do("read")
             pump.offer([b"a response"])
             pump.tick(1, all_consumed=True)
-            assert (len(pump.inbox.queue), pump.untaken) == (0, 0)
+            assert (len(pump.inbox.queue), pump.undelivered) == (0, 0)
             assert near.driver.to_acknowledge
             assert pump.command(b"\0\7", "twin:1")
             assert [item.data for item in pump.inbox.queue] == [b"\0\7"]
@@ -349,7 +349,7 @@ def test_the_link_delivers_everything_once_in_order_and_no_faster_than_it_can(
 
 def test_modems_that_do_not_send_again_lose_repeat_and_turn_round_messages() -> None:
     """Random losses with a seed; arriving messages are complete, and at most one position out of order."""
-    link = PacketLink(1e6, 1.0, 0.0, Random(1), capacity=10_000, untamed=Untamed(0.2, 0.1, 0.1))
+    link = PacketLink(1e6, 1.0, 0.0, Random(1), capacity=10_000, untamed=LinkImpairments(0.2, 0.1, 0.1))
     sent = [n.to_bytes(2) for n in range(2000)]
     assert all(link.submit(payload, 0) for payload in sent)
     got = []

@@ -16,7 +16,7 @@ from fieldtwin.gateway.devices.config import DeviceConfig
 from fieldtwin.gateway.devices.register_device import RegisterDriver, SensorDriver
 from fieldtwin.gateway.protocols.modbus.server import examine
 from fieldtwin.gateway.protocols.modbus.server_forward import ForwardedReply
-from fieldtwin.gateway.runtime.buses.bridge_queue import MAX_WAIT_NS, Guest, GuestQueue
+from fieldtwin.gateway.runtime.buses.bridge_queue import MAX_WAIT_NS, BridgeQueue, BridgeRequest
 from fieldtwin.gateway.runtime.buses.modbus_bus import Job, ModbusBus
 from fieldtwin.gateway.runtime.tags import TagTable
 
@@ -26,8 +26,8 @@ Result = ForwardedReply | FieldtwinError
 
 def guest(
     client: str, results: list[Result], *, queued_ns: int = 0, wanted: Callable[[], bool] = lambda: True
-) -> Guest:
-    return Guest(client, 1, READ, examine(READ), 1, queued_ns, results.append, wanted)
+) -> BridgeRequest:
+    return BridgeRequest(client, 1, READ, examine(READ), 1, queued_ns, results.append, wanted)
 
 
 def make(tags: TagTable) -> list[RegisterDriver]:
@@ -87,7 +87,7 @@ def test_mb_063_a_write_of_the_plc_goes_before_clients_and_polls() -> None:
 
 
 def test_clients_take_turns_among_themselves() -> None:
-    queue = GuestQueue()
+    queue = BridgeQueue()
     for client in ("a", "a", "a", "b", "c"):
         queue.put(guest(client, []))
     taken = [queue.take(0) for _ in range(5)]
@@ -96,7 +96,7 @@ def test_clients_take_turns_among_themselves() -> None:
 
 
 def test_expired_and_abandoned_requests_are_never_sent() -> None:
-    queue, results = GuestQueue(), list[Result]()
+    queue, results = BridgeQueue(), list[Result]()
     queue.put(guest("a", results, queued_ns=0))
     queue.put(guest("a", results, wanted=lambda: False))
     assert queue.take(MAX_WAIT_NS + 1) is None
@@ -122,7 +122,7 @@ def test_if_the_wire_does_not_return_all_clients_get_an_answer() -> None:
 def test_the_queue_never_holds_more_than_its_limit_and_answers_each_once(
     puts: list[tuple[str, bool]], limit: int
 ) -> None:
-    queue = GuestQueue(limit)
+    queue = BridgeQueue(limit)
     answers: list[list[Result]] = []
     taken = 0
     for client, take in puts:

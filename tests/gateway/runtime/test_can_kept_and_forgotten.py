@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from canopen_slave_rig import NODE, RICH, U16, Rig, pdo, var
 
-from fieldtwin.emulators.canopen.behaviour import DeviceModel, Outcome, Situation
+from fieldtwin.emulators.canopen.behaviour import DeviceModel, ModelOutput, Situation
 from fieldtwin.emulators.canopen.dictionary import parse_eds
 from fieldtwin.emulators.canopen.node import CanopenNode, NodeContext
 from fieldtwin.emulators.canopen.serve import serve_node
@@ -119,9 +119,9 @@ class Mirror(DeviceModel):
     def power_on(self, situation: Situation) -> None:
         pass
 
-    def step(self, situation: Situation) -> Outcome:
+    def step(self, situation: Situation) -> ModelOutput:
         self.steps += 1
-        return Outcome({(0x2002, 0): situation.objects.number(0x2006)}, {(0x6000, 0): self.steps})
+        return ModelOutput({(0x2002, 0): situation.objects.number(0x2006)}, {(0x6000, 0): self.steps})
 
 
 def test_a_model_sees_the_current_object_whoever_changed_it() -> None:
@@ -151,8 +151,8 @@ def test_errors_that_come_and_go_are_reported_to_the_model_at_its_next_step() ->
 @pytest.mark.parametrize("number", [1, -1, 40_000, -40_000, 2.5, -3.5, float("inf"), float("-inf"), float("nan"), True])
 def test_a_device_holds_a_number_within_its_type(number: float) -> None:
     class Says(Mirror):
-        def step(self, situation: Situation) -> Outcome:
-            return Outcome({(0x2000, 0): number, (0x2005, 0): number, (0x2007, 0): number, (0x7777, 0): number})
+        def step(self, situation: Situation) -> ModelOutput:
+            return ModelOutput({(0x2000, 0): number, (0x2005, 0): number, (0x2007, 0): number, (0x7777, 0): number})
 
     data = Rig(context=NodeContext(model=Says())).node.data
     asked: dict[int, tuple[int, int]] = {

@@ -132,7 +132,7 @@ def test_inputs_equal_the_tag_table(steps: list[Any]) -> None:
         elif what == "late":
             clock.now_ns += args[0] * 10 * MS
         elif what == "untaken":
-            exchange.untaken["m.out"] = args[0]
+            exchange.undelivered["m.out"] = args[0]
         for _ in range(args[0] if what == "ticks" else 0):
             clock.now_ns += 10 * MS
             exchange.exchange(clock.now_ns)
@@ -145,8 +145,8 @@ def test_inputs_equal_the_tag_table(steps: list[Any]) -> None:
                     held.value, held.quality, held.reason, held.t_ns,
                 ), name  # fmt: skip
             says = taken
-            if "m.out" in exchange.untaken:  # an item that came just now is not yet processed
-                says -= exchange.untaken["m.out"] + len(exchange.new_messages.get("m.out", ()))
+            if "m.out" in exchange.undelivered:  # an item that came just now is not yet processed
+                says -= exchange.undelivered["m.out"] + len(exchange.new_messages.get("m.out", ()))
             assert snapshot.value(taken_name("m.out")) == TagValue(says, Quality.GOOD, t_ns=clock.now_ns)
             sent = int(snapshot.value("m.inbox").value or 0)
             plc.publish([zero, TagValue(sent, Quality.GOOD)], clock.now_ns)

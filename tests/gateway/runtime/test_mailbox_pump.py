@@ -10,7 +10,7 @@ from fieldtwin.gateway.core.clock import NS_PER_MS
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.values import COMMAND
 from fieldtwin.gateway.runtime.mailboxes.mailboxes import Patience
-from fieldtwin.run.processes.topside import Shore
+from fieldtwin.run.processes.topside import TopsideController
 from fieldtwin.twin.prototype.file import load_prototype
 from fieldtwin.twin.prototype.virtual import VirtualPrototype
 from fieldtwin.twin.site.system import load_system
@@ -26,7 +26,7 @@ def test_a_slow_modem_is_not_asked_all_the_time(tmp_path: Path) -> None:
     async def main() -> None:
         system = load_system("observatory")
         async with VirtualPrototype(system, load_prototype(system), loop, tmp_path) as run, Nursery() as nursery:
-            shore = Shore(system, "modem", run.field.far["modem"], run.clock, run.net)
+            shore = TopsideController(system, "modem", run.field.far["modem"], run.clock, run.net)
             nursery.start(shore.run([]), "far end")
             await asyncio.sleep(3.0)
             pump = run.gateway.pumps[0]
@@ -51,7 +51,7 @@ def test_nor_is_the_far_ends(tmp_path: Path) -> None:
     async def main() -> None:
         system = load_system("observatory")
         async with VirtualPrototype(system, load_prototype(system), loop, tmp_path) as run, Nursery() as nursery:
-            shore = Shore(system, "modem", run.field.far["modem"], run.clock, run.net)
+            shore = TopsideController(system, "modem", run.field.far["modem"], run.clock, run.net)
             nursery.start(shore.run([]), "far end")
             await asyncio.sleep(3.0)
             far = shore._driver

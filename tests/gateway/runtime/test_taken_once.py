@@ -20,7 +20,7 @@ from fieldtwin.gateway.devices.config import DeviceConfig
 from fieldtwin.gateway.devices.transmitter import TransmitterDriver
 from fieldtwin.gateway.runtime.audit_log import AuditLog
 from fieldtwin.gateway.runtime.buses.modbus_bus import Job
-from fieldtwin.gateway.runtime.mailboxes.acked_commands import TakenFile
+from fieldtwin.gateway.runtime.mailboxes.acked_commands import AckedCommandStore
 from fieldtwin.gateway.runtime.mailboxes.pump import MailboxPump
 from fieldtwin.gateway.runtime.tags import TagTable
 from fieldtwin.gateway.wallclock import WallClock
@@ -57,7 +57,9 @@ class Life:
 
 
 @asynccontextmanager
-async def life(modems: ModemPair, folder: Path, *, writes: bool, file: TakenFile | None = None) -> AsyncIterator[Life]:
+async def life(
+    modems: ModemPair, folder: Path, *, writes: bool, file: AckedCommandStore | None = None
+) -> AsyncIterator[Life]:
     """`writes` False: it dies before it acknowledges anything."""
     drivers: list[TransmitterDriver] = []
 
@@ -69,7 +71,7 @@ async def life(modems: ModemPair, folder: Path, *, writes: bool, file: TakenFile
     audit = AuditLog(folder / "audit.jsonl", clock)
     try:
         async with running_bus(make, FieldBus({1: ModbusUnit(modems.near)}), LAN) as r:  # type: ignore[arg-type]
-            kept = file or TakenFile(folder / "taken.json")
+            kept = file or AckedCommandStore(folder / "taken.json")
             made = Life(MailboxPump(drivers[0], r.bus, audit, allow_writes=writes, remote=True, taken=kept), r.field)
             await eventually(lambda: r.bus.online(drivers[0]))
             yield made
@@ -119,7 +121,7 @@ def test_a_command_that_was_consumed_is_not_handed_on_again(tmp_path: Path, kept
             assert second.taken == ([] if kept else [b"\0\7"])
             await command(modems, b"\0\7")  # the same bytes again are a new message
             await second.offered()
-        assert TakenFile(tmp_path / "taken.json").of("modem") == b"", "what is acknowledged is forgotten"
+        assert AckedCommandStore(tmp_path / "taken.json").of("modem") == b"", "what is acknowledged is forgotten"
 
     run(main())
 
@@ -150,7 +152,7 @@ def test_commands_taken_from_a_restarted_modem_do_not_count(tmp_path: Path) -> N
             await first.offered()
             first.consume()
             first.tick()
-        assert TakenFile(tmp_path / "taken.json").of("modem")
+        assert AckedCommandStore(tmp_path / "taken.json").of("modem")
         async with life(after, tmp_path, writes=True) as second:
             second.tick()
             second.field.unplug()  # it comes while no gateway polls
@@ -164,14 +166,14 @@ def test_commands_taken_from_a_restarted_modem_do_not_count(tmp_path: Path) -> N
 @pytest.mark.parametrize("text", ["", "[]", '{"modem": 3}', '{"modem": "xy"}', "\x00"])
 def test_a_foreign_file_counts_as_missing(tmp_path: Path, text: str) -> None:
     (tmp_path / "taken.json").write_text(text)
-    file = TakenFile(tmp_path / "taken.json")
+    file = AckedCommandStore(tmp_path / "taken.json")
     assert file.of("modem") == b""
     file.note("modem", b"\1\2")
-    assert TakenFile(tmp_path / "taken.json").of("modem") == b"\1\2"
+    assert AckedCommandStore(tmp_path / "taken.json").of("modem") == b"\1\2"
     assert (tmp_path / "taken.json").stat().st_mode & 0o777 == 0o600
 
 
 def test_a_disk_that_refuses_is_reported(tmp_path: Path) -> None:
-    file = TakenFile(tmp_path / "nowhere" / "taken.json")
+    file = AckedCommandStore(tmp_path / "nowhere" / "taken.json")
     with pytest.raises(Unreachable, match="cannot store the executed commands"):
         file.note("modem", b"\1")

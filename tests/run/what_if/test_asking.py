@@ -17,7 +17,7 @@ from fieldtwin.gateway.store.event import Event, Kind
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.run.shadow.rules import load_planner, questions_of
 from fieldtwin.run.what_if.asked import objection
-from fieldtwin.run.what_if.asking import Asked, Asking, Subject
+from fieldtwin.run.what_if.asking import Asking, QuestionMessage, Subject
 from fieldtwin.run.what_if.last_known import LastKnown
 from fieldtwin.twin.model.mape.execute import Bounds, Execute
 from fieldtwin.twin.model.mape.messages import verdict
@@ -34,10 +34,10 @@ DEEP = (
 STAYS_ACTIVE = Question(6.0, ("relay.state == 'ACTIVE'",), settle_s=3.0)
 
 
-def asked(period_s: int, **other: object) -> Asked:
+def asked(period_s: int, **other: object) -> QuestionMessage:
     form = {"horizon_s": 6.0, "require": ("relay.state == 'ACTIVE'",), "finally_": (), "settle_s": 3.0, **other}
     known = {"values": {"ctd.pressure": 250.0}, "programs": {"relay": {"period": 1, "period_s": 1, "state": 1}}}
-    return Asked(system="observatory", period_s=period_s, **known, **form)  # type: ignore[arg-type]
+    return QuestionMessage(system="observatory", period_s=period_s, **known, **form)  # type: ignore[arg-type]
 
 
 def test_a_command_that_keeps_the_requirements_has_no_objection_and_a_different_one_has() -> None:

@@ -22,7 +22,7 @@ from fieldtwin.run.what_if.known import known_state
 from fieldtwin.run.what_if.last_known import of_period
 from fieldtwin.run.what_if.many import answers
 from fieldtwin.run.what_if.outcome import VariableOutcome
-from fieldtwin.run.what_if.plan import Plan, load_plans
+from fieldtwin.run.what_if.plan import WhatIfPlan, load_plans
 from fieldtwin.run.what_if.plan import command as parsed
 from fieldtwin.run.what_if.state import KnownState, read_state
 from fieldtwin.twin.model.status import encode_status
@@ -35,7 +35,9 @@ DEEP = KnownState({"ctd.pressure": 250.0, "ctd.temperature": 8.0}, {"relay": of_
 
 def test_a_fork_continues_from_the_known_state() -> None:
     """The relay is ACTIVE with its earlier period, and the sensor continues at its position in the cast."""
-    outcome = answer(Fork("observatory", DEEP, 6.0, settle_s=3.0), Plan("go on", require=("relay.state == 'ACTIVE'",)))
+    outcome = answer(
+        Fork("observatory", DEEP, 6.0, settle_s=3.0), WhatIfPlan("go on", require=("relay.state == 'ACTIVE'",))
+    )
     assert outcome.error == ""
     assert outcome.met
     assert [state for _, state in outcome.states["relay"]] == ["ACTIVE"]
@@ -71,7 +73,7 @@ def test_a_mean_is_over_time_and_independent_of_the_number_of_reads() -> None:
 def test_a_program_that_does_not_publish_its_period_gets_the_known_command() -> None:
     """For `adapt.st`, a store knows state and period, but not the period that it was ordered."""
     known = KnownState({}, {"adapt": of_period(10)})
-    outcome = answer(Fork("ocean_west", known, 30.0), Plan("go on", require=("adapt.state == 'ACTIVE'",)))
+    outcome = answer(Fork("ocean_west", known, 30.0), WhatIfPlan("go on", require=("adapt.state == 'ACTIVE'",)))
     assert (outcome.error, outcome.met, outcome.not_taken) == ("", True, [])
     assert outcome.variables["ctd.sample_period_s"].last == 10
 
@@ -82,13 +84,17 @@ def test_a_state_that_a_fork_could_not_begin_with_is_named_unless_a_command_came
 ) -> None:
     # OFF with a period of 10 s: the state follows from the period
     known = KnownState({}, {program: {**of_period(10), "state": 2}})
-    told = [answer(Fork(system, known, 3.0), plan).not_taken for plan in (Plan("go on"), Plan("", (Scripted(0, 5),)))]
+    told = [
+        answer(Fork(system, known, 3.0), plan).not_taken
+        for plan in (WhatIfPlan("go on"), WhatIfPlan("", (Scripted(0, 5),)))
+    ]
     assert told == [[program], []]
 
 
 def test_without_knowledge_it_begins_as_any_prototype() -> None:
     outcome = answer(
-        Fork("observatory", KnownState(), 2.0, settle_s=1.0), Plan("nothing", require=("relay.state == 'ACTIVE'",))
+        Fork("observatory", KnownState(), 2.0, settle_s=1.0),
+        WhatIfPlan("nothing", require=("relay.state == 'ACTIVE'",)),
     )
     assert not outcome.met
     [broken] = outcome.requirements
@@ -100,8 +106,8 @@ def test_commands_and_faults_of_a_plan_and_the_same_again() -> None:
     fork = Fork("observatory", DEEP, 12.0, settle_s=3.0)
     silent = ({"name": "silence", "device": "ctd", "from": "4s"},)
     plans = [
-        Plan("off", (Scripted(0.5, -1),), finally_=("relay.state == 'OFF'",)),
-        Plan("dead", (), silent, require=("quality(ctd.pressure) == 'good'",)),
+        WhatIfPlan("off", (Scripted(0.5, -1),), finally_=("relay.state == 'OFF'",)),
+        WhatIfPlan("dead", (), silent, require=("quality(ctd.pressure) == 'good'",)),
     ]
     off, dead = answers(fork, plans, jobs=1)
     assert off.met
@@ -114,27 +120,27 @@ def test_commands_and_faults_of_a_plan_and_the_same_again() -> None:
 
 def test_messages_are_taken_at_the_remote_end() -> None:
     """Modems whose messages are not taken would become full, and the fork would predict losses that do not occur."""
-    outcome = answer(Fork("observatory", DEEP, 40.0), Plan("go on", finally_=("relay.waiting < 3",)))
+    outcome = answer(Fork("observatory", DEEP, 40.0), WhatIfPlan("go on", finally_=("relay.waiting < 3",)))
     assert outcome.met, outcome.described()
     assert outcome.variables["modem.link_sent"].last > 30
 
 
 def test_a_simulation_continues_from_its_values() -> None:
     known = KnownState({"localiser.x": 5.0, "localiser.heading": 0.0, "console.enable": 1, "console.speed": 1.0})
-    outcome = answer(Fork("lab_vehicle", known, 4.0), Plan("drive", finally_=("localiser.x > 6",)))
+    outcome = answer(Fork("lab_vehicle", known, 4.0), WhatIfPlan("drive", finally_=("localiser.x > 6",)))
     assert outcome.met, outcome.described()
     assert outcome.variables["localiser.x"].lowest >= 5.0
 
 
 def test_impossible_plans() -> None:
     with pytest.raises(UsageError, match="the horizon"):
-        answer(Fork("observatory", DEEP, 0.0), Plan("x"))
+        answer(Fork("observatory", DEEP, 0.0), WhatIfPlan("x"))
     with pytest.raises(UsageError, match="no tag or variable"):
-        answer(Fork("observatory", DEEP, 1.0), Plan("x", require=("ctd.presure > 1",)))
+        answer(Fork("observatory", DEEP, 1.0), WhatIfPlan("x", require=("ctd.presure > 1",)))
     with pytest.raises(UsageError, match="a command"):
         parsed("fast")
     assert parsed("60@10min") == Scripted(600.0, 60)
-    nobody = answer(Fork("lab_vehicle", KnownState(), 1.0), Plan("x", (Scripted(0, 1),)))
+    nobody = answer(Fork("lab_vehicle", KnownState(), 1.0), WhatIfPlan("x", (Scripted(0, 1),)))
     assert "this system cannot be commanded" in nobody.error
     assert not nobody.met
 

@@ -7,12 +7,12 @@ from pathlib import Path
 from tank_plant import DIVIDES_BY_ZERO, write_plant
 
 from fieldtwin.run.what_if.fork import Fork, answer
-from fieldtwin.run.what_if.plan import Plan
+from fieldtwin.run.what_if.plan import WhatIfPlan
 from fieldtwin.run.what_if.state import KnownState
 
 
-def plan(name: str, *require: str) -> Plan:
-    return Plan(name, require=require)
+def plan(name: str, *require: str) -> WhatIfPlan:
+    return WhatIfPlan(name, require=require)
 
 
 def test_a_plan_in_which_the_plc_stops_or_nothing_is_known_is_not_met(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from fieldtwin.cli.main import cli
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.scenarios.language.form import load_scenario
 from fieldtwin.twin.network.network import load_network
-from fieldtwin.twin.network.water_faults import WaterFaults
+from fieldtwin.twin.network.water_faults import AcousticFaults
 from fieldtwin.twin.site.data_files import network_file
 from fieldtwin.twin.site.system import load_system
 
@@ -137,7 +137,7 @@ def test_a_scenario_of_a_network_has_no_probes(tmp_path: Path) -> None:
 
 
 def test_faults_of_the_acoustic_channel_start_and_end() -> None:
-    faults = WaterFaults(load_network(SHIPPED), 1)
+    faults = AcousticFaults(load_network(SHIPPED), 1)
     assert faults.inject({"id": "deaf", "name": "drop", "bus": "water", "device": "east"}) == "deaf"
     assert [faults.spoils(5, listener, b"x") for listener in (1, 2, 3, 4)] == [False, False, True, False]
     assert faults.describe() == [{"id": "deaf", "name": "drop", "bus": "water", "device": "east", "struck": 1}]

@@ -16,7 +16,7 @@ from template_rig import own_system, packed, with_python
 from fieldtwin.cli.main import cli
 from fieldtwin.gateway.core.errors import NotAllowed
 from fieldtwin.run.targets.template_scenarios import agree_to_scenario
-from fieldtwin.run.template import Stranger, agree, system_file
+from fieldtwin.run.template import ForeignParts, agree, system_file
 from fieldtwin.testing.worker.host import Host
 from fieldtwin.twin.site.system import load_system
 from fieldtwin.twin.template.package import open_package, unpack
@@ -122,9 +122,9 @@ def test_a_scenario_of_a_template_is_asked_about_wherever_it_lies(site: Site, wh
 def test_a_probe_of_an_untrusted_scenario_is_named(site: Site) -> None:
     probe = "probes:\n  crane: {endpoint: 'tcp://192.0.2.7:502', unit: 1, registers: {height: {at: 30001}}}\n"
     site.inside.write_text(SCENARIO.replace("SYSTEM", "observatory") + probe)
-    told: list[Stranger] = []
+    told: list[ForeignParts] = []
 
-    def asked(template: Stranger) -> bool:
+    def asked(template: ForeignParts) -> bool:
         told.append(template)
         return True
 
@@ -167,9 +167,9 @@ def test_a_network_with_an_untrusted_system_is_asked_about(site: Site) -> None:
 
 
 def test_nested_searched_and_prototype_only_files_are_untrusted_too(site: Site, tmp_path: Path) -> None:
-    told: list[Stranger] = []
+    told: list[ForeignParts] = []
 
-    def asked(template: Stranger) -> bool:
+    def asked(template: ForeignParts) -> bool:
         told.append(template)
         return False
 
@@ -191,9 +191,9 @@ def test_code_from_elsewhere_that_an_unpacked_template_names_is_asked_about(site
     """No packed file does so; a file changed since then may."""
     for name in CODE:
         (site.folder / name).unlink()
-    told: list[Stranger] = []
+    told: list[ForeignParts] = []
 
-    def asked(template: Stranger) -> bool:
+    def asked(template: ForeignParts) -> bool:
         told.append(template)
         return False
 

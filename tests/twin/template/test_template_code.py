@@ -10,7 +10,7 @@ import pytest
 from template_rig import SHIPPED, fieldtwin, no, own_system, packed, reworked, with_python, yes
 
 from fieldtwin.gateway.core.errors import NotAllowed
-from fieldtwin.run.template import Stranger, system_file
+from fieldtwin.run.template import ForeignParts, system_file
 from fieldtwin.twin.prototype.file import load_prototype
 from fieldtwin.twin.site.system import load_system
 from fieldtwin.twin.template.check import examine
@@ -113,9 +113,9 @@ def test_a_prototype_that_does_not_keep_to_itself_is_asked_about(
     prototype = dam.with_name("dam.prototype.yaml")
     prototype.write_text(prototype.read_text().replace(old, new))
     packed(dam, tmp_path / "T")
-    told: list[Stranger] = []
+    told: list[ForeignParts] = []
 
-    def asked(template: Stranger) -> bool:
+    def asked(template: ForeignParts) -> bool:
         told.append(template)
         return False
 

@@ -142,19 +142,19 @@ def test_a_system_with_one_transmitter_lends_that() -> None:
 
 
 def test_the_gateway_leaves_a_lent_mailbox_alone() -> None:
-    config = gateway_config(OBSERVATORY, allow_writes=True, lent=("modem",))
-    assert config.lent == {"modem"}
+    config = gateway_config(OBSERVATORY, allow_writes=True, delegated=("modem",))
+    assert config.delegated == {"modem"}
     assert config.devices["modem"].poll == {"status": 2000}
     assert gateway_config(OBSERVATORY, allow_writes=True).devices["modem"].poll == {"inbox": 200, "status": 2000}
 
 
 def test_a_plant_assigns_its_modem_only_if_it_is_writable_and_unused() -> None:
-    def lent(*, prototype: bool, **more: object) -> str:
-        return RunSession(RunOptions(str(PROFILES / "observatory.yaml"), prototype, thread="modem:", **more)).lent  # type: ignore[arg-type]
+    def delegated(*, prototype: bool, **more: object) -> str:
+        return RunSession(RunOptions(str(PROFILES / "observatory.yaml"), prototype, thread="modem:", **more)).delegated  # type: ignore[arg-type]
 
     with pytest.raises(UsageError, match="writes into its mailbox; expected --allow-writes"):
-        lent(prototype=False)
-    assert lent(prototype=False, allow_writes=True) == "modem"
+        delegated(prototype=False)
+    assert delegated(prototype=False, allow_writes=True) == "modem"
     with pytest.raises(UsageError, match="belongs to the digital twin; expected --commands none"):
-        lent(prototype=True, commands=(1, 2))
-    assert lent(prototype=True) == "modem"
+        delegated(prototype=True, commands=(1, 2))
+    assert delegated(prototype=True) == "modem"

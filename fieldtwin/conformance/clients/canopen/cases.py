@@ -24,20 +24,28 @@ from fieldtwin.conformance.clients.canopen.checks import (
     takes_the_switch,
     waits_for_each,
 )
-from fieldtwin.conformance.clients.canopen.setup import CanopenCase, CanPlay
-from fieldtwin.conformance.core.case import OWN, Basis, Case, Danger, Judge
+from fieldtwin.conformance.clients.canopen.setup import CanopenCase, SdoReplyFunction
+from fieldtwin.conformance.core.case import OWN, Basis, Case, CheckFunction, Impact
 
 REQUIRED, ROBUST, FIELD = Basis.STANDARD, Basis.ROBUSTNESS, Basis.FIELD
-READ, CUT, LOOK = Danger.READ, Danger.DISRUPT, Danger.OBSERVE
+READ, CUT, LOOK = Impact.READ, Impact.DISRUPT, Impact.OBSERVE
 
 
 def _case(
-    id: str, title: str, basis: Basis, clause: str, danger: Danger, play: CanPlay, judge: Judge, does: str, must: str
+    id: str,
+    title: str,
+    basis: Basis,
+    clause: str,
+    danger: Impact,
+    play: SdoReplyFunction,
+    judge: CheckFunction,
+    does: str,
+    must: str,
 ) -> CanopenCase:
     return CanopenCase(Case(id, title, clause, danger, does, must, judge, basis=basis), play)
 
 
-def _watch(id: str, title: str, basis: Basis, clause: str, judge: Judge, must: str) -> CanopenCase:
+def _watch(id: str, title: str, basis: Basis, clause: str, judge: CheckFunction, must: str) -> CanopenCase:
     case = _case(id, title, basis, clause, LOOK, plays.nothing, judge, "answers well during the whole run", must)
     return case.on(wants="nothing")
 
@@ -58,7 +66,7 @@ CASES: tuple[CanopenCase, ...] = (
           0x05040000), "answers with E0h", "abort with 05040001, or with 05040000 once it has waited").on(strikes=1),
     _case("CO-005", "a reply for another object", REQUIRED, "7.2.4; canopen-stack #132", READ, plays.other_object, judges.rejects,
           "answers for another index", "never take it for the one that was asked for"),
-    _case("CO-006", "write refused", REQUIRED, "7.2.4", Danger.WRITE, plays.refuses_write, judges.survives,
+    _case("CO-006", "write refused", REQUIRED, "7.2.4", Impact.WRITE, plays.refuses_write, judges.survives,
           "aborts a download at once with 06010002", "end the transfer; go on").on(wants="download"),
     _case("CO-008", "missing index", REQUIRED, "7.2.4", READ, plays.no_object, judges.survives, "aborts with 06020000", "go on"),
     _case("CO-013", "segmented total differs from the indicated size", REQUIRED, "7.2.4", READ, plays.other_length,

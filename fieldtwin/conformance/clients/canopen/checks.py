@@ -5,8 +5,8 @@ from __future__ import annotations
 from itertools import pairwise
 
 from fieldtwin.conformance.clients.checks import accepts, owes, publishes_nothing_bad
-from fieldtwin.conformance.core.case import Finding, Judge, failed, inconclusive, passed, skipped
-from fieldtwin.conformance.core.observation import Asked, Observation, Sent, Shown, Told, Word
+from fieldtwin.conformance.core.case import CheckFunction, Finding, failed, inconclusive, passed, skipped
+from fieldtwin.conformance.core.observation import Observation, ReplySent, RequestSeen, Sent, ValuePublished, Word
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.results.model import Verdict
 
@@ -15,7 +15,7 @@ BLOCK_UPLOAD = 5
 """Client command specifier of a block upload."""
 
 
-def aborts_with(code: int, *others: int) -> Judge:
+def aborts_with(code: int, *others: int) -> CheckFunction:
     """Check that the master ends the transfer by the abort code `code` or one of `others`, which informs the node."""
 
     def aborted(seen: Observation) -> Finding | None:
@@ -37,7 +37,7 @@ BLOCK_ENDED = 0xA1
 
 
 def _block_ended(seen: Observation) -> Finding | None:
-    for told in seen.of(Told, seen.begun_ns):
+    for told in seen.of(ReplySent, seen.begun_ns):
         if told.data[:1] == bytes((BLOCK_ENDED,)):
             return None
     return failed("the block download was never completed")
@@ -48,7 +48,7 @@ completes = owes(_block_ended)
 
 def _noticed(seen: Observation) -> Finding | None:
     """Check that a missing heartbeat has an effect on the published value or causes a command."""
-    if any(shown.word is Word.NONE for shown in seen.of(Shown, seen.begun_ns, seen.over_ns)):
+    if any(shown.word is Word.NONE for shown in seen.of(ValuePublished, seen.begun_ns, seen.over_ns)):
         return passed("it published no value meanwhile")
     if any(_id(sent) == NMT for sent in seen.of(Sent, seen.begun_ns)):
         return passed("it commanded the node")
@@ -61,7 +61,7 @@ notices = owes(_noticed)
 def _unmoved(seen: Observation) -> Finding | None:
     """Check that a heartbeat that is slightly late has no effect: no command is sent and no value disappears."""
     moved = any(_id(sent) == NMT for sent in seen.of(Sent, seen.begun_ns))
-    if moved or any(shown.word is Word.NONE for shown in seen.of(Shown, seen.begun_ns)):
+    if moved or any(shown.word is Word.NONE for shown in seen.of(ValuePublished, seen.begun_ns)):
         return inconclusive("it treated the node as lost: correct only if its consumer time is shorter")
     return None
 
@@ -71,9 +71,9 @@ is_unmoved = owes(_unmoved)
 
 def _waits_for_each(seen: Observation) -> Finding | None:
     """Check that no request was repeated before its answer came. Every answer came within the timeout of its own request."""
-    asked = list(seen.of(Asked, seen.begun_ns, seen.over_ns))
+    asked = list(seen.of(RequestSeen, seen.begun_ns, seen.over_ns))
     for one, following in pairwise(asked):
-        told = next(seen.of(Told, one.t_ns, seen.over_ns), None)
+        told = next(seen.of(ReplySent, one.t_ns, seen.over_ns), None)
         if told is None or told.good or following.t_ns >= told.t_ns:
             continue
         after_s, due_s = (following.t_ns - one.t_ns) / NS_PER_S, (told.t_ns - one.t_ns) / NS_PER_S
@@ -96,7 +96,7 @@ def takes_the_switch(seen: Observation) -> Finding:
     wrong value would be a failure.
     """
     found = accepts(seen)
-    first = next(seen.of(Asked, seen.begun_ns), None)
+    first = next(seen.of(RequestSeen, seen.begun_ns), None)
     forbidden = first is not None and first.target[1] >> 5 == BLOCK_UPLOAD and first.target[6:7] == b"\0"
     if not forbidden or found.verdict is not Verdict.FAILED:
         return found
@@ -107,7 +107,7 @@ def _one_a_block(seen: Observation) -> Finding | None:
     """Check that a sub-block is acknowledged once, and a segment never."""
     acknowledged = [s for s in seen.of(Sent, seen.begun_ns, seen.over_ns) if s.data[2] & 0xE3 == BLOCK_ACKNOWLEDGED]
     segments = sum(
-        1 for t in seen.of(Told, seen.begun_ns, seen.over_ns) if t.data[0] & 0x7F and t.data[0] not in _OTHERS
+        1 for t in seen.of(ReplySent, seen.begun_ns, seen.over_ns) if t.data[0] & 0x7F and t.data[0] not in _OTHERS
     )
     if not acknowledged:
         return inconclusive("no acknowledgement of a sub-block was seen")
@@ -126,7 +126,7 @@ def _restarted(seen: Observation) -> Finding | None:
     for sent in seen.of(Sent, seen.over_ns):
         if _id(sent) == NMT:
             return passed("it commanded the node again")
-    for asked in seen.of(Asked, seen.over_ns):
+    for asked in seen.of(RequestSeen, seen.over_ns):
         if asked.target[1] >> 5 == 1:
             return passed("it wrote to the node again")
     return inconclusive("it neither commanded nor wrote to the node: correct only for a master that configures no node")

@@ -9,9 +9,9 @@ import asyncio
 from collections.abc import Collection
 
 from fieldtwin.conformance.clients.canopen.device import BOOT_UP, STOPPED, HonestNode
-from fieldtwin.conformance.clients.canopen.setup import CanopenCase, CanScene, SayFrame
+from fieldtwin.conformance.clients.canopen.setup import CanopenCase, SayFrame, SdoRequestContext
 from fieldtwin.conformance.clients.recorder import Recorder
-from fieldtwin.conformance.core.observation import Asked, Garbled, Sent, Told, Word
+from fieldtwin.conformance.core.observation import Garbled, ReplySent, RequestSeen, Sent, Word
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
@@ -27,7 +27,7 @@ BEHIND_S = 0.050
 MASTER = 1
 
 
-class CanopenStage:
+class HostileNode:
     """The CANopen counterpart of `modbus_stage.Stage`.
 
     `size` is the number of bytes of an object, `heartbeat_s` the heartbeat period of known nodes (0: none), `nodes` are
@@ -117,7 +117,7 @@ class CanopenStage:
         opens = not receiving and _opens(request)
         if opens:
             self.recorder.add(
-                Asked(now_ns, MASTER, bytes((node,)) + request, frame=str(CanFrame(SDO_REQUEST + node, request)))
+                RequestSeen(now_ns, MASTER, bytes((node,)) + request, frame=str(CanFrame(SDO_REQUEST + node, request)))
             )
             self._memory = self._begun(node, request, now_ns)
             server.objects.word = self._word_for(self._memory is not None)
@@ -132,7 +132,7 @@ class CanopenStage:
             self._send([SayFrame(CanFrame(0x580 + node, d), good=True) for d in true], now_ns)
             return
         poison = self._words[2]
-        scene = CanScene(
+        scene = SdoRequestContext(
             node, request, true, server.poisoned(request, poison), poison.to_bytes(self._size, "little"), opens,
             self.struck - 1, self.timeout_s, self._memory,
         )  # fmt: skip
@@ -225,7 +225,7 @@ class CanopenStage:
                 now_ns = self.now_ns()
                 if not move.good:
                     self.last_ns = now_ns
-                self.recorder.add(Told(now_ns, MASTER, move.frame.data, move.good, frame=str(move.frame)))
+                self.recorder.add(ReplySent(now_ns, MASTER, move.frame.data, move.good, frame=str(move.frame)))
                 await self._connection.send(move.frame)
                 left -= 1
                 self.pending -= 1

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
-from fieldtwin.conformance.clients.canopen.setup import CanPlay, CanScene, SayFrame
+from fieldtwin.conformance.clients.canopen.setup import SayFrame, SdoReplyFunction, SdoRequestContext
 from fieldtwin.gateway.core.canframe import CanFrame
 
 HEARTBEAT, EMCY, TPDO1 = 0x700, 0x080, 0x180
@@ -16,11 +16,11 @@ SLOW = 0.35
 """Share of a timeout that each step of a slow transfer takes: no step is too long, but all of them together are."""
 
 
-def nothing(scene: CanScene) -> list[SayFrame]:
+def nothing(scene: SdoRequestContext) -> list[SayFrame]:
     return []
 
 
-def _segmented(scene: CanScene, segment: Callable[[int], bytes]) -> list[SayFrame]:
+def _segmented(scene: SdoRequestContext, segment: Callable[[int], bytes]) -> list[SayFrame]:
     """Reply with a segmented upload of 14 bytes; `segment` gives the reply to the n-th request after the first, from 1."""
     if scene.opens:
         scene.memory["segments"] = 0
@@ -31,31 +31,31 @@ def _segmented(scene: CanScene, segment: Callable[[int], bytes]) -> list[SayFram
     return [scene.reply(segment(scene.memory["segments"]))]
 
 
-def same_toggle(scene: CanScene) -> list[SayFrame]:
+def same_toggle(scene: SdoRequestContext) -> list[SayFrame]:
     """Repeat the toggle bit of the first segment in the second segment of an upload."""
     return _segmented(scene, lambda n: bytes((0x01 if n > 1 else 0x00,)) + scene.poison.ljust(7, b"\0"))
 
 
-def other_length(scene: CanScene) -> list[SayFrame]:
+def other_length(scene: SdoRequestContext) -> list[SayFrame]:
     """End a segmented upload before the indicated length."""
     return _segmented(scene, lambda n: bytes((0x01 | (7 - len(scene.poison)) << 1,)) + scene.poison.ljust(7, b"\0"))
 
 
-def unknown_command(scene: CanScene) -> list[SayFrame]:
+def unknown_command(scene: SdoRequestContext) -> list[SayFrame]:
     return [scene.reply(b"\xe0" + scene.false[1:])] if scene.opens else scene.honest()
 
 
-def other_object(scene: CanScene) -> list[SayFrame]:
+def other_object(scene: SdoRequestContext) -> list[SayFrame]:
     if not scene.opens:
         return scene.honest()
     return [scene.reply(scene.false[:1] + bytes((scene.false[1] ^ 0x01,)) + scene.false[2:])]
 
 
-def no_object(scene: CanScene) -> list[SayFrame]:
+def no_object(scene: SdoRequestContext) -> list[SayFrame]:
     return [scene.reply(b"\x80" + scene.request[1:4] + (0x06020000).to_bytes(4, "little"))]
 
 
-def wrong_crc(scene: CanScene) -> list[SayFrame]:
+def wrong_crc(scene: SdoRequestContext) -> list[SayFrame]:
     """Block upload: send a wrong check sum in the end frame."""
     if len(scene.true) == 1 and scene.true[0][0] & 0xE3 == 0xC1:
         end = scene.true[0]
@@ -63,10 +63,10 @@ def wrong_crc(scene: CanScene) -> list[SayFrame]:
     return [scene.reply(data) for data in scene.true]
 
 
-def loses(at: int) -> CanPlay:
+def loses(at: int) -> SdoReplyFunction:
     """Block upload: a segment of each first try of a sub-block is lost; `at` as of a list."""
 
-    def play(scene: CanScene) -> list[SayFrame]:
+    def play(scene: SdoRequestContext) -> list[SayFrame]:
         frames = [scene.reply(data) for data in scene.true]
         full = len(frames) == 127
         if len(frames) < 3 or (at > 0) != full or scene.memory.get("lost"):
@@ -78,7 +78,7 @@ def loses(at: int) -> CanPlay:
     return play
 
 
-def expedited_instead(scene: CanScene) -> list[SayFrame]:
+def expedited_instead(scene: SdoRequestContext) -> list[SayFrame]:
     """Block upload is answered by an ordinary one, as pst allows."""
     if not scene.opens:
         return scene.honest()
@@ -87,16 +87,16 @@ def expedited_instead(scene: CanScene) -> list[SayFrame]:
     return [scene.reply(bytes((0x43 | (4 - size) << 2,)) + scene.request[1:4] + word)]
 
 
-def late(scene: CanScene) -> list[SayFrame]:
+def late(scene: SdoRequestContext) -> list[SayFrame]:
     return [scene.reply(scene.false, LATE * scene.timeout_s)]
 
 
-def flood(scene: CanScene) -> list[SayFrame]:
+def flood(scene: SdoRequestContext) -> list[SayFrame]:
     junk = [scene.reply(bytes((0xE0 + i % 32,)) + bytes(7)) for i in range(30)]
     return [*junk, *scene.honest(0.010)] if scene.opens else scene.honest()
 
 
-def short(scene: CanScene) -> list[SayFrame]:
+def short(scene: SdoRequestContext) -> list[SayFrame]:
     """Send only the bytes of the reply that carry data."""
     if not scene.opens:
         return scene.honest()
@@ -104,51 +104,51 @@ def short(scene: CanScene) -> list[SayFrame]:
     return [scene.reply(scene.true[0][: min(used, 7)])]
 
 
-def restarts(scene: CanScene) -> list[SayFrame]:
+def restarts(scene: SdoRequestContext) -> list[SayFrame]:
     return [replace(scene.frame(HEARTBEAT, b"\0"), after_s=0.050)]
 
 
-def boots(scene: CanScene) -> list[SayFrame]:
+def boots(scene: SdoRequestContext) -> list[SayFrame]:
     return [*scene.honest(), replace(scene.frame(HEARTBEAT, b"\0"), after_s=0.010)]
 
 
-def no_size(scene: CanScene) -> list[SayFrame]:
+def no_size(scene: SdoRequestContext) -> list[SayFrame]:
     return [scene.reply(b"\x42" + scene.true[0][1:])] if scene.opens else scene.honest()
 
 
-def heartbeat(data: bytes) -> CanPlay:
+def heartbeat(data: bytes) -> SdoReplyFunction:
     return lambda scene: [scene.frame(HEARTBEAT, data), *scene.honest()]
 
 
-def twin(scene: CanScene) -> list[SayFrame]:
+def twin(scene: SdoRequestContext) -> list[SayFrame]:
     return [*scene.honest(), scene.reply(scene.false, 0.003)] if scene.opens else scene.honest()
 
 
-def emcy_short(scene: CanScene) -> list[SayFrame]:
+def emcy_short(scene: SdoRequestContext) -> list[SayFrame]:
     return [scene.frame(EMCY, b"\x10\x81\x11"), *scene.honest()]
 
 
-def emcy_burst(scene: CanScene) -> list[SayFrame]:
+def emcy_burst(scene: SdoRequestContext) -> list[SayFrame]:
     return [*(scene.frame(EMCY, bytes((i, 0x10, 0x01, 0, 0, 0, 0, 0))) for i in range(20)), *scene.honest()]
 
 
-def boot_storm(scene: CanScene) -> list[SayFrame]:
+def boot_storm(scene: SdoRequestContext) -> list[SayFrame]:
     return [*(SayFrame(CanFrame(HEARTBEAT + n, b"\0")) for n in STORM), *scene.honest()]
 
 
-def extended(scene: CanScene) -> list[SayFrame]:
+def extended(scene: SdoRequestContext) -> list[SayFrame]:
     return [SayFrame(CanFrame(0x580 + scene.node, scene.false, extended=True))]
 
 
-def honest(scene: CanScene) -> list[SayFrame]:
+def honest(scene: SdoRequestContext) -> list[SayFrame]:
     """Reply correctly. The fault is elsewhere: in frames that the node ignores or does not send."""
     return [scene.reply(data) for data in scene.true]
 
 
-def block_size(size: int) -> CanPlay:
+def block_size(size: int) -> SdoReplyFunction:
     """Block download: announce `size` segments per sub-block; 1 to 127 are allowed."""
 
-    def play(scene: CanScene) -> list[SayFrame]:
+    def play(scene: SdoRequestContext) -> list[SayFrame]:
         if not scene.opens:
             return honest(scene)
         data = scene.true[0]
@@ -157,7 +157,7 @@ def block_size(size: int) -> CanPlay:
     return play
 
 
-def refuses_crc(scene: CanScene) -> list[SayFrame]:
+def refuses_crc(scene: SdoRequestContext) -> list[SayFrame]:
     """Block download: report a wrong check sum at the end."""
     if scene.true[0][0] != 0xA1:
         return honest(scene)
@@ -165,12 +165,12 @@ def refuses_crc(scene: CanScene) -> list[SayFrame]:
     return [scene.reply(b"\x80" + mux + (0x05040004).to_bytes(4, "little"))]
 
 
-def unanswered(scene: CanScene) -> list[SayFrame]:
+def unanswered(scene: SdoRequestContext) -> list[SayFrame]:
     """Lose the reply, or the request, on the bus."""
     return []
 
 
-def aborts_amid(scene: CanScene) -> list[SayFrame]:
+def aborts_amid(scene: SdoRequestContext) -> list[SayFrame]:
     """Abort a segmented upload after the first segment."""
 
     def segment(n: int) -> bytes:
@@ -181,14 +181,14 @@ def aborts_amid(scene: CanScene) -> list[SayFrame]:
     return _segmented(scene, segment)
 
 
-def refuses_write(scene: CanScene) -> list[SayFrame]:
+def refuses_write(scene: SdoRequestContext) -> list[SayFrame]:
     """Refuse at once a download to an object that can only be read."""
     if not scene.opens:
         return honest(scene)
     return [scene.reply(b"\x80" + scene.request[1:4] + (0x06010002).to_bytes(4, "little"))]
 
 
-def slow_segments(scene: CanScene) -> list[SayFrame]:
+def slow_segments(scene: SdoRequestContext) -> list[SayFrame]:
     """Send a segmented upload with one byte per segment, and delay each step."""
     word = scene.memory["word"].to_bytes(len(scene.poison), "little")
     after_s = SLOW * scene.timeout_s
@@ -203,12 +203,12 @@ def slow_segments(scene: CanScene) -> list[SayFrame]:
     return [scene.reply(bytes((command, word[at])) + bytes(6), after_s)]
 
 
-def unhurried(scene: CanScene) -> list[SayFrame]:
+def unhurried(scene: SdoRequestContext) -> list[SayFrame]:
     """Delay each reply by more than half of a timeout: two consecutive ones take longer than one."""
     return [scene.reply(data, 0.6 * scene.timeout_s) for data in scene.true]
 
 
-def empty(scene: CanScene) -> list[SayFrame]:
+def empty(scene: SdoRequestContext) -> list[SayFrame]:
     """Reply with an upload of zero bytes."""
     if scene.opens:
         scene.memory["segments"] = 0
@@ -216,17 +216,17 @@ def empty(scene: CanScene) -> list[SayFrame]:
     return [scene.reply(bytes((7 << 1 | 1,)) + bytes(7))]
 
 
-def short_pdo(scene: CanScene) -> list[SayFrame]:
+def short_pdo(scene: SdoRequestContext) -> list[SayFrame]:
     return [scene.frame(TPDO1, scene.poison[:1]), *scene.honest()]
 
 
-def pdo_outside(scene: CanScene) -> list[SayFrame]:
+def pdo_outside(scene: SdoRequestContext) -> list[SayFrame]:
     """Report PRE-OPERATIONAL, and send process data nevertheless."""
     pdo = (scene.poison * 8)[:8]
     return [scene.frame(HEARTBEAT, bytes((PRE_OPERATIONAL,))), scene.frame(TPDO1, pdo), *scene.honest()]
 
 
-def emcy_partly_over(scene: CanScene) -> list[SayFrame]:
+def emcy_partly_over(scene: SdoRequestContext) -> list[SayFrame]:
     """Send two errors, and report one of them as cleared: the error register still shows an error."""
     told = (b"\x10\x81\x11", b"\x00\x50\x19", b"\x00\x00\x11")
     return [*(scene.frame(EMCY, data.ljust(8, b"\0")) for data in told), *scene.honest()]

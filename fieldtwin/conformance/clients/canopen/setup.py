@@ -22,7 +22,7 @@ class SayFrame:
 
 
 @dataclass(frozen=True, slots=True)
-class CanScene:
+class SdoRequestContext:
     """One SDO request that receives a wrong reply: eight bytes to `node`.
 
     `true` are the correct replies, `false` is an expedited one with the poisoned word. `nth` counts the transfers of
@@ -53,7 +53,7 @@ class CanScene:
         return SayFrame(CanFrame(base + self.node, data))
 
 
-CanPlay = Callable[[CanScene], list[SayFrame]]
+SdoReplyFunction = Callable[[SdoRequestContext], list[SayFrame]]
 CanWants = Literal["upload", "download", "block upload", "block download", "guard request", "nothing"]
 
 
@@ -68,7 +68,7 @@ class CanopenCase:
     """
 
     about: Case
-    play: CanPlay
+    play: SdoReplyFunction
     wants: CanWants = "upload"
     strikes: int = 2
     holds_good: bool = False

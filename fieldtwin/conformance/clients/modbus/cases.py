@@ -20,41 +20,49 @@ from fieldtwin.conformance.clients.habits import (
 )
 from fieldtwin.conformance.clients.modbus import line_replies as line_plays
 from fieldtwin.conformance.clients.modbus import tcp_replies as tcp_plays
-from fieldtwin.conformance.clients.modbus.setup import ModbusCase, Play
-from fieldtwin.conformance.core.case import OWN, Basis, Case, Danger, Judge
+from fieldtwin.conformance.clients.modbus.setup import ModbusCase, ReplyFunction
+from fieldtwin.conformance.core.case import OWN, Basis, Case, CheckFunction, Impact
 
 REQUIRED, ROBUST, FIELD = Basis.STANDARD, Basis.ROBUSTNESS, Basis.FIELD
-READ, WRITE, CUT, LOOK = Danger.READ, Danger.WRITE, Danger.DISRUPT, Danger.OBSERVE
+READ, WRITE, CUT, LOOK = Impact.READ, Impact.WRITE, Impact.DISRUPT, Impact.OBSERVE
 RTU, ASCII, LINES, TCP, STREAM = ("rtu",), ("ascii",), ("rtu", "ascii"), ("tcp",), ("stream",)
 
 
 def _case(
-    id: str, title: str, basis: Basis, clause: str, danger: Danger, play: Play, judge: Judge, does: str, must: str
+    id: str,
+    title: str,
+    basis: Basis,
+    clause: str,
+    danger: Impact,
+    play: ReplyFunction,
+    judge: CheckFunction,
+    does: str,
+    must: str,
 ) -> ModbusCase:
     return ModbusCase(Case(id, title, clause, danger, does, must, judge, basis=basis), play)
 
 
 def _bad(
-    id: str, title: str, basis: Basis, clause: str, play: Play, does: str, must: str = "refuse it; go on"
+    id: str, title: str, basis: Basis, clause: str, play: ReplyFunction, does: str, must: str = "refuse it; go on"
 ) -> ModbusCase:
     return _case(id, title, basis, clause, READ, play, judges.rejects, does, must)
 
 
 def _good(
-    id: str, title: str, basis: Basis, clause: str, play: Play, does: str, must: str = "take the answer"
+    id: str, title: str, basis: Basis, clause: str, play: ReplyFunction, does: str, must: str = "take the answer"
 ) -> ModbusCase:
     case = _case(id, title, basis, clause, READ, play, judges.accepts, does, must)
     return case.on(holds_good=True, strikes=4)
 
 
 def _waits(
-    id: str, title: str, basis: Basis, clause: str, play: Play, does: str, must: str = "take the answer"
+    id: str, title: str, basis: Basis, clause: str, play: ReplyFunction, does: str, must: str = "take the answer"
 ) -> ModbusCase:
     case = _case(id, title, basis, clause, READ, play, judges.accepts_on_line, does, must)
     return case.on(holds_good=True, strikes=4)
 
 
-def _watch(id: str, title: str, basis: Basis, clause: str, judge: Judge, must: str) -> ModbusCase:
+def _watch(id: str, title: str, basis: Basis, clause: str, judge: CheckFunction, must: str) -> ModbusCase:
     case = _case(id, title, basis, clause, LOOK, line_plays.nothing, judge, "answers well during the whole run", must)
     return case.on(wants="nothing")
 

@@ -18,9 +18,9 @@ from fieldtwin.conformance.clients.modbus.device import (
     ModbusWire,
     RtuWire,
 )
-from fieldtwin.conformance.clients.modbus.setup import Deaf, Hang, ModbusCase, Move, Say, Scene, Unplug
+from fieldtwin.conformance.clients.modbus.setup import Deaf, Hang, ModbusCase, Move, RequestContext, Say, Unplug
 from fieldtwin.conformance.clients.recorder import Recorder
-from fieldtwin.conformance.core.observation import Asked, Came, Garbled, Left, Told, Word
+from fieldtwin.conformance.core.observation import Came, Garbled, Left, ReplySent, RequestSeen, Word
 from fieldtwin.emulators.endpoints.socket_end import SocketEnd
 from fieldtwin.emulators.modbus.bank import Table
 from fieldtwin.emulators.virtual.memory_stream import MemoryEnd
@@ -35,7 +35,7 @@ LINE_GAP_S = 0.060
 """Pause that ends a frame on a line; an incomplete frame is garbage then."""
 
 
-class Stage:
+class HostileServer:
     """A server for every client of the endpoint. `play` is the current case; None: all requests are answered correctly.
 
     `struck` counts wrong replies, `first_ns` is the time of the first one, `last_ns` that of the last fault; `pending`
@@ -56,7 +56,7 @@ class Stage:
         self.unplug: Callable[[Unplug], None] = lambda move: None
         """Takes the port away and gives it back; `pending` counts it until then."""
         self._make_wire = make_wire
-        self._first: Scene | None = None
+        self._first: RequestContext | None = None
         self._loop = asyncio.get_running_loop()
 
     def now_ns(self) -> int:
@@ -91,7 +91,7 @@ class Stage:
         finally:
             self.note(Left(self.now_ns(), number, client.hung_up))
 
-    def note(self, event: Asked | Told | Garbled | Came | Left) -> None:
+    def note(self, event: RequestSeen | ReplySent | Garbled | Came | Left) -> None:
         self.recorder.add(event)
         self.on_event()
 
@@ -105,7 +105,7 @@ class Stage:
         if case is None or self.struck >= self.strikes or not true or not _wanted(case, request):
             return honest
         false = self.device.answer_with(self.poison, request[1:], now_ns) if request[1] in READS else true
-        scene = Scene(wire, request, tag, true, false, self.struck, self.timeout_s, self._first)
+        scene = RequestContext(wire, request, tag, true, false, self.struck, self.timeout_s, self._first)
         made = case.play(scene)
         self._first = self._first or scene
         self.struck += 1
@@ -128,7 +128,7 @@ def _wanted(case: ModbusCase, request: bytes) -> bool:
 class _Client:
     nursery: Nursery
 
-    def __init__(self, stage: Stage, connection: ByteConnection, wire: ModbusWire, number: int) -> None:
+    def __init__(self, stage: HostileServer, connection: ByteConnection, wire: ModbusWire, number: int) -> None:
         self.hung_up = False
         self._deaf = False
         self._stage = stage
@@ -144,7 +144,7 @@ class _Client:
             now_ns = self._stage.now_ns()
             for request, tag in self._wire.cut(data, now_ns):
                 frame = self._wire.frame(request, tag, request[1:])
-                self._stage.note(Asked(now_ns, self._number, request, tag, frame.hex(" ")))
+                self._stage.note(RequestSeen(now_ns, self._number, request, tag, frame.hex(" ")))
                 if self._deaf:
                     continue
                 self._answer(self._stage.moves(self._wire, request, tag, now_ns), now_ns)
@@ -209,7 +209,7 @@ class _Client:
             return
         if not move.good:
             self._stage.last_ns = now_ns
-        self._stage.note(Told(now_ns, self._number, move.data, move.good, asked_ns))
+        self._stage.note(ReplySent(now_ns, self._number, move.data, move.good, asked_ns))
         await self._connection.write(move.data)
 
 

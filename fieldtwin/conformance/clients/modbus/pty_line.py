@@ -7,7 +7,7 @@ import os
 from contextlib import suppress
 from pathlib import Path
 
-from fieldtwin.conformance.clients.modbus.hostile_server import Stage
+from fieldtwin.conformance.clients.modbus.hostile_server import HostileServer
 from fieldtwin.conformance.clients.modbus.setup import Unplug
 from fieldtwin.emulators.endpoints.ports import OsPorts
 from fieldtwin.gateway.core.connection import ByteConnection
@@ -22,7 +22,7 @@ with suppress(ImportError):  # Windows has no pseudo-terminals
 class PtyLine:
     """``line = await PtyLine.open(listen, stage)``, ``await line.run()`` until cancelled, ``await line.aclose()``."""
 
-    def __init__(self, listen: Endpoint, stage: Stage, port: ByteConnection, named: Endpoint) -> None:
+    def __init__(self, listen: Endpoint, stage: HostileServer, port: ByteConnection, named: Endpoint) -> None:
         self.named = named
         self._listen = listen
         self._stage = stage
@@ -31,7 +31,7 @@ class PtyLine:
         stage.unplug = self._unplug
 
     @classmethod
-    async def open(cls, listen: Endpoint, stage: Stage) -> PtyLine:
+    async def open(cls, listen: Endpoint, stage: HostileServer) -> PtyLine:
         """Raises as `PtyEnd.open`."""
         return cls(listen, stage, *await _open(listen))
 

@@ -47,7 +47,7 @@ Move = Say | Hang | Deaf | Unplug
 
 
 @dataclass(frozen=True, slots=True)
-class Scene:
+class RequestContext:
     """One request that is to be misanswered.
 
     `request` is unit id and PDU, `tag` its transaction id. `true` is the honest response PDU, `false` one of the same shape with
@@ -62,7 +62,7 @@ class Scene:
     false: bytes
     nth: int = 0
     timeout_s: float = 1.0
-    first: Scene | None = None
+    first: RequestContext | None = None
 
     @property
     def unit(self) -> int:
@@ -94,7 +94,7 @@ class Scene:
         return self.frame(bytes(((function or self.function) | 0x80, code)))
 
 
-Play = Callable[[Scene], list[Move]]
+ReplyFunction = Callable[[RequestContext], list[Move]]
 Wants = Literal["register read", "read", "write", "read of several", "request to unit 0", "nothing"]
 
 
@@ -110,7 +110,7 @@ class ModbusCase:
     """
 
     about: Case
-    play: Play
+    play: ReplyFunction
     wants: Wants = "register read"
     strikes: int = 2
     holds_good: bool = False

@@ -3,57 +3,57 @@
 from __future__ import annotations
 
 from fieldtwin.conformance.clients.modbus.device import mbap
-from fieldtwin.conformance.clients.modbus.setup import Deaf, Hang, Move, Play, Say, Scene
+from fieldtwin.conformance.clients.modbus.setup import Deaf, Hang, Move, ReplyFunction, RequestContext, Say
 
 BYTE_S = 0.002
 
 
-def bytewise(scene: Scene) -> list[Move]:
+def bytewise(scene: RequestContext) -> list[Move]:
     frame = scene.frame(scene.true)
     return [Say(frame[i : i + 1], i * BYTE_S) for i in range(len(frame))]
 
 
-def with_stranger(scene: Scene) -> list[Move]:
+def with_stranger(scene: RequestContext) -> list[Move]:
     return [Say(mbap(scene.tag ^ 0x4000, scene.unit, scene.false) + scene.frame(scene.true))]
 
 
-def other_protocol(scene: Scene) -> list[Move]:
+def other_protocol(scene: RequestContext) -> list[Move]:
     return [Say(mbap(scene.tag, scene.unit, scene.false, protocol=1))]
 
 
-def other_protocol_first(scene: Scene) -> list[Move]:
+def other_protocol_first(scene: RequestContext) -> list[Move]:
     return [Say(mbap(scene.tag, scene.unit, scene.false, protocol=1)), Say(scene.frame(scene.true), 0.020)]
 
 
-def length(counted: int) -> Play:
+def length(counted: int) -> ReplyFunction:
     return lambda scene: [Say(mbap(scene.tag, scene.unit, scene.false, length=counted))]
 
 
-def other_tag(change: int) -> Play:
+def other_tag(change: int) -> ReplyFunction:
     return lambda scene: [Say(mbap(scene.tag ^ change, scene.unit, scene.false))]
 
 
-def zero_tag(scene: Scene) -> list[Move]:
+def zero_tag(scene: RequestContext) -> list[Move]:
     return [Say(mbap(0, scene.unit, scene.false))]
 
 
-def other_tag_first(scene: Scene) -> list[Move]:
+def other_tag_first(scene: RequestContext) -> list[Move]:
     return [Say(mbap(scene.tag ^ 0x4000, scene.unit, scene.false)), Say(scene.frame(scene.true), 0.020)]
 
 
-def reset(scene: Scene) -> list[Move]:
+def reset(scene: RequestContext) -> list[Move]:
     frame = scene.frame(scene.false)
     return [Say(frame[: len(frame) // 2]), Hang(0.005, reset=True)]
 
 
-def hang_up(scene: Scene) -> list[Move]:
+def hang_up(scene: RequestContext) -> list[Move]:
     return [Hang()]
 
 
-def half_open(scene: Scene) -> list[Move]:
+def half_open(scene: RequestContext) -> list[Move]:
     return [Deaf()]
 
 
-def closed_while_unused(scene: Scene) -> list[Move]:
+def closed_while_unused(scene: RequestContext) -> list[Move]:
     """Answer, and then close the connection while the master is idle."""
     return [scene.good(), Hang(0.050)]

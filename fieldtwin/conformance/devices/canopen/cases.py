@@ -8,15 +8,15 @@ from __future__ import annotations
 
 from functools import partial
 
-from fieldtwin.conformance.core.case import OWN, Basis, Danger
+from fieldtwin.conformance.core.case import OWN, Basis, Impact
 from fieldtwin.conformance.devices.canopen import nmt_cases as nmt
 from fieldtwin.conformance.devices.canopen import sdo_cases as sdo
 from fieldtwin.conformance.devices.canopen import write_cases as write
-from fieldtwin.conformance.devices.canopen.connection import CanopenWire
-from fieldtwin.conformance.devices.device_case import DeviceCase, Play
+from fieldtwin.conformance.devices.canopen.connection import NodeConnection
+from fieldtwin.conformance.devices.device_case import CaseProcedure, DeviceCase
 
-CanopenCase = DeviceCase[CanopenWire]
-READ, WRITE, DISRUPT = Danger.READ, Danger.WRITE, Danger.DISRUPT
+CanopenCase = DeviceCase[NodeConnection]
+READ, WRITE, DISRUPT = Impact.READ, Impact.WRITE, Impact.DISRUPT
 OBJECT = ("object",)
 
 
@@ -24,10 +24,10 @@ def case(
     id: str,
     title: str,
     clause: str,
-    danger: Danger,
+    danger: Impact,
     does: str,
     must: str,
-    play: Play[CanopenWire],
+    play: CaseProcedure[NodeConnection],
     needs: tuple[str, ...] = (),
     basis: Basis = Basis.STANDARD,
 ) -> CanopenCase:

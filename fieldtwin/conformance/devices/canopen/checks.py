@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from fieldtwin.conformance.core.case import Finding, failed, passed
-from fieldtwin.conformance.devices.canopen.connection import CanopenWire, Key, Reply, mux, shown
+from fieldtwin.conformance.devices.canopen.connection import Key, NodeConnection, Reply, mux, shown
 from fieldtwin.conformance.devices.device_case import NotHere
 from fieldtwin.gateway.protocols.canopen.abort_codes import UNKNOWN_SPECIFIER
 
@@ -15,7 +15,7 @@ def aborted(reply: Reply, *codes: int) -> str:
     return f"{reply} instead of abort {' or '.join(f'{code:08X}' for code in codes)}"
 
 
-async def verdict(wire: CanopenWire, wrong: str, good: str = "") -> Finding:
+async def verdict(wire: NodeConnection, wrong: str, good: str = "") -> Finding:
     """Return FAILED for an error in `wrong`, or if the node does not recover afterwards; else PASSED."""
     if wrong:
         return failed(wrong)
@@ -23,7 +23,7 @@ async def verdict(wire: CanopenWire, wrong: str, good: str = "") -> Finding:
     return failed(f"afterwards: {after}") if after else passed(good)
 
 
-async def must_abort(wire: CanopenWire, request: bytes, *codes: int) -> Finding:
+async def must_abort(wire: NodeConnection, request: bytes, *codes: int) -> Finding:
     """Send an SDO request that has to be aborted with one of `codes`; then the node must continue to answer."""
     reply = await wire.ask(request)
     if reply.data and not reply.abort:
@@ -31,21 +31,21 @@ async def must_abort(wire: CanopenWire, request: bytes, *codes: int) -> Finding:
     return await verdict(wire, aborted(reply, *codes), str(reply) if reply.abort else "")
 
 
-async def long_object(wire: CanopenWire) -> Key:
+async def long_object(wire: NodeConnection) -> Key:
     """Return an object of at least two segments, after its first reply was received. Raises `NotHere`."""
     if wire.long is None:
         raise NotHere("no object of more than 7 bytes was found: 1008h, 1009h, 100Ah, and those of the EDS")
     return wire.long
 
 
-async def begin_upload(wire: CanopenWire, key: Key) -> None:
+async def begin_upload(wire: NodeConnection, key: Key) -> None:
     """Begin an upload in segments. Raises `NotHere` if the node answers otherwise."""
     reply = await wire.ask(b"\x40" + mux(*key))
     if reply.specifier != 2 or reply.data[0] & 2:
         raise NotHere(f"{shown(key)} is not uploaded in segments: {reply}")
 
 
-async def present(wire: CanopenWire, key: Key) -> bytes:
+async def present(wire: NodeConnection, key: Key) -> bytes:
     """Return the object's value. Raises `NotHere` if the object cannot be read."""
     value = await wire.upload(key)
     if isinstance(value, Reply):

@@ -10,7 +10,7 @@ import asyncio
 from collections import deque
 from dataclasses import dataclass
 
-from fieldtwin.conformance.core.case import Danger
+from fieldtwin.conformance.core.case import Impact
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.clock import NS_PER_S, Clock
 from fieldtwin.gateway.core.connection import CanConnection
@@ -63,7 +63,7 @@ class Reply:
         return self.data.hex(" ").upper()
 
 
-class CanopenWire:
+class NodeConnection:
     """One bus and one node on it.
 
     `may_write` are objects that the user gave; `dictionary` is the content of the EDS, if there is one. `state` is the
@@ -84,7 +84,7 @@ class CanopenWire:
     ) -> None:
         self.node, self.timeout_s, self.boot_s = node, timeout_s, boot_s
         self.may_write, self.dictionary = may_write, dictionary
-        self.danger = Danger.READ
+        self.danger = Impact.READ
         self.traits = frozenset({"can"})
         self.device_type = b""
         """The node's answer for 1000h without faults: an object that every node has (7.5.2.1)."""
@@ -108,11 +108,11 @@ class CanopenWire:
         self._sent_ns = self.clock.monotonic_ns()
 
     def _must_be_allowed(self, frame: CanFrame) -> None:
-        if self.danger is Danger.DISRUPT:
+        if self.danger is Impact.DISRUPT:
             return
         specifier = frame.data[0] >> 5 if frame.data else -1
         to_server = frame.can_id == SDO_REQUEST + self.node and not frame.remote
-        if to_server and (specifier in READS or (self.danger is Danger.WRITE and specifier in WRITES)):
+        if to_server and (specifier in READS or (self.danger is Impact.WRITE and specifier in WRITES)):
             return
         raise Bug(f"a check of danger {self.danger.value} would send {frame}")
 

@@ -20,7 +20,7 @@ from fieldtwin.conformance.devices.canopen.connection import (
     PRE_OPERATIONAL,
     SDO_REPLY,
     STOPPED,
-    CanopenWire,
+    NodeConnection,
     mux,
 )
 from fieldtwin.conformance.devices.device_case import NotHere, Unsaid
@@ -31,7 +31,7 @@ NAMES = {OPERATIONAL: "OPERATIONAL", STOPPED: "STOPPED", PRE_OPERATIONAL: "PRE-O
 
 
 @asynccontextmanager
-async def _restored(wire: CanopenWire) -> AsyncIterator[None]:
+async def _restored(wire: NodeConnection) -> AsyncIterator[None]:
     """Restore the node's NMT state afterwards; PRE-OPERATIONAL if it was never reported."""
     before = wire.state
     try:
@@ -41,7 +41,7 @@ async def _restored(wire: CanopenWire) -> AsyncIterator[None]:
         await wire.pause()
 
 
-async def _reset(wire: CanopenWire, command: int) -> Finding:
+async def _reset(wire: NodeConnection, command: int) -> Finding:
     async with _restored(wire):
         wire.forget()
         await wire.command(command)
@@ -54,17 +54,17 @@ async def _reset(wire: CanopenWire, command: int) -> Finding:
         return await verdict(wire, "")
 
 
-async def reset_node(wire: CanopenWire) -> Finding:
+async def reset_node(wire: NodeConnection) -> Finding:
     """CO-032: reset node: boot-up, PRE-OPERATIONAL."""
     return await _reset(wire, RESET_NODE)
 
 
-async def reset_communication(wire: CanopenWire) -> Finding:
+async def reset_communication(wire: NodeConnection) -> Finding:
     """CO-032: reset communication: boot-up, PRE-OPERATIONAL."""
     return await _reset(wire, RESET_COMMUNICATION)
 
 
-async def reset_in_a_transfer(wire: CanopenWire) -> Finding:
+async def reset_in_a_transfer(wire: NodeConnection) -> Finding:
     """CO-027: a reset in the middle of an upload: boot-up, and the transfer is over."""
     async with _restored(wire):
         await begin_upload(wire, await long_object(wire))
@@ -78,7 +78,7 @@ async def reset_in_a_transfer(wire: CanopenWire) -> Finding:
         return await verdict(wire, "")
 
 
-async def stopped(wire: CanopenWire) -> Finding:
+async def stopped(wire: NodeConnection) -> Finding:
     """CO-028: no SDO in STOPPED."""
     async with _restored(wire):
         await wire.command(STOP)
@@ -89,7 +89,7 @@ async def stopped(wire: CanopenWire) -> Finding:
         return await verdict(wire, f"{reply} in STOPPED" if reply.data else "")
 
 
-async def odd_commands(wire: CanopenWire) -> Finding:
+async def odd_commands(wire: NodeConnection) -> Finding:
     """CO-033: send resets of one and of three bytes, and one to a node ID that does not exist."""
     async with _restored(wire):
         wire.forget()
@@ -101,7 +101,7 @@ async def odd_commands(wire: CanopenWire) -> Finding:
         return await verdict(wire, "")
 
 
-async def guarding(wire: CanopenWire) -> Finding:
+async def guarding(wire: NodeConnection) -> Finding:
     """CO-040: two guard requests: answered, the toggle bit alternates."""
     toggles = []
     for _ in range(2):
@@ -116,7 +116,7 @@ async def guarding(wire: CanopenWire) -> Finding:
     return passed()
 
 
-async def silent_outside(wire: CanopenWire) -> Finding:
+async def silent_outside(wire: NodeConnection) -> Finding:
     """CO-044: no PDO outside OPERATIONAL."""
     async with _restored(wire):
         await wire.command(ENTER_PRE_OPERATIONAL)
@@ -126,7 +126,7 @@ async def silent_outside(wire: CanopenWire) -> Finding:
         return await verdict(wire, f"sends {pdos[0]} in PRE-OPERATIONAL" if pdos else "")
 
 
-async def fastscan(wire: CanopenWire) -> Finding:
+async def fastscan(wire: NodeConnection) -> Finding:
     """CO-057: a node that has an id keeps out of a fastscan."""
     wire.forget()
     await wire.send(CanFrame(LSS_REQUEST, b"\x51\0\0\0\0\x80\0\0"))

@@ -12,7 +12,7 @@ from fieldtwin.conformance.devices.canopen.checks import (
     present,
     verdict,
 )
-from fieldtwin.conformance.devices.canopen.connection import SDO_REQUEST, CanopenWire, Key, Reply, mux, shown
+from fieldtwin.conformance.devices.canopen.connection import SDO_REQUEST, Key, NodeConnection, Reply, mux, shown
 from fieldtwin.conformance.devices.device_case import NotHere, Unsaid
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.protocols.canopen.sdo_block import crc16
@@ -25,7 +25,7 @@ COUNTED = (0x1018, 0x1010, 0x1016, 0x1029)
 """Records and arrays whose sub 00 states their number of subindices."""
 
 
-async def toggle_repeated(wire: CanopenWire) -> Finding:
+async def toggle_repeated(wire: NodeConnection) -> Finding:
     """CO-001: repeat the toggle bit in the second segment; afterwards there is no transfer that could continue."""
     await begin_upload(wire, await long_object(wire))
     await wire.ask(b"\x60")
@@ -38,7 +38,7 @@ async def toggle_repeated(wire: CanopenWire) -> Finding:
     return await verdict(wire, "", f"for the repeated toggle: {repeated}; for the next segment: {following}")
 
 
-async def client_aborts(wire: CanopenWire) -> Finding:
+async def client_aborts(wire: NodeConnection) -> Finding:
     """CO-002: the client aborts after a segment, then asks for the next one all the same."""
     key = await long_object(wire)
     await begin_upload(wire, key)
@@ -51,17 +51,17 @@ async def client_aborts(wire: CanopenWire) -> Finding:
     return await verdict(wire, aborted(await wire.ask(b"\x70"), UNKNOWN))
 
 
-async def segment_alone(wire: CanopenWire) -> Finding:
+async def segment_alone(wire: NodeConnection) -> Finding:
     """CO-003: an upload segment without an initiate."""
     return await must_abort(wire, b"\x60", UNKNOWN)
 
 
-async def unknown_specifier(wire: CanopenWire) -> Finding:
+async def unknown_specifier(wire: NodeConnection) -> Finding:
     """CO-004: command specifier 7."""
     return await must_abort(wire, b"\xe0", UNKNOWN)
 
 
-async def begun_anew(wire: CanopenWire) -> Finding:
+async def begun_anew(wire: NodeConnection) -> Finding:
     """CO-005: begin a second upload in the middle of one.
 
     The server may serve the new upload at once, or abort it and serve the next one: CiA 301 describes neither, and the
@@ -78,7 +78,7 @@ async def begun_anew(wire: CanopenWire) -> Finding:
     return await verdict(wire, "")
 
 
-async def write_only(wire: CanopenWire) -> Finding:
+async def write_only(wire: NodeConnection) -> Finding:
     """CO-007: upload an object that is write-only according to the EDS."""
     entries = [e for e in wire.dictionary or () if not e.readable]
     if not entries:
@@ -86,7 +86,7 @@ async def write_only(wire: CanopenWire) -> Finding:
     return await must_abort(wire, b"\x40" + mux(entries[0].index, entries[0].subindex), 0x0601_0001)
 
 
-async def missing_index(wire: CanopenWire) -> Finding:
+async def missing_index(wire: NodeConnection) -> Finding:
     """CO-008: an index that is not there."""
     for index in UNLIKELY:
         if wire.dictionary is not None and wire.dictionary.get(index) is not None:
@@ -99,12 +99,12 @@ async def missing_index(wire: CanopenWire) -> Finding:
     raise Unsaid("it has all objects of " + ", ".join(f"{index:04X}h" for index in UNLIKELY))
 
 
-async def subindex_of_a_var(wire: CanopenWire) -> Finding:
+async def subindex_of_a_var(wire: NodeConnection) -> Finding:
     """CO-008: 1000h is a VAR: it has no subindex 01."""
     return await must_abort(wire, b"\x40" + mux(0x1000, 1), 0x0609_0011)
 
 
-async def subindex_beyond(wire: CanopenWire) -> Finding:
+async def subindex_beyond(wire: NodeConnection) -> Finding:
     """CO-008: upload one subindex beyond the number in sub 00."""
     for index in COUNTED:
         count = await wire.upload((index, 0))
@@ -113,7 +113,7 @@ async def subindex_beyond(wire: CanopenWire) -> Finding:
     raise NotHere("it has no object of " + ", ".join(f"{index:04X}h" for index in COUNTED))
 
 
-async def empty_history(wire: CanopenWire) -> Finding:
+async def empty_history(wire: NodeConnection) -> Finding:
     """CO-012: the first entry of an error history that is empty."""
     count = await wire.upload((0x1003, 0))
     if isinstance(count, Reply):
@@ -123,7 +123,7 @@ async def empty_history(wire: CanopenWire) -> Finding:
     return await must_abort(wire, b"\x40" + mux(0x1003, 1), 0x0800_0024, 0x0800_0000)
 
 
-async def short_request(wire: CanopenWire) -> Finding:
+async def short_request(wire: NodeConnection) -> Finding:
     """CO-026: send an upload request of 4 bytes, which is ignored or optionally accepted."""
     wire.forget()
     await wire.tell(b"\x40" + mux(0x1000))
@@ -133,7 +133,7 @@ async def short_request(wire: CanopenWire) -> Finding:
     return await verdict(wire, "", f"refuses it: {reply}" if reply.data else "ignores it")
 
 
-async def extended_identifier(wire: CanopenWire) -> Finding:
+async def extended_identifier(wire: NodeConnection) -> Finding:
     """CO-060: an upload request with a 29-bit identifier of the same number."""
     wire.forget()
     await wire.send(CanFrame(SDO_REQUEST + wire.node, (b"\x40" + mux(0x1000)).ljust(8, b"\0"), extended=True))
@@ -144,11 +144,11 @@ async def extended_identifier(wire: CanopenWire) -> Finding:
 # -- block upload (7.2.4.3.13 to 15) ---------------------------------------------------------------------------------
 
 
-async def _begin_block(wire: CanopenWire, key: Key, size: int, switch: int = 0) -> Reply:
+async def _begin_block(wire: NodeConnection, key: Key, size: int, switch: int = 0) -> Reply:
     return await wire.ask(b"\xa4" + mux(*key) + bytes((size, switch)))
 
 
-async def _must_have_blocks(wire: CanopenWire, key: Key) -> None:
+async def _must_have_blocks(wire: NodeConnection, key: Key) -> None:
     """Raises `NotHere` where a block upload is not done as one."""
     reply = await _begin_block(wire, key, 127)
     if reply.specifier == 6:
@@ -160,11 +160,11 @@ async def _must_have_blocks(wire: CanopenWire, key: Key) -> None:
     raise NotHere(f"it has no block upload: {reply}")
 
 
-async def _any_object(wire: CanopenWire) -> Key:
+async def _any_object(wire: NodeConnection) -> Key:
     return wire.long or (0x1000, 0)
 
 
-async def no_switch_unasked(wire: CanopenWire) -> Finding:
+async def no_switch_unasked(wire: NodeConnection) -> Finding:
     """CO-021: request a block upload without permission to switch to an ordinary one: blocks, or an abort."""
     key = await _any_object(wire)
     reply = await _begin_block(wire, key, 127, switch=0)
@@ -178,23 +178,23 @@ async def no_switch_unasked(wire: CanopenWire) -> Finding:
     return await verdict(wire, "" if reply.specifier == 6 else f"an ordinary upload all the same: {reply}")
 
 
-async def _block_size(wire: CanopenWire, size: int) -> Finding:
+async def _block_size(wire: NodeConnection, size: int) -> Finding:
     key = await _any_object(wire)
     await _must_have_blocks(wire, key)
     return await must_abort(wire, b"\xa4" + mux(*key) + bytes((size, 0)), BLOCK_SIZE)
 
 
-async def block_size_0(wire: CanopenWire) -> Finding:
+async def block_size_0(wire: NodeConnection) -> Finding:
     """CO-014: blocks of 0 segments."""
     return await _block_size(wire, 0)
 
 
-async def block_size_128(wire: CanopenWire) -> Finding:
+async def block_size_128(wire: NodeConnection) -> Finding:
     """CO-014: blocks of 128 segments."""
     return await _block_size(wire, 128)
 
 
-async def _block(wire: CanopenWire, size: int) -> list[bytes] | str:
+async def _block(wire: NodeConnection, size: int) -> list[bytes] | str:
     """Return the segments of one sub-block, or a description of the differing reply."""
     segments: list[bytes] = []
     while len(segments) < size:
@@ -207,7 +207,7 @@ async def _block(wire: CanopenWire, size: int) -> list[bytes] | str:
     return segments
 
 
-async def _block_upload(wire: CanopenWire, key: Key, size: int, *, lose: bool) -> tuple[bytes, str]:
+async def _block_upload(wire: NodeConnection, key: Key, size: int, *, lose: bool) -> tuple[bytes, str]:
     """Make a whole block upload; return the value and any error.
 
     With `lose`, the first sub-block is acknowledged only up to its last but one segment. The end is left open: the
@@ -234,7 +234,7 @@ async def _block_upload(wire: CanopenWire, key: Key, size: int, *, lose: bool) -
     return b"", "no end"
 
 
-async def _block_end(wire: CanopenWire, value: bytes, begun: Reply) -> tuple[bytes, str]:
+async def _block_end(wire: NodeConnection, value: bytes, begun: Reply) -> tuple[bytes, str]:
     end = await wire.reply()
     if end.specifier != 6 or end.data[0] & 3 != 1:
         return b"", f"{end} instead of the end"
@@ -245,7 +245,7 @@ async def _block_end(wire: CanopenWire, value: bytes, begun: Reply) -> tuple[byt
     return value, ""
 
 
-async def segment_lost(wire: CanopenWire) -> Finding:
+async def segment_lost(wire: NodeConnection) -> Finding:
     """CO-016: the last segment of a sub-block is not acknowledged."""
     key = await long_object(wire)
     await _must_have_blocks(wire, key)
@@ -260,7 +260,7 @@ async def segment_lost(wire: CanopenWire) -> Finding:
     )
 
 
-async def right_after_the_end(wire: CanopenWire) -> Finding:
+async def right_after_the_end(wire: NodeConnection) -> Finding:
     """CO-019: a request right after the end of a block upload."""
     key = await _any_object(wire)
     await _must_have_blocks(wire, key)

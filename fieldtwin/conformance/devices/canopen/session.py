@@ -8,10 +8,10 @@ from pathlib import Path
 
 from fieldtwin.commissioning.access.connection import frames_at
 from fieldtwin.conformance.devices.canopen.cases import CASES
-from fieldtwin.conformance.devices.canopen.connection import SDO_REQUEST, CanopenWire, Key, Reply
+from fieldtwin.conformance.devices.canopen.connection import SDO_REQUEST, Key, NodeConnection, Reply
 from fieldtwin.conformance.devices.checked import Checked, shown
 from fieldtwin.conformance.devices.device_case import DeviceResult
-from fieldtwin.conformance.devices.run import Plan, Transcript, play
+from fieldtwin.conformance.devices.run import DeviceTestOptions, Transcript, play
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.clock import NS_PER_S, Clock
 from fieldtwin.gateway.core.connection import Connector, Direction, Tap
@@ -37,7 +37,7 @@ class CanopenOptions:
 
     endpoint: str
     node: int
-    plan: Plan
+    plan: DeviceTestOptions
     bitrate: int = 0
     timeout_s: float = 0.5
     spacing_s: float = 0.02
@@ -80,7 +80,7 @@ async def check_canopen(
     async with frames_at(
         options.endpoint, options.bitrate, taps=taps, connector=options.connector, clock=clock
     ) as connection:
-        wire = CanopenWire(
+        wire = NodeConnection(
             connection, clock, options.node, timeout_s=options.timeout_s, spacing_s=options.spacing_s, boot_s=options.boot_s,
             may_write=options.may_write, dictionary=dictionary,
         )  # fmt: skip
@@ -96,7 +96,7 @@ async def check_canopen(
     return Checked(identity, results, before, (clock.monotonic_ns() - began_ns) / NS_PER_S)
 
 
-async def learn(wire: CanopenWire) -> dict[str, str]:
+async def learn(wire: NodeConnection) -> dict[str, str]:
     """Read the device type and identity, and find an object of several segments. Raises `Unreachable` without an answer."""
     found: bytes | Reply = Reply()
     for _ in range(2):  # a single loss may be a lost frame
@@ -127,7 +127,7 @@ async def learn(wire: CanopenWire) -> dict[str, str]:
     return identity
 
 
-async def _long_by_eds(wire: CanopenWire) -> Key | None:
+async def _long_by_eds(wire: NodeConnection) -> Key | None:
     """Return an object of the EDS that holds more than 7 bytes."""
     texts = [e for e in wire.dictionary or () if e.readable and e.type_code in (0x09, 0x0A, 0x0B, 0x0F)]
     for entry in texts[:MOST_LONG]:

@@ -8,9 +8,9 @@ from __future__ import annotations
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
-from fieldtwin.conformance.core.case import Danger, Finding
+from fieldtwin.conformance.core.case import Finding, Impact
 from fieldtwin.conformance.devices.canopen.checks import aborted, must_abort, present, verdict
-from fieldtwin.conformance.devices.canopen.connection import ERROR_CONTROL, CanopenWire, Key, Reply, mux, shown
+from fieldtwin.conformance.devices.canopen.connection import ERROR_CONTROL, Key, NodeConnection, Reply, mux, shown
 from fieldtwin.conformance.devices.device_case import NotHere, Unsaid
 from fieldtwin.gateway.protocols.canopen.datatypes import DataType
 from fieldtwin.gateway.protocols.canopen.sdo_block import crc16
@@ -22,14 +22,14 @@ ANY_LENGTH = frozenset({DataType.VISIBLE_STRING, DataType.OCTET_STRING, DataType
 
 
 @asynccontextmanager
-async def _borrowed(wire: CanopenWire, key: Key) -> AsyncIterator[bytes]:
+async def _borrowed(wire: NodeConnection, key: Key) -> AsyncIterator[bytes]:
     """Yield the object's value, and restore it. Raises `Unsaid` where that failed."""
     before = await present(wire, key)
     try:
         yield before
     finally:
         if await wire.upload(key) != before:
-            wire.danger = max(wire.danger, Danger.WRITE, key=lambda danger: danger.rank)
+            wire.danger = max(wire.danger, Impact.WRITE, key=lambda danger: danger.rank)
             await wire.download(key, before)
             now = await wire.upload(key)
             if now != before:
@@ -37,7 +37,7 @@ async def _borrowed(wire: CanopenWire, key: Key) -> AsyncIterator[bytes]:
                 raise Unsaid(f"{shown(key)} could not be restored: {said} instead of {before.hex()}")
 
 
-async def _unchanged(wire: CanopenWire, key: Key, before: bytes, wrong: str) -> Finding:
+async def _unchanged(wire: NodeConnection, key: Key, before: bytes, wrong: str) -> Finding:
     if wrong:
         await wire.abandon(key)  # ends any transfer in progress
     now = await wire.upload(key)
@@ -47,7 +47,7 @@ async def _unchanged(wire: CanopenWire, key: Key, before: bytes, wrong: str) -> 
     return await verdict(wire, wrong)
 
 
-async def _number(wire: CanopenWire) -> tuple[Key, bytes]:
+async def _number(wire: NodeConnection) -> tuple[Key, bytes]:
     """Return the first given object that is a number of 1, 2 or 4 bytes; 1017h only if there is no other.
 
     Raises `NotHere` with the reason for each given object.
@@ -65,7 +65,7 @@ async def _number(wire: CanopenWire) -> tuple[Key, bytes]:
     raise NotHere(f"needs an object of 1, 2 or 4 bytes by --write: {', '.join(why_not)}")
 
 
-async def _text(wire: CanopenWire) -> tuple[Key, bytes]:
+async def _text(wire: NodeConnection) -> tuple[Key, bytes]:
     """Return the first given object of more than 14 bytes: three segments. Raises `NotHere`, as `_number`."""
     why_not = []
     for key in wire.may_write:
@@ -86,29 +86,29 @@ def _instead(key: Key, value: bytes | Reply) -> str:
 # -- refusals ---------------------------------------------------------------------------------------------------------
 
 
-async def read_only_expedited(wire: CanopenWire) -> Finding:
+async def read_only_expedited(wire: NodeConnection) -> Finding:
     """CO-006: 1000h, written with its own value."""
     return await must_abort(wire, b"\x23" + mux(0x1000) + wire.device_type.ljust(4, b"\0"), READ_ONLY)
 
 
-async def read_only_segmented(wire: CanopenWire) -> Finding:
+async def read_only_segmented(wire: NodeConnection) -> Finding:
     """CO-006: a download in segments to 1000h: refused at initiate, before any data."""
     return await must_abort(wire, b"\x21" + mux(0x1000) + b"\x14\0\0\0", READ_ONLY)
 
 
-async def segment_alone(wire: CanopenWire) -> Finding:
+async def segment_alone(wire: NodeConnection) -> Finding:
     """CO-003: a download segment without an initiate."""
     return await must_abort(wire, b"\x00abcdefg", UNKNOWN)
 
 
-async def history_set(wire: CanopenWire) -> Finding:
+async def history_set(wire: NodeConnection) -> Finding:
     """CO-011: 1003h:00 can only be cleared."""
     if isinstance(there := await wire.upload((0x1003, 0)), Reply):
         raise NotHere(f"it has no error history, 1003h: {there}")
     return await must_abort(wire, b"\x2f" + mux(0x1003) + b"\x01", 0x0609_0030, 0x0800_0000)
 
 
-async def store_signature(wire: CanopenWire) -> Finding:
+async def store_signature(wire: NodeConnection) -> Finding:
     """CO-031: write an invalid signature to 1010h."""
     if isinstance(there := await wire.upload((0x1010, 1)), Reply):
         raise NotHere(f"it stores no parameters, 1010h: {there}")
@@ -118,7 +118,7 @@ async def store_signature(wire: CanopenWire) -> Finding:
 # -- lengths and limits -----------------------------------------------------------------------------------------------
 
 
-async def too_long(wire: CanopenWire) -> Finding:
+async def too_long(wire: NodeConnection) -> Finding:
     """CO-009: one byte more than the object has, announced."""
     key, before = await _number(wire)
     async with _borrowed(wire, key):
@@ -128,7 +128,7 @@ async def too_long(wire: CanopenWire) -> Finding:
         return await _unchanged(wire, key, before, aborted(reply, TOO_LONG))
 
 
-async def too_short(wire: CanopenWire) -> Finding:
+async def too_short(wire: NodeConnection) -> Finding:
     """CO-009: one byte less, expedited."""
     key, before = await _number(wire)
     if len(before) < 2:
@@ -137,7 +137,7 @@ async def too_short(wire: CanopenWire) -> Finding:
         return await _unchanged(wire, key, before, aborted(await wire.download(key, before[:-1]), TOO_SHORT))
 
 
-async def _limit(wire: CanopenWire, *, above: bool) -> Finding:
+async def _limit(wire: NodeConnection, *, above: bool) -> Finding:
     for key in wire.may_write:
         entry = wire.dictionary.get(*key) if wire.dictionary is not None else None
         bound = None if entry is None else entry.high if above else entry.low
@@ -153,17 +153,17 @@ async def _limit(wire: CanopenWire, *, above: bool) -> Finding:
     raise NotHere("no object of --write has such a limit in the EDS, with values of its type outside it")
 
 
-async def above_limit(wire: CanopenWire) -> Finding:
+async def above_limit(wire: NodeConnection) -> Finding:
     """CO-010: one more than the EDS allows."""
     return await _limit(wire, above=True)
 
 
-async def below_limit(wire: CanopenWire) -> Finding:
+async def below_limit(wire: NodeConnection) -> Finding:
     """CO-010: one less than the EDS allows."""
     return await _limit(wire, above=False)
 
 
-async def _announced(wire: CanopenWire, more: int, code: int) -> Finding:
+async def _announced(wire: NodeConnection, more: int, code: int) -> Finding:
     key, before = await _number(wire)
     sent = len(before) + more
     if not sent:
@@ -176,17 +176,17 @@ async def _announced(wire: CanopenWire, more: int, code: int) -> Finding:
         return await _unchanged(wire, key, before, aborted(reply, code))
 
 
-async def more_than_announced(wire: CanopenWire) -> Finding:
+async def more_than_announced(wire: NodeConnection) -> Finding:
     """CO-013: a byte more than was announced."""
     return await _announced(wire, 1, TOO_LONG)
 
 
-async def less_than_announced(wire: CanopenWire) -> Finding:
+async def less_than_announced(wire: NodeConnection) -> Finding:
     """CO-013: a byte less than was announced."""
     return await _announced(wire, -1, TOO_SHORT)
 
 
-async def without_size(wire: CanopenWire) -> Finding:
+async def without_size(wire: NodeConnection) -> Finding:
     """CO-029: expedited, without the size bit: the object's own length counts."""
     key, before = await _number(wire)
     async with _borrowed(wire, key):
@@ -194,7 +194,7 @@ async def without_size(wire: CanopenWire) -> Finding:
         return await _unchanged(wire, key, before, "" if reply.specifier == 3 else f"{reply} instead of taking it")
 
 
-async def toggle_repeated(wire: CanopenWire) -> Finding:
+async def toggle_repeated(wire: NodeConnection) -> Finding:
     """CO-001: the toggle bit stays the same in the second segment of a download."""
     key, before = await _text(wire)
     async with _borrowed(wire, key):
@@ -208,7 +208,7 @@ async def toggle_repeated(wire: CanopenWire) -> Finding:
 # -- block download (7.2.4.3.9 to 11) ----------------------------------------------------------------------------------
 
 
-async def _begin_block(wire: CanopenWire, key: Key, size: int) -> Reply:
+async def _begin_block(wire: NodeConnection, key: Key, size: int) -> Reply:
     reply = await wire.ask(b"\xc6" + mux(*key) + size.to_bytes(4, "little"))
     if reply.specifier != 5 or not 1 <= reply.data[4] <= 127:
         raise NotHere(f"it has no block download: {reply}")
@@ -227,7 +227,7 @@ def _end(value: bytes, crc: int) -> bytes:
     return (bytes((0xC1 | unused << 2,)) + crc.to_bytes(2, "little")).ljust(8, b"\0")
 
 
-async def crc_mismatch(wire: CanopenWire) -> Finding:
+async def crc_mismatch(wire: NodeConnection) -> Finding:
     """CO-015: end a block download with a wrong CRC."""
     key, before = await _number(wire)
     async with _borrowed(wire, key):
@@ -241,7 +241,7 @@ async def crc_mismatch(wire: CanopenWire) -> Finding:
         return await _unchanged(wire, key, before, aborted(await wire.ask(_end(before, crc16(before) ^ 0xFFFF)), CRC))
 
 
-async def _whole_block(wire: CanopenWire, *, lose: bool) -> Finding:
+async def _whole_block(wire: NodeConnection, *, lose: bool) -> Finding:
     """Download the object's own value by blocks; if `lose`, the second segment is lost at first."""
     key, before = await _text(wire)
     async with _borrowed(wire, key):
@@ -275,12 +275,12 @@ async def _whole_block(wire: CanopenWire, *, lose: bool) -> Finding:
         return await _unchanged(wire, key, before, "" if end.specifier == 5 else f"{end} instead of the end")
 
 
-async def one_reply_a_block(wire: CanopenWire) -> Finding:
+async def one_reply_a_block(wire: NodeConnection) -> Finding:
     """CO-020: a sub-block is acknowledged exactly once."""
     return await _whole_block(wire, lose=False)
 
 
-async def segment_lost(wire: CanopenWire) -> Finding:
+async def segment_lost(wire: NodeConnection) -> Finding:
     """CO-017: lose a segment of the last sub-block; repeat it and the following ones, numbered from 1."""
     return await _whole_block(wire, lose=True)
 
@@ -291,7 +291,7 @@ PERIOD_MS = 200
 BEATS = 4
 
 
-async def heartbeat_changed(wire: CanopenWire) -> Finding:
+async def heartbeat_changed(wire: NodeConnection) -> Finding:
     """CO-041: change 1017h: the new period applies at once."""
     key = (0x1017, 0)
     if key not in wire.may_write:

@@ -9,16 +9,16 @@ from __future__ import annotations
 
 from functools import partial
 
-from fieldtwin.conformance.core.case import OWN, Basis, Danger, Elsewhere
-from fieldtwin.conformance.devices.device_case import DeviceCase, Play
+from fieldtwin.conformance.core.case import OWN, Basis, Elsewhere, Impact
+from fieldtwin.conformance.devices.device_case import CaseProcedure, DeviceCase
 from fieldtwin.conformance.devices.modbus import line_cases as line
 from fieldtwin.conformance.devices.modbus import pdu_cases as pdu
 from fieldtwin.conformance.devices.modbus import tcp_cases as tcp
 from fieldtwin.conformance.devices.modbus import write_cases as write
-from fieldtwin.conformance.devices.modbus.connection import ModbusWire
+from fieldtwin.conformance.devices.modbus.connection import DeviceConnection
 
-ModbusCase = DeviceCase[ModbusWire]
-READ, WRITE, DISRUPT = Danger.READ, Danger.WRITE, Danger.DISRUPT
+ModbusCase = DeviceCase[DeviceConnection]
+READ, WRITE, DISRUPT = Impact.READ, Impact.WRITE, Impact.DISRUPT
 LINE = ("rtu-line",)
 ASCII = ("ascii-line",)
 FRAMED = ("rtu-line", "rtu-stream")
@@ -32,10 +32,10 @@ def case(
     id: str,
     title: str,
     clause: str,
-    danger: Danger,
+    danger: Impact,
     does: str,
     must: str,
-    play: Play[ModbusWire],
+    play: CaseProcedure[DeviceConnection],
     wires: tuple[str, ...] = (),
     needs: tuple[str, ...] = (),
     basis: Basis = Basis.STANDARD,

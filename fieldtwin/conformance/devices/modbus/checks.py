@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from fieldtwin.conformance.core.case import Finding, failed, passed
 from fieldtwin.conformance.devices.device_case import NotHere
-from fieldtwin.conformance.devices.modbus.connection import Heard, ModbusWire
+from fieldtwin.conformance.devices.modbus.connection import DeviceConnection, Received
 from fieldtwin.conformance.devices.modbus.frames import Answer
 
 NAMES = {1: "illegal function", 2: "illegal data address", 3: "illegal data value", 4: "device failure", 6: "busy"}
@@ -29,7 +29,7 @@ def refused(pdu: bytes, answer: Answer, *codes: int) -> str:
     return f"answers {answer} instead of exception {wanted}"
 
 
-async def must_refuse(wire: ModbusWire, pdu: bytes, *codes: int, may_lack: bool = True) -> Finding:
+async def must_refuse(wire: DeviceConnection, pdu: bytes, *codes: int, may_lack: bool = True) -> Finding:
     """Send a request that the device has to refuse with one of `codes`; then it must continue to answer.
 
     `may_lack`: exception 01 means that the device lacks the function, and the case is skipped.
@@ -45,7 +45,7 @@ async def must_refuse(wire: ModbusWire, pdu: bytes, *codes: int, may_lack: bool 
     return failed(wrong) if wrong else passed(named(answer.refusal))
 
 
-async def silent_then_good(wire: ModbusWire, heard: Heard) -> Finding:
+async def silent_then_good(wire: DeviceConnection, heard: Received) -> Finding:
     """Require that `heard` is silence, and that a request afterwards is answered."""
     if not heard.nothing:
         return failed(f"{heard} instead of silence")
@@ -55,12 +55,12 @@ async def silent_then_good(wire: ModbusWire, heard: Heard) -> Finding:
     )
 
 
-def answers_good(wire: ModbusWire, heard: Heard, times: int) -> bool:
+def answers_good(wire: DeviceConnection, heard: Received, times: int) -> bool:
     """Return whether `heard` is the usual answer `times` times, without any other bytes."""
     return len(heard.answers) == times and all(wire.is_good(a) for a in heard.answers) and not heard.rest
 
 
-def first_table(wire: ModbusWire, functions: Sequence[int]) -> tuple[int, int, int]:
+def first_table(wire: DeviceConnection, functions: Sequence[int]) -> tuple[int, int, int]:
     """Return (function, address, count) of a read that is answered. Raises `NotHere` if none of `functions` has one."""
     for function in functions:
         if function in wire.readable:

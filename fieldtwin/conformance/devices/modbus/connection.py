@@ -10,7 +10,7 @@ import asyncio
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 
-from fieldtwin.conformance.core.case import Danger
+from fieldtwin.conformance.core.case import Impact
 from fieldtwin.conformance.devices.modbus.frames import Answer, framed, replies, short
 from fieldtwin.gateway.core.clock import NS_PER_S, Clock
 from fieldtwin.gateway.core.connection import ByteConnection
@@ -36,7 +36,7 @@ Open = Callable[[], Awaitable[ByteConnection]]
 
 
 @dataclass(frozen=True, slots=True)
-class Heard:
+class Received:
     """The received data: whole replies, other bytes, and whether the device closed the connection."""
 
     answers: tuple[Answer, ...]
@@ -58,7 +58,7 @@ class Heard:
         return ", ".join(said) or "silence"
 
 
-class ModbusWire:
+class DeviceConnection:
     """One connection to one unit.
 
     `framing` is rtu, ascii, mbap or udp; `traits` describe the transport for cases (the framing, ``serial`` or
@@ -83,7 +83,7 @@ class ModbusWire:
         self.timeout_s, self.char_s = timeout_s, char_s
         self.pause_s = max(4 * char_s, 0.005)
         """A silence that ends any frame (SL 2.5.1.1: 3.5 characters, 1.75 ms at least), with something to spare."""
-        self.danger = Danger.READ
+        self.danger = Impact.READ
         self.good = b""
         """The request that tests normal operation: a read."""
         self.good_reply = b""
@@ -152,20 +152,20 @@ class ModbusWire:
         self._quiet_since_ns = self.clock.monotonic_ns() + round(len(data) * self.char_s * NS_PER_S)
 
     def _must_be_allowed(self, pdu: bytes) -> None:
-        if self.danger is Danger.DISRUPT or (pdu[0] in READS and (pdu[0] != 0x2B or pdu[:2] == IDENTIFICATION)):
+        if self.danger is Impact.DISRUPT or (pdu[0] in READS and (pdu[0] != 0x2B or pdu[:2] == IDENTIFICATION)):
             return
-        if self.danger is Danger.WRITE and pdu[0] in WRITES:
+        if self.danger is Impact.WRITE and pdu[0] in WRITES:
             return
         raise Bug(f"a check of danger {self.danger.value} would send function {pdu[0]:02X}h")
 
     async def _rest(self) -> None:
         await self.clock.sleep_until_ns(self._quiet_since_ns + round(self._spacing_s * NS_PER_S))
 
-    async def hear(self, count: int = 1, within_s: float | None = None) -> Heard:
+    async def hear(self, count: int = 1, within_s: float | None = None) -> Received:
         """Receive until there are `count` whole replies, or nothing came for the timeout; ``count=0`` receives everything."""
         data, closed = await self._bytes(count, self.timeout_s if within_s is None else within_s)
         answers, rest = replies(self.framing, data)
-        return Heard(tuple(answers), rest, closed)
+        return Received(tuple(answers), rest, closed)
 
     async def _bytes(self, count: int, within_s: float) -> tuple[bytes, bool]:
         data = b""
@@ -193,7 +193,7 @@ class ModbusWire:
         self._echo_left = self._echo_left[same:] if same else b""
         return chunk[same:]
 
-    async def ask(self, pdu: bytes, unit: int | None = None, *, due: bool = True) -> Heard:
+    async def ask(self, pdu: bytes, unit: int | None = None, *, due: bool = True) -> Received:
         """Send a request in a good frame and return the received data; without a `due` answer silence is accepted sooner.
 
         On a connection with transaction IDs only replies to the request count.
@@ -206,13 +206,13 @@ class ModbusWire:
             if late and len(late) == len(heard.answers):  # of an earlier request: the reply may follow
                 more = await self.hear()
                 ours = tuple(a for a in more.answers if a.transaction == number)
-                return Heard(ours or heard.answers, heard.rest + more.rest, more.closed)
+                return Received(ours or heard.answers, heard.rest + more.rest, more.closed)
         return heard
 
     async def pause(self, s: float) -> None:
         await asyncio.sleep(s)
 
-    async def drain(self) -> Heard:
+    async def drain(self) -> Received:
         """Receive the unrequested bytes that have arrived."""
         return await self.hear(0, self.pause_s)
 

@@ -6,7 +6,7 @@ missing device.
 
 from __future__ import annotations
 
-from fieldtwin.conformance.devices.modbus.connection import GATEWAY_SAYS_NO, ModbusWire
+from fieldtwin.conformance.devices.modbus.connection import GATEWAY_SAYS_NO, DeviceConnection
 from fieldtwin.conformance.devices.modbus.frames import Answer
 from fieldtwin.gateway.core.errors import Unreachable
 
@@ -31,7 +31,7 @@ def values_of(answer: Answer | None, function: int, count: int) -> bytes | None:
     return answer.pdu[2:]
 
 
-async def learn(wire: ModbusWire, given: dict[str, int], writable: dict[str, int] | None = None) -> None:
+async def learn(wire: DeviceConnection, given: dict[str, int], writable: dict[str, int] | None = None) -> None:
     """Fill `good`, `readable` and `refused` of `wire`.
 
     `given`: table -> address that can be read according to the user, `writable` the same of cells that may be written:
@@ -58,7 +58,7 @@ async def learn(wire: ModbusWire, given: dict[str, int], writable: dict[str, int
 
 
 async def _table(
-    wire: ModbusWire, function: int, given: dict[str, int], writable: dict[str, int]
+    wire: DeviceConnection, function: int, given: dict[str, int], writable: dict[str, int]
 ) -> tuple[bytes, bytes] | None:
     """Find a readable cell of one table. Return a refused request with its reply if there is no such cell."""
     table, refusal, silent = TABLE[function], None, 0
@@ -83,7 +83,7 @@ async def _table(
     return refusal
 
 
-async def _widen(wire: ModbusWire) -> None:
+async def _widen(wire: DeviceConnection) -> None:
     """Extend the known reads to 2 or 3 cells, which is enough to check padding and byte counts."""
     for function, (address, _) in list(wire.readable.items()):
         count = 3 if function in (0x01, 0x02) else 2

@@ -9,7 +9,7 @@ from __future__ import annotations
 from fieldtwin.conformance.core.case import Finding, failed, passed
 from fieldtwin.conformance.devices.device_case import NotHere, Unsaid
 from fieldtwin.conformance.devices.modbus.checks import answers_good, silent_then_good
-from fieldtwin.conformance.devices.modbus.connection import ModbusWire
+from fieldtwin.conformance.devices.modbus.connection import DeviceConnection
 from fieldtwin.conformance.devices.modbus.frames import ascii_frame, framed
 from fieldtwin.conformance.devices.modbus.learn import read_of
 from fieldtwin.gateway.protocols.modbus.ascii import lrc
@@ -19,7 +19,7 @@ LONG_PAUSE_S = 0.1
 """Ends any RTU frame at any baud rate from 1200 on."""
 
 
-async def bad_check_sum(wire: ModbusWire) -> Finding:
+async def bad_check_sum(wire: DeviceConnection) -> Finding:
     """MB-001: send a request with a wrong check sum."""
     frame = bytearray(wire.frame(wire.good))
     frame[-1] ^= 0xFF
@@ -28,7 +28,7 @@ async def bad_check_sum(wire: ModbusWire) -> Finding:
     return await silent_then_good(wire, await wire.hear())
 
 
-async def half_then_whole(wire: ModbusWire) -> Finding:
+async def half_then_whole(wire: DeviceConnection) -> Finding:
     """MB-004: half a request, a pause, a whole one."""
     frame = wire.frame(wire.good)
     await wire.say(frame[: len(frame) // 2], wire.good)
@@ -38,7 +38,7 @@ async def half_then_whole(wire: ModbusWire) -> Finding:
     return passed() if answers_good(wire, heard, 1) else failed(f"{heard} instead of an answer to the complete one")
 
 
-async def gap_inside(wire: ModbusWire) -> Finding:
+async def gap_inside(wire: DeviceConnection) -> Finding:
     """MB-005: a pause of 2.5 characters or 2 ms inside a frame."""
     frame = wire.frame(wire.good)
     await wire.say(frame[:4], wire.good)
@@ -53,7 +53,7 @@ async def gap_inside(wire: ModbusWire) -> Finding:
     return failed(f"the request afterwards: {after}") if after else passed("discards it: strict")
 
 
-async def no_gap(wire: ModbusWire) -> Finding:
+async def no_gap(wire: DeviceConnection) -> Finding:
     """MB-007: two requests without a pause between them."""
     frame = wire.frame(wire.good)
     await wire.say(frame + frame, wire.good)
@@ -66,11 +66,11 @@ async def no_gap(wire: ModbusWire) -> Finding:
     return failed(f"the request afterwards: {after}") if after else passed("discards both: strict")
 
 
-async def _among(wire: ModbusWire, before: bytes, after: bytes) -> Finding:
+async def _among(wire: DeviceConnection, before: bytes, after: bytes) -> Finding:
     return await _goes_on(wire, before + wire.frame(wire.good) + after, may_discard=False)
 
 
-async def _goes_on(wire: ModbusWire, data: bytes, *, may_discard: bool) -> Finding:
+async def _goes_on(wire: DeviceConnection, data: bytes, *, may_discard: bool) -> Finding:
     """Send a good request with noise around it, and a good request 0.1 s after the reply.
 
     `may_discard`: silence for the first one is also right. In RTU the noise and the frame are one frame, because no
@@ -91,32 +91,32 @@ async def _goes_on(wire: ModbusWire, data: bytes, *, may_discard: bool) -> Findi
     return passed(said if may_discard else "")
 
 
-async def _with_noise(wire: ModbusWire, before: bytes, after: bytes) -> Finding:
+async def _with_noise(wire: DeviceConnection, before: bytes, after: bytes) -> Finding:
     return await _goes_on(wire, before + wire.frame(wire.good) + after, may_discard=True)
 
 
-async def leading_zero(wire: ModbusWire) -> Finding:
+async def leading_zero(wire: DeviceConnection) -> Finding:
     """MB-008: 00 00 before the frame."""
     return await _with_noise(wire, b"\x00\x00", b"")
 
 
-async def leading_ones(wire: ModbusWire) -> Finding:
+async def leading_ones(wire: DeviceConnection) -> Finding:
     """MB-008: FF FF before the frame."""
     return await _with_noise(wire, b"\xff\xff", b"")
 
 
-async def trailing_zeros(wire: ModbusWire) -> Finding:
+async def trailing_zeros(wire: DeviceConnection) -> Finding:
     """MB-009: send 00 00 after the frame."""
     return await _with_noise(wire, b"", b"\x00\x00")
 
 
-async def broadcast_read(wire: ModbusWire) -> Finding:
+async def broadcast_read(wire: DeviceConnection) -> Finding:
     """MB-027: a read to unit 0."""
     await wire.say(wire.frame(wire.good, 0), wire.good)
     return await silent_then_good(wire, await wire.hear())
 
 
-async def _silent_neighbour(wire: ModbusWire) -> int:
+async def _silent_neighbour(wire: DeviceConnection) -> int:
     """Return an unused unit ID. Raises `Unsaid` if a device answers each of those that were tried."""
     for unit in _neighbours(wire):
         if (await wire.ask(wire.good, unit, due=False)).nothing:
@@ -125,11 +125,11 @@ async def _silent_neighbour(wire: ModbusWire) -> int:
     raise Unsaid("it answers to every other unit ID that was tried: see MB-029")
 
 
-def _neighbours(wire: ModbusWire) -> list[int]:
+def _neighbours(wire: DeviceConnection) -> list[int]:
     return [unit for unit in (wire.unit % 247 + 1, 247, 200, 113) if unit != wire.unit][:3]
 
 
-async def other_unit(wire: ModbusWire) -> Finding:
+async def other_unit(wire: DeviceConnection) -> Finding:
     """MB-029: requests to other units. Three that answer alike are one device that answers for all."""
     said = []
     for unit in _neighbours(wire):
@@ -145,7 +145,7 @@ async def other_unit(wire: ModbusWire) -> Finding:
     raise Unsaid(f"units {units} answer, each differently: there are other units on this line")
 
 
-async def neighbours_talk(wire: ModbusWire) -> Finding:
+async def neighbours_talk(wire: DeviceConnection) -> Finding:
     """MB-030: send another unit's request and its response, then a request to this unit."""
     other = await _silent_neighbour(wire)
     request = read_of(0x03, 0, 2)
@@ -159,7 +159,7 @@ async def neighbours_talk(wire: ModbusWire) -> Finding:
     return passed() if answers_good(wire, heard, 1) else failed(f"{heard} instead of an answer to ours alone")
 
 
-async def neighbour_silent(wire: ModbusWire) -> Finding:
+async def neighbour_silent(wire: DeviceConnection) -> Finding:
     """MB-031: send a request that another unit does not answer, then one to this unit."""
     other = await _silent_neighbour(wire)
     request = read_of(0x03, 0, 2)
@@ -170,7 +170,7 @@ async def neighbour_silent(wire: ModbusWire) -> Finding:
     return passed() if answers_good(wire, heard, 1) else failed(f"{heard} instead of an answer to ours alone")
 
 
-async def stranger_function(wire: ModbusWire) -> Finding:
+async def stranger_function(wire: DeviceConnection) -> Finding:
     """MB-032: send an unknown function to another unit."""
     other = await _silent_neighbour(wire)
     pdu = b"\x64\x00\x01"
@@ -182,14 +182,14 @@ async def stranger_function(wire: ModbusWire) -> Finding:
     return failed(f"the request right afterwards: {after}") if after else passed()
 
 
-async def wrong_baud_rate(wire: ModbusWire) -> Finding:
+async def wrong_baud_rate(wire: DeviceConnection) -> Finding:
     """MB-068: send the bytes that a wrong baud rate makes of a request."""
     await wire.say(bytes.fromhex("80 00 F8 00 78 80 E6 FE 00 80 F8 66 06 FE"), b"\x80")
     await wire.pause(LONG_PAUSE_S)
     return await silent_then_good(wire, await wire.hear())
 
 
-async def two_masters(wire: ModbusWire) -> Finding:
+async def two_masters(wire: DeviceConnection) -> Finding:
     """MB-069: send two overlapping requests, combined bit by bit."""
     one, other = wire.frame(wire.good), framed("rtu", wire.unit, read_of(0x04, 0x1234, 9))
     if wire.framing == "ascii":
@@ -202,14 +202,14 @@ async def two_masters(wire: ModbusWire) -> Finding:
 # -- ASCII (SL 2.5.2) --------------------------------------------------------------------------------------------------
 
 
-async def bad_lrc(wire: ModbusWire) -> Finding:
+async def bad_lrc(wire: DeviceConnection) -> Finding:
     """MB-070: a wrong check sum."""
     body = bytes((wire.unit,)) + wire.good
     await wire.say(ascii_frame(body, lrc(body) ^ 0xFF), wire.good)
     return await silent_then_good(wire, await wire.hear())
 
 
-async def second_colon(wire: ModbusWire) -> Finding:
+async def second_colon(wire: DeviceConnection) -> Finding:
     """MB-070: send half a frame, then a whole one: the colon begins a new frame."""
     frame = wire.frame(wire.good)
     await wire.say(frame[:7] + frame, wire.good)
@@ -217,7 +217,7 @@ async def second_colon(wire: ModbusWire) -> Finding:
     return passed() if answers_good(wire, heard, 1) else failed(f"{heard} instead of an answer to the second")
 
 
-async def gap_over_a_second(wire: ModbusWire) -> Finding:
+async def gap_over_a_second(wire: DeviceConnection) -> Finding:
     """MB-070: 1.5 s between two characters."""
     frame = wire.frame(wire.good)
     await wire.say(frame[:7], wire.good)
@@ -226,7 +226,7 @@ async def gap_over_a_second(wire: ModbusWire) -> Finding:
     return await silent_then_good(wire, await wire.hear())
 
 
-async def gap_under_a_second(wire: ModbusWire) -> Finding:
+async def gap_under_a_second(wire: DeviceConnection) -> Finding:
     """MB-070: half a second between two characters."""
     frame = wire.frame(wire.good)
     await wire.say(frame[:7], wire.good)
@@ -236,12 +236,12 @@ async def gap_under_a_second(wire: ModbusWire) -> Finding:
     return passed() if answers_good(wire, heard, 1) else failed(f"{heard} instead of an answer")
 
 
-async def noise_before_colon(wire: ModbusWire) -> Finding:
+async def noise_before_colon(wire: DeviceConnection) -> Finding:
     """MB-070: noise before the colon."""
     return await _among(wire, b"\x00\xffQ1", b"")
 
 
-async def no_character(wire: ModbusWire) -> Finding:
+async def no_character(wire: DeviceConnection) -> Finding:
     """MB-070: send a character other than 0 to F inside the frame."""
     frame = bytearray(wire.frame(wire.good))
     frame[5:6] = b"G"
@@ -249,12 +249,12 @@ async def no_character(wire: ModbusWire) -> Finding:
     return await silent_then_good(wire, await wire.hear())
 
 
-def longest(wire: ModbusWire) -> bytes:
+def longest(wire: DeviceConnection) -> bytes:
     """Return the PDU of the longest request that an echo can carry (SL 2.5.1: a frame of 256 bytes)."""
     return b"\x08\x00\x00" + b"\x5a" * 250
 
 
-async def frame_of_256(wire: ModbusWire) -> Finding:
+async def frame_of_256(wire: DeviceConnection) -> Finding:
     """MB-050: the longest frame, by the echo of FC 08."""
     short = await wire.ask(b"\x08\x00\x00\x5a\x5a")
     if short.first is None or short.first.pdu != b"\x08\x00\x00\x5a\x5a":
@@ -264,7 +264,7 @@ async def frame_of_256(wire: ModbusWire) -> Finding:
     return passed() if whole else failed(f"{heard} instead of the same bytes")
 
 
-async def frame_of_257(wire: ModbusWire) -> Finding:
+async def frame_of_257(wire: DeviceConnection) -> Finding:
     """MB-050: a frame that is too long."""
     body = bytes((wire.unit,)) + longest(wire) + b"\x5a"
     await wire.say(with_crc(body), longest(wire))

@@ -8,7 +8,7 @@ from __future__ import annotations
 from fieldtwin.conformance.core.case import Finding, failed, passed
 from fieldtwin.conformance.devices.device_case import NotHere, Unsaid
 from fieldtwin.conformance.devices.modbus.checks import first_table, must_refuse, named, refused
-from fieldtwin.conformance.devices.modbus.connection import ModbusWire
+from fieldtwin.conformance.devices.modbus.connection import DeviceConnection
 from fieldtwin.conformance.devices.modbus.frames import short
 from fieldtwin.conformance.devices.modbus.learn import ORDER, read_of, values_of
 
@@ -16,24 +16,24 @@ MOST_FRAMES = 32
 """Frames of an identification: 255 objects fit into fewer, and one that never ends is bounded."""
 
 
-async def unknown_function(wire: ModbusWire) -> Finding:
+async def unknown_function(wire: DeviceConnection) -> Finding:
     """MB-033: function 64h, with two bytes."""
     return await must_refuse(wire, b"\x64\x00\x01", 0x01)
 
 
-async def unknown_bare_function(wire: ModbusWire) -> Finding:
+async def unknown_bare_function(wire: DeviceConnection) -> Finding:
     """MB-033: function 41h, without any."""
     return await must_refuse(wire, b"\x41", 0x01)
 
 
-async def after_unknown(wire: ModbusWire) -> Finding:
+async def after_unknown(wire: DeviceConnection) -> Finding:
     """MB-034: a good request right after one with an unknown function."""
     await wire.ask(b"\x64\x00\x01")
     after = await wire.still_good()
     return failed(f"the request afterwards: {after}") if after else passed()
 
 
-async def high_function(wire: ModbusWire) -> Finding:
+async def high_function(wire: DeviceConnection) -> Finding:
     """MB-035: function 83h; code 01 or silence, the same both times."""
     seen = []
     for _ in range(2):
@@ -50,38 +50,38 @@ async def high_function(wire: ModbusWire) -> Finding:
     return passed(seen[0]) if seen[0] == seen[1] else failed(f"once {seen[0]}, once {seen[1]}")
 
 
-async def no_register(wire: ModbusWire) -> Finding:
+async def no_register(wire: DeviceConnection) -> Finding:
     """MB-036: count 0."""
     function, address, _ = first_table(wire, ORDER)
     return await must_refuse(wire, read_of(function, address, 0), 0x03, may_lack=False)
 
 
-async def many_registers(wire: ModbusWire) -> Finding:
+async def many_registers(wire: DeviceConnection) -> Finding:
     """MB-036: 126 registers."""
     function, address, _ = first_table(wire, (0x03, 0x04))
     return await must_refuse(wire, read_of(function, min(address, 0xFFFF - 125), 126), 0x03, may_lack=False)
 
 
-async def many_bits(wire: ModbusWire) -> Finding:
+async def many_bits(wire: DeviceConnection) -> Finding:
     """MB-036: 2001 bits."""
     function, address, _ = first_table(wire, (0x01, 0x02))
     return await must_refuse(wire, read_of(function, min(address, 0xFFFF - 2000), 2001), 0x03, may_lack=False)
 
 
-async def beyond_the_table(wire: ModbusWire) -> Finding:
+async def beyond_the_table(wire: DeviceConnection) -> Finding:
     """MB-037: two cells from FFFFh on."""
     function, _, _ = first_table(wire, ORDER)
     return await must_refuse(wire, read_of(function, 0xFFFF, 2), 0x02, may_lack=False)
 
 
-async def both_wrong(wire: ModbusWire) -> Finding:
+async def both_wrong(wire: DeviceConnection) -> Finding:
     """MB-038: too many cells from FFFFh on. AP 6 checks the count first (exception 03); 02 names the other error."""
     function, _, _ = first_table(wire, ORDER)
     count = 126 if function in (0x03, 0x04) else 2001
     return await must_refuse(wire, read_of(function, 0xFFFF, count), 0x03, 0x02, may_lack=False)
 
 
-async def padding(wire: ModbusWire) -> Finding:
+async def padding(wire: DeviceConnection) -> Finding:
     """MB-049: check the bits after the last requested one."""
     function, address, count = first_table(wire, (0x01, 0x02))
     heard = await wire.ask(read_of(function, address, count))
@@ -91,7 +91,7 @@ async def padding(wire: ModbusWire) -> Finding:
     return failed(f"{short(data)} for {count} bits: the padding is not 0") if data[-1] >> count % 8 else passed()
 
 
-async def queue(wire: ModbusWire) -> Finding:
+async def queue(wire: DeviceConnection) -> Finding:
     """MB-044: read a FIFO queue at any address: byte count and count agree, at most 31."""
     _, address, _ = first_table(wire, (0x03, 0x04))
     pdu = b"\x18" + address.to_bytes(2)
@@ -114,7 +114,7 @@ async def queue(wire: ModbusWire) -> Finding:
 # -- identification (AP 6.21) ----------------------------------------------------------------------------------------
 
 
-async def _objects(wire: ModbusWire, code: int) -> tuple[dict[int, bytes], str]:
+async def _objects(wire: DeviceConnection, code: int) -> tuple[dict[int, bytes], str]:
     """Return all objects of a category, from as many frames as needed, and any error in them."""
     objects: dict[int, bytes] = {}
     at = 0
@@ -147,7 +147,7 @@ async def _objects(wire: ModbusWire, code: int) -> tuple[dict[int, bytes], str]:
     return objects, f"more follows after {MOST_FRAMES} frames"
 
 
-async def identification(wire: ModbusWire) -> Finding:
+async def identification(wire: DeviceConnection) -> Finding:
     """MB-045: the basic objects, all of them."""
     objects, wrong = await _objects(wire, 0x01)
     if wrong:
@@ -158,7 +158,7 @@ async def identification(wire: ModbusWire) -> Finding:
     return passed(", ".join(text_of(objects[n]) for n in (0, 1, 2)))
 
 
-async def regular_identification(wire: ModbusWire) -> Finding:
+async def regular_identification(wire: DeviceConnection) -> Finding:
     """MB-045: the regular objects, in as many frames as they take."""
     objects, wrong = await _objects(wire, 0x02)
     if wrong:
@@ -166,7 +166,7 @@ async def regular_identification(wire: ModbusWire) -> Finding:
     return passed(f"{len(objects)} objects") if objects else failed("no object at all")
 
 
-async def unknown_object(wire: ModbusWire) -> Finding:
+async def unknown_object(wire: DeviceConnection) -> Finding:
     """MB-045: one object that is not there."""
     first = await wire.ask(b"\x2b\x0e\x04\x00")
     if first.first is None or first.first.refusal:
@@ -182,7 +182,7 @@ async def unknown_object(wire: ModbusWire) -> Finding:
     raise Unsaid("it has objects 7F and 6F")
 
 
-async def unknown_category(wire: ModbusWire) -> Finding:
+async def unknown_category(wire: DeviceConnection) -> Finding:
     """MB-045: send an undefined read device ID code."""
     return await must_refuse(wire, b"\x2b\x0e\x07\x00", 0x03)
 
@@ -195,7 +195,7 @@ def text_of(raw: bytes) -> str:
 # -- diagnostics (AP 6.8) ---------------------------------------------------------------------------------------------
 
 
-async def counters(wire: ModbusWire) -> Finding:
+async def counters(wire: DeviceConnection) -> Finding:
     """MB-047: the counter of requests increases by the number of requests sent."""
     before = await _counter(wire, 0x0E)
     for _ in range(3):
@@ -207,7 +207,7 @@ async def counters(wire: ModbusWire) -> Finding:
     return failed(f"counted {counted} requests instead of 4")
 
 
-async def _counter(wire: ModbusWire, which: int) -> int:
+async def _counter(wire: DeviceConnection, which: int) -> int:
     heard = await wire.ask(bytes((0x08, 0x00, which, 0x00, 0x00)))
     answer = heard.first
     if answer is None or answer.refusal or len(answer.pdu) != 5:
@@ -215,7 +215,7 @@ async def _counter(wire: ModbusWire, which: int) -> int:
     return int.from_bytes(answer.pdu[3:5])
 
 
-async def listen_only(wire: ModbusWire) -> Finding:
+async def listen_only(wire: DeviceConnection) -> Finding:
     """MB-046: switch to listen only mode, until a restart."""
     echo = await wire.ask(b"\x08\x00\x00\x5a\x5a")
     if echo.first is None or echo.first.refusal:

@@ -10,9 +10,9 @@ from fieldtwin.commissioning.access.connection import bytes_at
 from fieldtwin.conformance.devices.checked import Checked, shown
 from fieldtwin.conformance.devices.device_case import DeviceResult
 from fieldtwin.conformance.devices.modbus.cases import CASES
-from fieldtwin.conformance.devices.modbus.connection import ModbusWire
+from fieldtwin.conformance.devices.modbus.connection import DeviceConnection
 from fieldtwin.conformance.devices.modbus.learn import learn
-from fieldtwin.conformance.devices.run import Plan, Transcript, play
+from fieldtwin.conformance.devices.run import DeviceTestOptions, Transcript, play
 from fieldtwin.gateway.core.clock import NS_PER_S, Clock
 from fieldtwin.gateway.core.connection import ByteConnection, Connector, Tap
 from fieldtwin.gateway.core.endpoint import Endpoint
@@ -43,7 +43,7 @@ class ModbusOptions:
 
     endpoint: str
     unit: int
-    plan: Plan
+    plan: DeviceTestOptions
     timeout_s: float = 1.0
     spacing_s: float = 0.05
     echo: bool = False
@@ -84,7 +84,7 @@ async def check_modbus(
                 bytes_at(options.endpoint, taps=taps, connector=options.connector, clock=clock)
             )
 
-        wire = ModbusWire(
+        wire = DeviceConnection(
             open_wire, clock, framing_of(endpoint), options.unit, traits=traits_of(endpoint), timeout_s=options.timeout_s,
             spacing_s=options.spacing_s, char_s=endpoint.serial.char_time_s if endpoint.is_serial else 0.0, echo=options.echo,
         )  # fmt: skip
@@ -107,7 +107,7 @@ async def check_modbus(
     return Checked(identity, results, before, (clock.monotonic_ns() - began_ns) / NS_PER_S)
 
 
-async def read_identity(wire: ModbusWire) -> dict[str, str]:
+async def read_identity(wire: DeviceConnection) -> dict[str, str]:
     """Return the device's identification by FC 43/14 and FC 17; empty if it gives none."""
     identity: dict[str, str] = {}
     for code in (0x01, 0x02):

@@ -8,16 +8,16 @@ from __future__ import annotations
 from fieldtwin.conformance.core.case import Finding, failed, passed
 from fieldtwin.conformance.devices.device_case import NotHere
 from fieldtwin.conformance.devices.modbus.checks import answers_good, named
-from fieldtwin.conformance.devices.modbus.connection import GATEWAY_SAYS_NO, ModbusWire
+from fieldtwin.conformance.devices.modbus.connection import GATEWAY_SAYS_NO, DeviceConnection
 from fieldtwin.conformance.devices.modbus.frames import Answer, mbap
 from fieldtwin.gateway.core.errors import Unreachable
 
 
-def _adu(wire: ModbusWire, transaction: int, protocol: int = 0, length: int | None = None) -> bytes:
+def _adu(wire: DeviceConnection, transaction: int, protocol: int = 0, length: int | None = None) -> bytes:
     return mbap(bytes((wire.unit,)) + wire.good, transaction, protocol, length)
 
 
-async def byte_by_byte(wire: ModbusWire) -> Finding:
+async def byte_by_byte(wire: DeviceConnection) -> Finding:
     """MB-051: a segment a byte."""
     frame = wire.frame(wire.good)
     for at in range(len(frame)):
@@ -27,7 +27,7 @@ async def byte_by_byte(wire: ModbusWire) -> Finding:
     return passed() if answers_good(wire, heard, 1) else failed(f"{heard} instead of an answer")
 
 
-async def several_at_once(wire: ModbusWire) -> Finding:
+async def several_at_once(wire: DeviceConnection) -> Finding:
     """MB-052: three ADUs in one segment: each is answered or refused with 06, in order."""
     numbers = [wire.next_transaction() for _ in range(3)]
     await wire.say(b"".join(_adu(wire, n) for n in numbers), wire.good)
@@ -42,7 +42,7 @@ async def several_at_once(wire: ModbusWire) -> Finding:
     return failed(f"{len(got)} answers to 3 requests")
 
 
-async def more_than_allowed(wire: ModbusWire) -> Finding:
+async def more_than_allowed(wire: DeviceConnection) -> Finding:
     """MB-053: send 40 requests at once: each is answered, or refused with 06."""
     numbers = [wire.next_transaction() for _ in range(40)]
     await wire.say(b"".join(_adu(wire, n) for n in numbers), wire.good)
@@ -60,7 +60,7 @@ async def more_than_allowed(wire: ModbusWire) -> Finding:
     return passed(f"{40 - len(busy)} answered, {len(busy)} refused with 06")
 
 
-async def other_protocol(wire: ModbusWire) -> Finding:
+async def other_protocol(wire: DeviceConnection) -> Finding:
     """MB-054: an ADU with protocol id 1, then a good one."""
     odd, ours = wire.next_transaction(), wire.next_transaction()
     await wire.say(_adu(wire, odd, protocol=1), wire.good)
@@ -71,7 +71,7 @@ async def other_protocol(wire: ModbusWire) -> Finding:
     return passed() if answers_good(wire, heard, 1) else failed(f"{heard} instead of an answer to the good one")
 
 
-async def _wrong_length(wire: ModbusWire, adu: bytes) -> Finding:
+async def _wrong_length(wire: DeviceConnection, adu: bytes) -> Finding:
     """Send an invalid ADU: it is discarded, or the connection is closed. A new connection has to be served in any case."""
     await wire.say(adu, wire.good)
     heard = await wire.hear()
@@ -87,7 +87,7 @@ async def _wrong_length(wire: ModbusWire, adu: bytes) -> Finding:
     return failed(f"keeps the connection, but the request afterwards: {after}")
 
 
-async def _served_anew(wire: ModbusWire, why: str) -> Finding:
+async def _served_anew(wire: DeviceConnection, why: str) -> Finding:
     try:
         await wire.reopen()
         after = await wire.still_good()
@@ -96,22 +96,22 @@ async def _served_anew(wire: ModbusWire, why: str) -> Finding:
     return failed(f"{why}; on a new connection: {after}") if after else passed(f"{why}, and serves the next connection")
 
 
-async def length_zero(wire: ModbusWire) -> Finding:
+async def length_zero(wire: DeviceConnection) -> Finding:
     """MB-055: send length 0 and no further bytes."""
     return await _wrong_length(wire, wire.next_transaction().to_bytes(2) + b"\0\0\0\0")
 
 
-async def length_one(wire: ModbusWire) -> Finding:
+async def length_one(wire: DeviceConnection) -> Finding:
     """MB-055: length 1, the unit id alone."""
     return await _wrong_length(wire, wire.next_transaction().to_bytes(2) + b"\0\0\0\x01" + bytes((wire.unit,)))
 
 
-async def length_ffff(wire: ModbusWire) -> Finding:
+async def length_ffff(wire: DeviceConnection) -> Finding:
     """MB-055: send length FFFFh, followed by an ordinary request."""
     return await _wrong_length(wire, _adu(wire, wire.next_transaction(), length=0xFFFF))
 
 
-async def transaction_zero(wire: ModbusWire) -> Finding:
+async def transaction_zero(wire: DeviceConnection) -> Finding:
     """MB-056: transaction id 0 is echoed."""
     await wire.say(_adu(wire, 0), wire.good)
     heard = await wire.hear()
@@ -119,7 +119,7 @@ async def transaction_zero(wire: ModbusWire) -> Finding:
     return passed() if good else failed(f"{_told(heard.first)} instead of an answer with id 0")
 
 
-async def transaction_twice(wire: ModbusWire) -> Finding:
+async def transaction_twice(wire: DeviceConnection) -> Finding:
     """MB-056: two requests with one id, one after the other's answer."""
     number = wire.next_transaction()
     for _ in range(2):
@@ -134,7 +134,7 @@ def _told(answer: Answer | None) -> str:
     return "silence" if answer is None else f"{answer} with id {answer.transaction}"
 
 
-async def _as_itself(wire: ModbusWire, unit: int) -> Finding:
+async def _as_itself(wire: DeviceConnection, unit: int) -> Finding:
     """A direct device answers to `unit`, and echoes it (TG 4.4.1.2)."""
     if wire.unit == unit:
         raise NotHere(f"all other test cases use unit {unit}")
@@ -150,17 +150,17 @@ async def _as_itself(wire: ModbusWire, unit: int) -> Finding:
     return passed() if same else failed(f"{answer} instead of the answer of unit {wire.unit}")
 
 
-async def unit_255(wire: ModbusWire) -> Finding:
+async def unit_255(wire: DeviceConnection) -> Finding:
     """MB-057: unit 255."""
     return await _as_itself(wire, 255)
 
 
-async def unit_0(wire: ModbusWire) -> Finding:
+async def unit_0(wire: DeviceConnection) -> Finding:
     """MB-057: unit 0."""
     return await _as_itself(wire, 0)
 
 
-async def half_and_gone(wire: ModbusWire) -> Finding:
+async def half_and_gone(wire: DeviceConnection) -> Finding:
     """MB-064: send half a request and disconnect; the next client is served."""
     frame = wire.frame(wire.good)
     await wire.say(frame[: len(frame) // 2], wire.good)
@@ -168,7 +168,7 @@ async def half_and_gone(wire: ModbusWire) -> Finding:
     return await _served_anew(wire, "left in the middle of a request")
 
 
-async def many_connections(wire: ModbusWire) -> Finding:
+async def many_connections(wire: DeviceConnection) -> Finding:
     """MB-065: open 20 idle connections: one more is still served."""
     held = []
     try:

@@ -9,14 +9,14 @@ from __future__ import annotations
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
-from fieldtwin.conformance.core.case import Danger, Finding, failed, passed
+from fieldtwin.conformance.core.case import Finding, Impact, failed, passed
 from fieldtwin.conformance.devices.device_case import NotHere, Unsaid
 from fieldtwin.conformance.devices.modbus.checks import must_refuse, named, refused
-from fieldtwin.conformance.devices.modbus.connection import ModbusWire
+from fieldtwin.conformance.devices.modbus.connection import DeviceConnection
 from fieldtwin.conformance.devices.modbus.learn import FUNCTION, read_of, values_of
 
 
-async def _read(wire: ModbusWire, table: str, address: int, count: int = 1) -> bytes:
+async def _read(wire: DeviceConnection, table: str, address: int, count: int = 1) -> bytes:
     heard = await wire.ask(read_of(FUNCTION[table], address, count))
     data = values_of(heard.first, FUNCTION[table], count)
     if data is None:
@@ -32,7 +32,7 @@ def _write(table: str, address: int, data: bytes) -> bytes:
 
 
 @asynccontextmanager
-async def _borrowed(wire: ModbusWire, table: str) -> AsyncIterator[tuple[int, bytes]]:
+async def _borrowed(wire: DeviceConnection, table: str) -> AsyncIterator[tuple[int, bytes]]:
     """Yield the cell that may be written and its value, and restore it. Raises `Unsaid` where that failed."""
     if table not in wire.may_write:
         raise NotHere(f"no address to write was given: --write {table}:ADDRESS")
@@ -42,14 +42,14 @@ async def _borrowed(wire: ModbusWire, table: str) -> AsyncIterator[tuple[int, by
         yield address, before
     finally:
         if await _read(wire, table, address) != before:
-            wire.danger = max(wire.danger, Danger.WRITE, key=lambda d: d.rank)
+            wire.danger = max(wire.danger, Impact.WRITE, key=lambda d: d.rank)
             await wire.ask(_write(table, address, before))
             now = await _read(wire, table, address)
             if now != before:
                 raise Unsaid(f"{table} {address} could not be restored: {now.hex()} instead of {before.hex()}")
 
 
-async def _unchanged(wire: ModbusWire, table: str, address: int, before: bytes, finding: Finding) -> Finding:
+async def _unchanged(wire: DeviceConnection, table: str, address: int, before: bytes, finding: Finding) -> Finding:
     """Return the finding, or a worse one if the cell changed."""
     now = await _read(wire, table, address)
     if now != before:
@@ -63,13 +63,13 @@ def _other(before: bytes) -> bytes:
     return before[:1] + bytes((before[1] ^ 1,))
 
 
-async def write_none(wire: ModbusWire) -> Finding:
+async def write_none(wire: DeviceConnection) -> Finding:
     """MB-036: FC 16 with count 0."""
     async with _borrowed(wire, "holding") as (address, _):
         return await must_refuse(wire, b"\x10" + address.to_bytes(2) + b"\0\0\0", 0x03)
 
 
-async def _odd_coil(wire: ModbusWire, value: bytes) -> Finding:
+async def _odd_coil(wire: DeviceConnection, value: bytes) -> Finding:
     async with _borrowed(wire, "coil") as (address, before):
         on = bool(before[0] & 1)
         # the tested value must differ from the current state: FF01 on a coil that is off, 0001 likewise
@@ -81,55 +81,55 @@ async def _odd_coil(wire: ModbusWire, value: bytes) -> Finding:
         return await _unchanged(wire, "coil", address, b"\0", finding)
 
 
-async def coil_0001(wire: ModbusWire) -> Finding:
+async def coil_0001(wire: DeviceConnection) -> Finding:
     """MB-039: FC 05 with value 0001h."""
     return await _odd_coil(wire, b"\x00\x01")
 
 
-async def coil_ff01(wire: ModbusWire) -> Finding:
+async def coil_ff01(wire: DeviceConnection) -> Finding:
     """MB-039: FC 05 with value FF01h."""
     return await _odd_coil(wire, b"\xff\x01")
 
 
-async def registers_mismatch(wire: ModbusWire) -> Finding:
+async def registers_mismatch(wire: DeviceConnection) -> Finding:
     """MB-040: FC 16, one register, byte count 4."""
     async with _borrowed(wire, "holding") as (address, before):
         pdu = b"\x10" + address.to_bytes(2) + b"\0\x01\x04" + _other(before) + b"\0\0"
         return await _unchanged(wire, "holding", address, before, await must_refuse(wire, pdu, 0x03))
 
 
-async def _length_mismatch(wire: ModbusWire, byte_count: int, more: bytes) -> Finding:
+async def _length_mismatch(wire: DeviceConnection, byte_count: int, more: bytes) -> Finding:
     """Send FC 16 of one register with a byte count that contradicts the length of the request (AP 7, exception 03)."""
     async with _borrowed(wire, "holding") as (address, before):
         pdu = b"\x10" + address.to_bytes(2) + bytes((0, 1, byte_count)) + _other(before) + more
         return await _unchanged(wire, "holding", address, before, await must_refuse(wire, pdu, 0x03))
 
 
-async def count_below_length(wire: ModbusWire) -> Finding:
+async def count_below_length(wire: DeviceConnection) -> Finding:
     """MB-040: FC 16, one register, byte count 2, four bytes of data."""
     return await _length_mismatch(wire, 2, b"\0\0")
 
 
-async def count_above_length(wire: ModbusWire) -> Finding:
+async def count_above_length(wire: DeviceConnection) -> Finding:
     """MB-040: FC 16, one register, byte count 4, two bytes of data."""
     return await _length_mismatch(wire, 4, b"")
 
 
-async def count_of_none(wire: ModbusWire) -> Finding:
+async def count_of_none(wire: DeviceConnection) -> Finding:
     """MB-040: FC 16, no register, byte count 0, two bytes of data, as libmodbus's unit-test-client sends it."""
     async with _borrowed(wire, "holding") as (address, before):
         pdu = b"\x10" + address.to_bytes(2) + b"\0\0\0" + _other(before)
         return await _unchanged(wire, "holding", address, before, await must_refuse(wire, pdu, 0x03))
 
 
-async def coils_mismatch(wire: ModbusWire) -> Finding:
+async def coils_mismatch(wire: DeviceConnection) -> Finding:
     """MB-040: FC 15, one coil, byte count 2."""
     async with _borrowed(wire, "coil") as (address, before):
         pdu = b"\x0f" + address.to_bytes(2) + b"\0\x01\x02" + bytes(((before[0] & 1) ^ 1, 0))
         return await _unchanged(wire, "coil", address, before, await must_refuse(wire, pdu, 0x03))
 
 
-async def partly_outside(wire: ModbusWire) -> Finding:
+async def partly_outside(wire: DeviceConnection) -> Finding:
     """MB-041: send FC 16 that ends one register after the map."""
     if "holding" not in wire.may_write:
         raise NotHere("no address to write was given: --write holding:ADDRESS+COUNT")
@@ -146,7 +146,7 @@ async def partly_outside(wire: ModbusWire) -> Finding:
         return await _unchanged(wire, "holding", address, before, await must_refuse(wire, pdu, 0x02))
 
 
-async def write_before_read(wire: ModbusWire) -> Finding:
+async def write_before_read(wire: DeviceConnection) -> Finding:
     """MB-042: send FC 23 that reads the register that it writes."""
     async with _borrowed(wire, "holding") as (address, before):
         at, new = address.to_bytes(2), _other(before)
@@ -163,7 +163,7 @@ async def write_before_read(wire: ModbusWire) -> Finding:
         return failed(f"answers {answer} where {new.hex().upper()} was written")
 
 
-async def refused_as_a_whole(wire: ModbusWire) -> Finding:
+async def refused_as_a_whole(wire: DeviceConnection) -> Finding:
     """MB-042: send FC 23 that reads 126 registers: nothing is written."""
     async with _borrowed(wire, "holding") as (address, before):
         at = address.to_bytes(2)
@@ -171,7 +171,7 @@ async def refused_as_a_whole(wire: ModbusWire) -> Finding:
         return await _unchanged(wire, "holding", address, before, await must_refuse(wire, pdu, 0x03))
 
 
-async def mask(wire: ModbusWire) -> Finding:
+async def mask(wire: DeviceConnection) -> Finding:
     """MB-043: AP's own example: 12h, and F2h, or 25h, is 17h."""
     async with _borrowed(wire, "holding") as (address, _):
         at = address.to_bytes(2)
@@ -193,7 +193,7 @@ async def mask(wire: ModbusWire) -> Finding:
         return passed() if now == b"\x00\x17" else failed(f"register {address} is {now.hex().upper()} instead of 0017")
 
 
-async def broadcast_write(wire: ModbusWire) -> Finding:
+async def broadcast_write(wire: DeviceConnection) -> Finding:
     """MB-026: FC 06 to unit 0: done, and not answered."""
     async with _borrowed(wire, "holding") as (address, before):
         new = _other(before)

@@ -41,7 +41,7 @@ class CollisionOutcome:
 
 @dataclass(frozen=True, slots=True)
 class FailedAttempt:
-    """An error frame. `kind` as in `WireFault`; the first flag begins at bit `flag_at`, and the attempt takes `bits` of
+    """An error frame. `kind` as in `ErrorFrame`; the first flag begins at bit `flag_at`, and the attempt takes `bits` of
     the bus.
 
     `first` are receivers that objected before all others. Their counters rise by more.

@@ -421,7 +421,8 @@ def test_a_killed_recorder_loses_the_last_record_at_most(tmp_path: Path) -> None
         "head = encode_header(RecordingHeader(version=1, device='a/b', kind='exchanges', source='measured'))\n"
         "file = RotatingFile(Path(sys.argv[1]), head, max_bytes=20_000)\n"
         "for n in range(10**9):\n"
-        "    file.line(n / 1000, encode_exchange(RecordedExchange(n / 1000, 1, b'\\x03' + n.to_bytes(4, 'big'), b'\\x83\\x02')))\n"
+        "    exchange = RecordedExchange(n / 1000, 1, b'\\x03' + n.to_bytes(4, 'big'), b'\\x83\\x02')\n"
+        "    file.line(n / 1000, encode_exchange(exchange))\n"
         "    sys.stdout.buffer.write(n.to_bytes(4, 'big')); sys.stdout.buffer.flush()\n"
     )
     out = tmp_path / "r.jsonl"

@@ -63,7 +63,7 @@ def test_facts_are_those_of_the_file():
         "every 500 ms, 1 s", "TPDO1 every 100 ms", "every 200 ms, 2 s",
     ]  # fmt: skip
     assert line.stations[0].writable == ("sample_period_s",)
-    assert lan.stations[0].far == "far end: 400 byte/s, 200 ms, 5 % lost"
+    assert lan.stations[0].far == "topside end: 400 byte/s, 200 ms, 5 % lost"
     assert observatory.servers[0].endpoint == "tcp://127.0.0.1:0"  # a prototype takes a free port
 
 

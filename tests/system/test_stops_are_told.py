@@ -52,7 +52,7 @@ def test_a_run_whose_plc_stopped_and_began_again_is_not_ok(tmp_path: Path) -> No
     (tmp_path / "once.py").write_text(PROGRAM)
     done = run_to_end(tmp_path, "run", str(tmp_path / "shed.yaml"), "--prototype", "--for", "4s")
     assert done.process.returncode == 1, done.out + done.err
-    assert "PLC: stopped by itself once, and restarted after that; the last time: program once" in done.out
+    assert "PLC: stopped without a request once, and restarted after that; the last time: program once" in done.out
 
 
 def test_a_run_whose_gateway_died_does_not_claim_to_know_its_outputs(tmp_path: Path) -> None:
@@ -62,4 +62,4 @@ def test_a_run_whose_gateway_died_does_not_claim_to_know_its_outputs(tmp_path: P
         os.kill(run.pid_of("observatory", "gateway"), signal.SIGKILL)
         run.wait(30)
     assert run.process.returncode == 1
-    assert "what its outputs hold is not known" in run.out
+    assert "its published values and outputs are not known" in run.out

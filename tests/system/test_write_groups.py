@@ -86,10 +86,10 @@ def test_without_a_group_the_drive_is_started_with_its_old_speed_and_the_run_is_
 @pytest.mark.parametrize(
     ("groups", "told"),
     [
-        ("{drive: [speed, pressure]}", "'pressure' is no output of a program"),
+        ("{drive: [speed, pressure]}", "'pressure' is not an output of a program"),
         ("{drive: [speed, rnu]}", "did you mean 'run'"),
-        ("{a: [speed, run], b: [run, speed]}", "is in the group 'a' already"),
-        ("{a: [speed, speed]}", "is in the group 'a' already"),
+        ("{a: [speed, run], b: [run, speed]}", "is already in the group 'a'"),
+        ("{a: [speed, speed]}", "is already in the group 'a'"),
         ("{drive: [speed]}", "at least 2"),
     ],
 )

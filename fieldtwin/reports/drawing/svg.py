@@ -65,7 +65,7 @@ def document(title: str, width: float, height: float, *parts: Child) -> str:
         cls="wires", viewBox=f"0 0 {width:.0f} {height:.0f}", width=f"{width:.0f}", height=f"{height:.0f}",
         role="img", xmlns="http://www.w3.org/2000/svg",
     )  # fmt: skip
-    return whole.replace("/><", "/>\n<").replace("</text><", "</text>\n<") + "\n"
+    return str(whole).replace("/><", "/>\n<").replace("</text><", "</text>\n<") + "\n"
 
 
 def _text(x: float, y: float, words: str, cls: str = "", most: int = LONGEST) -> Markup:

@@ -153,7 +153,7 @@ class TestVcan:
             for opener in (SocketCanConnection.open, open_can_end):
                 with pytest.raises(Unreachable, match=r"can:socketcan/nosuch0.*no interface"):
                     await opener(Endpoint.parse("can:socketcan/nosuch0"), 125_000)
-                with pytest.raises(Unreachable, match="no CAN interface"):
+                with pytest.raises(Unreachable, match="not a CAN interface"):
                     await opener(Endpoint.parse("can:socketcan/lo"), 125_000)
                 ip("link", "set", "vcan1", "down")
                 try:

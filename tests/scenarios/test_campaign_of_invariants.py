@@ -234,7 +234,7 @@ def test_rate_kinds_and_aims_are_observed(folder: Path) -> None:
         (RandomFaults(aims=("sensr",)), "did you mean 'sensor'"),
         (RandomFaults(aims=("sensor.levl",)), "did you mean 'sensor.level'"),
         (RandomFaults(kinds=("bus-off",)), "none of these faults fits"),
-        (RandomFaults(kinds=("set",)), "cannot be chosen by chance"),
+        (RandomFaults(kinds=("set",)), "cannot be chosen at random"),
         (RandomFaults(mean_s=0.0), "the time between two random faults"),
     ],
 )

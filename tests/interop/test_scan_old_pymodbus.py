@@ -47,7 +47,7 @@ def test_a_scan_finds_the_two_units_and_reports_the_other_answers_once(tmp_path:
     found, said, code = run(main(), timeout_s=120)
     assert code == 0
     assert [line.split()[:2] for line in found.splitlines()[1:]] == [["5", "answers"], ["9", "answers"]]
-    odd = [line for line in said.splitlines() if "does not fit" in line]
+    odd = [line for line in said.splitlines() if "does not match" in line]
     assert len(odd) == 1
     assert "units (0-4, 6-8, 10-247, 255): a reply that does not match the request (80 0B): exception 0B" in odd[0]
     assert "two devices" not in said

@@ -109,7 +109,7 @@ def test_a_controller_that_ends_is_an_error(site: Path) -> None:
     code, (result,), told = judged(site, *words)
     assert code == 1
     assert result["verdict"] == "error"
-    assert "the controller ended by itself with exit status 3" in result["reason"]
+    assert "the controller ended early with exit status 3" in result["reason"]
     assert "gone" in told
 
 

@@ -10,14 +10,14 @@ from xml.etree import ElementTree
 import pytest
 from click.testing import CliRunner
 
+from fieldtwin.acoustic import map as water
+from fieldtwin.acoustic.network import load_network
 from fieldtwin.cli.main import cli
-from fieldtwin.reports.drawing import network as water
 from fieldtwin.reports.drawing.svg import ROOM, svg
 from fieldtwin.reports.drawing.tree import tree
 from fieldtwin.reports.drawing.wiring import Wiring, wiring
-from fieldtwin.twin.network.network import load_network
 from fieldtwin.twin.prototype.file import load_prototype
-from fieldtwin.twin.site.data_files import network_file
+from fieldtwin.twin.site.groups import group_file
 from fieldtwin.twin.site.system import load_system
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -134,8 +134,8 @@ PICTURES = sorted((ROOT / "docs" / "wires").glob("*.svg"))
 @pytest.mark.parametrize("picture", PICTURES, ids=lambda path: path.stem)
 def test_a_picture_of_the_book_is_of_today_and_on_its_page(picture: Path):
     command = f"fieldtwin draw {picture.stem} --prototype -o docs/wires/{picture.name}"
-    network = network_file(picture.stem)
-    today = water.svg(water.network_map(load_network(network))) if network else svg(of(picture.stem))
+    network = group_file(picture.stem)
+    today = water.svg(water.network_map(load_network(network[1]))) if network else svg(of(picture.stem))
     assert picture.read_text("utf-8") == today, command
     assert any(f"(wires/{picture.name})" in page.read_text("utf-8") for page in (ROOT / "docs").glob("*.md"))
 

@@ -18,6 +18,7 @@ from typing import Any
 
 import yaml
 
+from fieldtwin.acoustic.network import load_network
 from fieldtwin.capture.decoding.trace_file import read_events
 from fieldtwin.capture.formats.can_files import read_can_file
 from fieldtwin.capture.formats.candump import LeftOut, read_log
@@ -38,9 +39,8 @@ from fieldtwin.run.shadow.rules import load_planner
 from fieldtwin.run.what_if.plan import load_plans
 from fieldtwin.run.what_if.state import read_state
 from fieldtwin.scenarios.language.form import load_scenario
-from fieldtwin.twin.network.network import load_network
 from fieldtwin.twin.prototype.file import load_prototype
-from fieldtwin.twin.site.data_files import network_file
+from fieldtwin.twin.site.groups import group_file
 from fieldtwin.twin.site.system import load_system
 from fieldtwin.twin.template.package import open_package
 
@@ -91,7 +91,7 @@ YAML_READERS: dict[str, tuple[Reader, str]] = {
     "waivers": (lambda p: load_waivers(p, ["MB-001"]), ""),
 }
 OTHER_READERS: dict[str, Reader] = {
-    "network or system": network_file,
+    "network or system": group_file,
     "EDS of the gateway": load_dictionary,
     "EDS of the emulator": load_eds,
     "Structured Text or PLCopen XML": load_file,

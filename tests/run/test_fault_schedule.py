@@ -11,16 +11,19 @@ from fieldtwin.emulators.faults.schema import parse_fault
 from fieldtwin.gateway.core.files.yaml_file import parse
 from fieldtwin.run.campaigns.shrink import as_scenario, smallest
 from fieldtwin.run.virtual.fault_schedule import CALM_S, MOST, UNSEEN_ON_TCP, random_schedule
+from fieldtwin.twin.prototype.file import load_prototype
+from fieldtwin.twin.prototype.group import one_system
 from fieldtwin.twin.site.system import load_system
 
 SYSTEM = load_system("observatory", [])
+GROUP = one_system(SYSTEM, load_prototype(SYSTEM))
 
 
 @given(st.integers(0, 10_000), st.floats(10.0, 100_000.0))
 @settings(max_examples=60, deadline=None)
 def test_a_seed_chooses_possible_faults_and_none_at_the_end(seed: int, duration_s: float) -> None:
-    faults = random_schedule(SYSTEM, seed, duration_s)
-    assert faults == random_schedule(SYSTEM, seed, duration_s)
+    faults = random_schedule(GROUP, seed, duration_s)
+    assert faults == random_schedule(GROUP, seed, duration_s)
     assert len(faults) <= MOST
     for number, said in enumerate(faults, 1):
         spec = parse_fault(dict(said), number=number)

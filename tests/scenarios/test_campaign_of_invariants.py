@@ -22,6 +22,8 @@ from fieldtwin.run.campaigns.confirming import CONFIRMED
 from fieldtwin.run.targets.virtual_scenario import run_virtual
 from fieldtwin.run.virtual.fault_schedule import RandomFaults, random_schedule
 from fieldtwin.scenarios.language.form import load_scenario
+from fieldtwin.twin.prototype.file import load_prototype
+from fieldtwin.twin.prototype.group import one_system
 from fieldtwin.twin.site.system import load_system
 
 pytestmark = [pytest.mark.long, pytest.mark.timeout(300)]
@@ -215,15 +217,16 @@ def test_a_rule_without_a_verdict_of_any_seed_and_faults_without_effect_are_inco
 
 def test_rate_kinds_and_aims_are_observed(folder: Path) -> None:
     system = load_system(str(folder / "plant.yaml"), [])
+    group = one_system(system, load_prototype(system))
     wanted = RandomFaults(30.0, ("silence", "exception", "stuck"), ("line", "sensor.level"))
-    found = [fault for seed in range(20) for fault in random_schedule(system, seed, 1200.0, wanted)]
+    found = [fault for seed in range(20) for fault in random_schedule(group, seed, 1200.0, wanted)]
     assert {fault["name"] for fault in found} == {"silence", "exception", "stuck"}
     assert {(fault["device"], fault.get("register")) for fault in found if fault["device"] == "sensor"} == {
         ("sensor", "level")
     }
     assert {fault["device"] for fault in found} == {"sensor", "station"}
     assert 20 * 1080 / 30 * 0.8 < len(found) < 20 * 1080 / 30 * 1.2
-    every = {fault["name"] for seed in range(200) for fault in random_schedule(system, seed, 3600.0)}
+    every = {fault["name"] for seed in range(200) for fault in random_schedule(group, seed, 3600.0)}
     assert not every & {"stuck", "nan", "drift", "set", "corrupt-bits"}
 
 

@@ -12,8 +12,7 @@ import os
 from collections.abc import Iterable
 from pathlib import Path
 
-from fieldtwin.gateway.core.errors import FileInvalid, UsageError
-from fieldtwin.gateway.core.files.input_file import read_input
+from fieldtwin.gateway.core.errors import UsageError
 
 MAX_BYTES = 8 * 1024 * 1024
 _HERE = Path(__file__).absolute().parents[3].resolve()  # not resolved at once: in a checkout fieldtwin/twin is a link
@@ -79,21 +78,6 @@ def find(kind: str, name: str, beside: Path | None = None, extra: Iterable[Path]
         expected="a file, or one of " + ", ".join(known),
         hint=f"did you mean {near[0]!r}?" if near else "",
     )
-
-
-def network_file(name: str, profiles: Iterable[Path] = ()) -> Path | None:
-    """Return the file that `name` refers to if it is a network file; None otherwise, also if it does not exist."""
-    try:
-        path = find("systems", name, extra=profiles)
-    except UsageError:
-        return None
-    if path.suffix not in (".yaml", ".yml"):
-        return None
-    try:
-        lines = read_input(path, MAX_BYTES).decode("utf-8").splitlines()
-    except (OSError, UnicodeDecodeError, FileInvalid):
-        return None
-    return path if any(line.startswith("network:") for line in lines) else None
 
 
 def find_recording(name: str, beside: Path | None = None) -> Path:

@@ -20,6 +20,7 @@ from fieldtwin.gateway.core.files.yaml_file import Key, YamlFile, load, validate
 from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig, Heartbeat, Tpdo
 from fieldtwin.twin.site.canopen_keys import canopen_bus, canopen_node, check_rpdo1
 from fieldtwin.twin.site.data_files import find
+from fieldtwin.twin.site.groups import kind_of
 from fieldtwin.twin.site.modbus_keys import connect_pauses, device_pace, modbus_bus
 from fieldtwin.twin.site.read_back_warnings import never_read_back
 from fieldtwin.twin.site.schema import BusForm, CommandsForm, DeviceForm, InvariantsForm, PlcForm, SystemForm
@@ -60,11 +61,11 @@ def load_system(name: str, profiles: Iterable[Path] = ()) -> System:
     """Read a system by path or bare name. Raises `FileInvalid` or `UsageError`."""
     path = find("systems", name, extra=profiles)
     file = load(path)
-    if "network" in file.data and "system" not in file.data:
+    if kind := kind_of(file.data):
         systems = file.data.get("systems")
         named = ", ".join(map(str, systems)) if isinstance(systems, dict) else ""
-        hint = "run --prototype and test take networks" + (f"; its systems are {named}" if named else "")
-        raise file.error(("network",), "a network, not a system", expected="a system file", hint=hint)
+        hint = f"run --prototype, simulate and test take a {kind}" + (f"; its systems are {named}" if named else "")
+        raise file.error((kind,), f"a {kind}, not a system", expected="a system file", hint=hint)
     form = validate(file, SystemForm)
     buses = {n: _bus(file, n, b) for n, b in form.buses.items()}
     known: dict[Path, DeviceProfile] = {}  # so that a profile used by a hundred devices is read once

@@ -10,13 +10,12 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from fieldtwin.cli.campaign_options import Choice, fault_choice
 from fieldtwin.cli.options import Duration, Secret, json_option, pairs, profiles_option
-from fieldtwin.cli.run.network_request import NetworkRequest
 from fieldtwin.cli.template_question import consent, trust_option
 from fieldtwin.gateway.core.errors import FieldtwinError, UsageError
 from fieldtwin.run.live.options import RunOptions
@@ -26,11 +25,11 @@ from fieldtwin.run.template import system_file
 from fieldtwin.service.attached import Service, ServiceOptions, check
 from fieldtwin.service.journal import Format
 from fieldtwin.service.notify import Notifier
-from fieldtwin.twin.site.data_files import network_file
+from fieldtwin.twin.site.groups import group_file
 
 if TYPE_CHECKING:
-    from fieldtwin.run.virtual.fault_schedule import RandomFaults
     from fieldtwin.run.virtual.run import VirtualOptions
+    from fieldtwin.twin.prototype.group import SystemGroup
 
 NEITHER = """run needs --plant or --prototype; there is no default.
   --prototype   emulate the field devices as defined in NAME.prototype.yaml; no real device is touched
@@ -193,22 +192,37 @@ def command(
     if prototype == plant:
         raise UsageError(NEITHER if not plant else "--plant and --prototype exclude each other")
     random_faults = choice.of(faults)
-    network = network_file(system, [Path(p) for p in profiles])
-    if network is not None:
+    if group_file(system, [Path(p) for p in profiles]) is not None:
         others = {
             "--field": field_host, "--recording": recordings, "--speed": speed, "--listen": listen, "--can": can,
             "--capture": capture, "--compare": compare, "--thread-store": thread_store, "--metrics": metrics, "--log": log,
             "--prototype-file": prototype_file,
         }  # fmt: skip
-        return _run_network(
-            NetworkRequest(
-                network, virtual, duration_s, seed, instance, profiles,
-                parse_periods(commands) if commands is not None else None, trace, cold, as_json, thread,
-                faults, seeds, jobs, ledger, trust, random_faults,
-            ),
-            plant,
-            [option for option, said in others.items() if said],
+        said = [option for option, value in others.items() if value]
+        group = _group(system, profiles, trust=trust, plant=plant, virtual=virtual, others=said)
+        periods = parse_periods(commands) if commands is not None else None
+        from fieldtwin.emulators.faults.schema import load_faults  # here and below: a plant has no emulators installed
+        from fieldtwin.run.virtual.group_kinds import LiveRequest, kind_named
+        from fieldtwin.run.virtual.run import VirtualOptions
+
+        chosen = load_faults(Path(faults), group.check_fault) if faults not in ("", "random") else ()
+        folders = tuple(Path(p) for p in profiles)
+        if not virtual:
+            if seed is not None or trace:
+                raise UsageError("--seed and --trace need --virtual")
+            if seeds or faults == "random":
+                raise UsageError("--seeds and random faults need --virtual")
+            live = LiveRequest(group, duration_s, instance, folders, periods, chosen, thread, cold)
+            return kind_named(group.kind).run_live(live, as_json=as_json)
+        if duration_s <= 0:
+            raise UsageError("--virtual needs an end time", expected="--for 24h")
+        if thread:
+            raise UsageError("--thread needs a run in real time", hint="without --virtual")
+        simulated = VirtualOptions(
+            str(group.path), duration_s, seed, folders,
+            commands=periods, faults=chosen, random_faults=random_faults, trace=Path(trace) if trace else None,
         )  # fmt: skip
+        return _simulate(simulated, seeds, jobs, Path(ledger) if ledger else None, None, as_json)
     if plant and faults:
         raise UsageError("faults cannot be injected into a plant", hint="--faults needs --prototype")
     if plant and (field_host or recordings or listen or can or speed or prototype_file or commands):
@@ -236,24 +250,26 @@ def command(
             )
         if duration_s <= 0:
             raise UsageError("--virtual needs an end time", expected="--for 24h")
-        return _run_virtual(
-            VirtualRequest(
+        from fieldtwin.run.virtual.run import VirtualOptions
+
+        return _simulate(
+            VirtualOptions(
                 system,
                 duration_s,
                 seed,
-                profiles,
-                prototype_file,
-                recordings,
+                tuple(Path(p) for p in profiles),
+                Path(prototype_file) if prototype_file else None,
+                pairs(recordings, "--recording"),
                 speed,
-                commands,
-                trace,
-                compare,
-                faults,
+                parse_periods(commands) if commands is not None else None,
+                _faults(faults, system, profiles) if faults not in ("", "random") else (),
                 random_faults,
+                Path(trace) if trace else None,
             ),
             seeds,
             jobs,
             Path(ledger) if ledger else None,
+            Path(compare) if compare else None,
             as_json,
         )
     if seeds or seed is not None or trace or compare or jobs != 1:
@@ -287,22 +303,31 @@ def command(
     return asyncio.run(_run(options, ServiceOptions(metrics=metrics, log=log), as_json))
 
 
-def _run_network(request: NetworkRequest, plant: bool, others: list[str]) -> int:
-    from fieldtwin.cli.run.network_view import run_network
+def _group(
+    system: str, profiles: tuple[str, ...], *, trust: bool, plant: bool, virtual: bool, others: list[str]
+) -> SystemGroup:
+    """Return the systems of a file that describes several, if the user agrees to them. `others`: unavailable options."""
+    from fieldtwin.run.template import agree
+    from fieldtwin.twin.prototype.group import load_group
 
+    folders = [Path(p) for p in profiles]
+    group = load_group(system, folders)
+    assert group is not None
     if plant:
         raise UsageError(
-            "a network file runs only as prototypes: each of its systems is a separate plant",
+            f"a {group.kind} file runs only as prototypes: each of its systems is a separate plant",
             hint="run each system on its computer, with its own system file",
         )
     if others:
         raise UsageError(
-            f"{', '.join(others)}: not available for a network",
+            f"{', '.join(others)}: not available for a {group.kind}",
             expected="--for, --virtual, --seed, --seeds, --jobs, --ledger, --faults, --trace, --commands, --instance, --thread, "
             "--cold, --json",
             hint="its systems can be run separately",
         )
-    return run_network(request)
+    members = [(member.system, member.prototype.path) for member in group.members.values()]
+    agree(consent(trust=trust), group.path, members, beside=group.path, virtual=virtual)
+    return group
 
 
 def _faults(path: str, system: str, profiles: tuple[str, ...]) -> tuple[dict[str, Any], ...]:
@@ -316,47 +341,16 @@ def _faults(path: str, system: str, profiles: tuple[str, ...]) -> tuple[dict[str
     return load_faults(Path(path), lambda spec: target(aimed_at, spec))
 
 
-class VirtualRequest(NamedTuple):
-    """The options of a run in virtual time."""
-
-    system: str
-    duration_s: float
-    seed: int | None
-    profiles: tuple[str, ...]
-    prototype_file: str | None
-    recordings: tuple[str, ...]
-    speed: float
-    commands: str | None
-    trace: str | None
-    compare: str | None
-    faults: str
-    random_faults: RandomFaults | None
-
-
-def _run_virtual(request: VirtualRequest, seeds: str, jobs: int, ledger: Path | None, as_json: bool) -> int:
+def _simulate(
+    options: VirtualOptions, seeds: str, jobs: int, ledger: Path | None, compare: Path | None, as_json: bool
+) -> int:
     from fieldtwin.cli.run.virtual_view import parse_seeds, run_many, run_one
-    from fieldtwin.run.virtual.run import VirtualOptions
 
-    options = VirtualOptions(
-        system=request.system,
-        duration_s=request.duration_s,
-        seed=request.seed,
-        profiles=tuple(Path(p) for p in request.profiles),
-        prototype_file=Path(request.prototype_file) if request.prototype_file else None,
-        recordings=pairs(request.recordings, "--recording"),
-        speed=request.speed,
-        commands=parse_periods(request.commands) if request.commands is not None else DEFAULT_SCRIPT,
-        trace=Path(request.trace) if request.trace else None,
-        faults=_faults(request.faults, request.system, request.profiles)
-        if request.faults not in ("", "random")
-        else (),
-        random_faults=request.random_faults,
-    )
     if not seeds:
         if ledger is not None:
             raise UsageError("--ledger needs --seeds")
-        return _run_against(options, Path(request.compare), as_json) if request.compare else run_one(options, as_json)
-    if request.trace or request.compare or request.seed is not None:
+        return _run_against(options, compare, as_json) if compare is not None else run_one(options, as_json)
+    if options.trace or compare or options.seed is not None:
         raise UsageError("--seeds, which makes several runs", hint="--seed, --trace and --compare need a single run")
     return run_many(options, parse_seeds(seeds), jobs, as_json, ledger)
 

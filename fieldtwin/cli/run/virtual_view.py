@@ -19,7 +19,7 @@ from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.wallclock import WallClock
 
 if TYPE_CHECKING:
-    from fieldtwin.run.campaigns.many_seeds import Options, SeedResult
+    from fieldtwin.run.campaigns.many_seeds import SeedResult
     from fieldtwin.run.virtual.run import VirtualOptions
 
 
@@ -38,13 +38,18 @@ def parse_seeds(text: str) -> range:
 
 def run_one(options: VirtualOptions, as_json: bool) -> int:
     """Run once and print the summary on stdout. Return the exit status: 0 if the run passed."""
+    from fieldtwin.run.virtual.group_kinds import kind_named
     from fieldtwin.run.virtual.run import VirtualRun
 
     run = VirtualRun(options)
+    kind = kind_named(run.group.kind) if run.group.kind else None
+    if kind is not None:
+        kind.introduce(run.group)
+    else:
+        show_warnings(run.group.whole.warnings)
     stderr.print(
-        f"{run.system.name} (prototype, virtual time), seed {run.seed}, {shown_time(options.duration_s)}", markup=False
+        f"{run.group.name} (prototype, virtual time), seed {run.seed}, {shown_time(options.duration_s)}", markup=False
     )
-    show_warnings(run.system.warnings)
     began_ns = WallClock().monotonic_ns()
     with progress_bar(options.duration_s) as at:
         run.run(at)
@@ -54,7 +59,8 @@ def run_one(options: VirtualOptions, as_json: bool) -> int:
         json.dump(summary, sys.stdout, indent=2)
         sys.stdout.write("\n")
     else:
-        print_summary(summary)
+        show = kind.print_summary if kind is not None else print_summary
+        show(summary)
         trace = summary["trace"]
         stdout.print(f"  trace          {trace['events']} events, sha256 {trace['sha256']}", soft_wrap=True)
         stdout.print(f"  took           {took_s:.1f} s, {run.elapsed_s / took_s:,.0f} times real time", soft_wrap=True)
@@ -75,7 +81,7 @@ def again(seed: int) -> str:
 
 
 def run_many(
-    options: Options,
+    options: VirtualOptions,
     seeds: range,
     jobs: int,
     as_json: bool,
@@ -159,7 +165,7 @@ def faults_text(faults: Sequence[tuple[str, int, int]]) -> str:
     return f"{sum(n for _, n, _ in faults)} injected: {', '.join(sorted(parts))}"
 
 
-def _shrink(options: Options, failed: SeedResult) -> None:
+def _shrink(options: VirtualOptions, failed: SeedResult) -> None:
     """Write the smallest part of the first failing schedule as a scenario into the working directory, once it is confirmed."""
     from fieldtwin.run.campaigns.confirming import confirm_run
     from fieldtwin.run.campaigns.many_seeds import shrunk
@@ -174,7 +180,7 @@ def _shrink(options: Options, failed: SeedResult) -> None:
         return
     path = Path(f"{Path(options.system).stem}-seed{failed.seed}.scenario.yaml")
     title = f"what failed with seed {failed.seed}"
-    acts = [(at_s, {"send": {"period_s": period_s}}) for at_s, period_s in small.scripted]
+    acts = [(one.at_s, {"send": {"period_s": one.period_s}}) for one in small.scripted]
     text = as_scenario(title, options.system, failed.seed, options.duration_s, small.faults, small.result.errors, acts)
     write_text(path, text)
     told = shrunk_texts(failed.seed, len(small.faults), small.minimal, small.without.ok, small.without.errors)

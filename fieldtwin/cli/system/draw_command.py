@@ -36,26 +36,20 @@ def command(system: str, prototype: bool, output: Path | None, profiles: tuple[s
     from fieldtwin.reports.drawing.tree import tree
     from fieldtwin.reports.drawing.wiring import wiring
     from fieldtwin.run.template import system_file
+    from fieldtwin.run.virtual.group_kinds import kind_named
     from fieldtwin.twin.prototype.file import load_prototype
-    from fieldtwin.twin.site.data_files import network_file
+    from fieldtwin.twin.prototype.group import load_group
     from fieldtwin.twin.site.system import load_system
 
     if as_json and output is not None:
         raise UsageError("--json and -o exclude each other", expected="one of them")
     folders = [Path(folder) for folder in profiles]
-    if (network := network_file(system, folders)) is not None:
-        return _put(*_network(network, folders), output, as_json)
+    if (group := load_group(system, folders)) is not None:
+        drawn = kind_named(group.kind).drawing(group)
+        return _put(drawn.data, drawn.text, drawn.svg, output, as_json)
     loaded = load_system(system_file(system, lambda _: True, plant=False), folders)
     wires = wiring(loaded, load_prototype(loaded) if prototype else None)
     return _put(wires.as_data(), tree(wires, *_room()), lambda: svg(wires), output, as_json)
-
-
-def _network(path: Path, profiles: list[Path]) -> tuple[Any, str, Callable[[], str]]:
-    from fieldtwin.reports.drawing.network import network_map, svg, text
-    from fieldtwin.twin.network.network import load_network
-
-    drawn = network_map(load_network(path, profiles))
-    return drawn.as_data(), text(drawn), lambda: svg(drawn)
 
 
 def _put(facts: Any, text: str, svg: Callable[[], str], output: Path | None, as_json: bool) -> int:

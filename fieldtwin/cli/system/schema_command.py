@@ -23,9 +23,9 @@ def _prototype() -> dict[str, Any]:
 
 
 def _network() -> dict[str, Any]:
-    from fieldtwin.twin.network.schema import NetworkForm
+    from fieldtwin.run.virtual.group_kinds import kind_named
 
-    return NetworkForm.model_json_schema()
+    return kind_named("network").schema()
 
 
 def _profile() -> dict[str, Any]:

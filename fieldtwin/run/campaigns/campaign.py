@@ -17,8 +17,8 @@ from fieldtwin.emulators.faults.schema import seconds
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.results.model import CheckResult, ScenarioResult, Verdict
 from fieldtwin.run.processes.workers import each
-from fieldtwin.run.targets.virtual_scenario import reproduce, run_virtual
-from fieldtwin.run.virtual.fault_schedule import RandomFaults, random_network_schedule, random_schedule
+from fieldtwin.run.targets.virtual_scenario import group_of, reproduce, run_virtual
+from fieldtwin.run.virtual.fault_schedule import RandomFaults, random_schedule
 from fieldtwin.scenarios.judging.runner import ByChance
 from fieldtwin.scenarios.language.about import result_of
 from fieldtwin.scenarios.language.form import Scenario, load_scenario
@@ -51,7 +51,7 @@ class Campaign:
         scenario = load_scenario(self.path, self.profiles)
         if self.random_faults is None:
             return scenario
-        self.random_faults.check(scenario.system, scenario.network)
+        self.random_faults.check(group_of(scenario))
         form = scenario.form
         if not (form.always or form.never or form.within or form.judge or scenario.invariants):
             raise UsageError(
@@ -84,9 +84,7 @@ def schedule(campaign: Campaign, scenario: Scenario, seed: int) -> tuple[dict[st
     wanted, length_s = campaign.random_faults, campaign.length_s(scenario)
     if wanted is None:
         return ()
-    if scenario.network is not None:
-        return random_network_schedule(scenario.network, seed, length_s, wanted)
-    return random_schedule(scenario.system, seed, length_s, wanted)
+    return random_schedule(group_of(scenario), seed, length_s, wanted)
 
 
 def run_seed(campaign: Campaign, seed: int, faults: Sequence[dict[str, Any]] | None = None) -> ScenarioResult:

@@ -8,14 +8,12 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from fieldtwin.run.campaigns.shrink import same_failure, shrunk_run
+from fieldtwin.run.processes.topside import Scripted
 from fieldtwin.run.processes.workers import each
-from fieldtwin.run.virtual.network_run import VirtualNetworkOptions
-from fieldtwin.run.virtual.run import VirtualOptions
+from fieldtwin.run.virtual.run import VirtualOptions, VirtualRun
 
 MAX_SEEDS = 100_000
 _ERRORS_SHOWN = 5
-Options = VirtualOptions | VirtualNetworkOptions
-"""The options of a run with a seed: of a system, or of a network."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,17 +39,15 @@ def fingerprint(*parts: str) -> str:
     return digest.hexdigest()[:16]
 
 
-def what_runs(options: Options) -> str:
+def what_runs(options: VirtualOptions) -> str:
     """Return a fingerprint of these options without the seed, from the contents of the files and the command-line options."""
-    anyhow = replace(options, seed=None, trace=None, profiles=())
-    if isinstance(anyhow, VirtualOptions):
-        anyhow = replace(anyhow, prototype_file=None)
-    return fingerprint(*options.make().files, repr(anyhow))
+    anyhow = replace(options, seed=None, trace=None, profiles=(), prototype_file=None)
+    return fingerprint(*VirtualRun(options).files, repr(anyhow))
 
 
-def run_seed(options: Options) -> SeedResult:
+def run_seed(options: VirtualOptions) -> SeedResult:
     """Make one complete run."""
-    run = options.make()
+    run = VirtualRun(options)
     run.run()
     summary = run.summary()
     systems: dict[str, dict[str, Any]] = summary.get("systems", {})
@@ -80,20 +76,20 @@ class Shrunk:
     """The fewest faults with which a run still fails in the same way: `faults`.
 
     `minimal`: all of them are necessary. `result`: the result with them. `without`: the result without any fault; the
-    same as `result` if none is necessary. `scripted`: the times (s) and periods of the remote client's commands.
+    same as `result` if none is necessary. `scripted`: the commands of the run.
     """
 
     faults: list[dict[str, Any]]
     minimal: bool
     result: SeedResult
     without: SeedResult
-    scripted: list[tuple[float, int]]
+    scripted: list[Scripted]
 
 
-def shrunk(options: Options, found: SeedResult) -> Shrunk:
+def shrunk(options: VirtualOptions, found: SeedResult) -> Shrunk:
     """Return the fewest faults with which the run of `found`'s seed still fails in the same way."""
     options = replace(options, seed=found.seed)
-    run = options.make()
+    run = VirtualRun(options)
     base = replace(options, random_faults=None, faults=())
 
     def ended(part: Sequence[dict[str, Any]]) -> SeedResult:
@@ -104,7 +100,7 @@ def shrunk(options: Options, found: SeedResult) -> Shrunk:
 
 
 def run_seeds(
-    options: Options, seeds: Sequence[int], jobs: int, on_result: Callable[[SeedResult], None] | None = None
+    options: VirtualOptions, seeds: Sequence[int], jobs: int, on_result: Callable[[SeedResult], None] | None = None
 ) -> list[SeedResult]:
     """Run each seed, `jobs` at a time, and return the results in the order of the seeds.
 

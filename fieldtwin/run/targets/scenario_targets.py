@@ -29,8 +29,8 @@ from fieldtwin.run.live.options import RunOptions
 from fieldtwin.run.live.session import RunSession
 from fieldtwin.run.processes.field_found import find_field
 from fieldtwin.run.processes.with_controller import WithController
-from fieldtwin.run.targets.local_network import run_network
 from fieldtwin.run.targets.virtual_scenario import prototype_of, reproduce, run_virtual
+from fieldtwin.run.virtual.group_kinds import kind_named
 from fieldtwin.scenarios.bench import Can, NothingKnown
 from fieldtwin.scenarios.judging.runner import Runner, gone
 from fieldtwin.scenarios.judging.target_limits import refusal
@@ -88,12 +88,8 @@ def _attempt(scenario: Scenario, target: Target, trace_file: Path | None) -> Sce
     collector = Collector(scenario.system, machines_of(scenario.system))
     began_ns = WallClock().monotonic_ns()
     refused = _of_a_plant(scenario, target) if target.name == "real" else ""
-    if scenario.network is not None and target.name != "local":
-        refused = f"a network is a prototype, and the target {target.name} is none: each of its systems is a plant"
-    elif scenario.network is not None and target.can:
-        refused = "--can needs a single system, and this is a network"
-    elif scenario.network is not None and target.controller:
-        refused = "a network has a controller in each of its systems, and --with starts one program"
+    if scenario.group is not None and (reason := _of_a_group(scenario.group.kind, target)):
+        refused = reason
     elif target.controller:
         refused = _of_a_foreign_controller(scenario)
     sink = open_sink(trace_file) if trace_file is not None else None
@@ -121,6 +117,17 @@ def _attempt(scenario: Scenario, target: Target, trace_file: Path | None) -> Sce
         took_s=(WallClock().monotonic_ns() - began_ns) / 1e9,
         counts=collector.finish(),
         trace_hash="",  # no two runs on a clock have the same
+    )
+
+
+def _of_a_group(kind: str, target: Target) -> str:
+    """Return the reason for which the target cannot run a scenario of several systems; empty if it can."""
+    if target.name != "local":
+        return f"a {kind} is a prototype, and the target {target.name} is none: each of its systems is a plant"
+    if target.can:
+        return f"--can needs a single system, and this is a {kind}"
+    return (
+        f"a {kind} has a controller in each of its systems, and --with starts one program" if target.controller else ""
     )
 
 
@@ -173,8 +180,8 @@ async def _run(scenario: Scenario, target: Target, trace: Trace) -> ScenarioResu
     me = asyncio.current_task()
     assert me is not None
     asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, me.cancel)
-    if scenario.network is not None:
-        return await run_network(scenario, target.seed, trace)
+    if scenario.group is not None:
+        return await kind_named(scenario.group.kind).run_scenario(scenario, target.seed, trace)
     async with AsyncExitStack() as stack:
         gone: Callable[[], FieldtwinError | None] = lambda: None  # noqa: E731
         if target.name == "compose" or target.instance:

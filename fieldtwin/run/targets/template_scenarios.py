@@ -13,14 +13,14 @@ from typing import Any
 from fieldtwin.gateway.core.errors import FieldtwinError
 from fieldtwin.gateway.core.files.yaml_file import load
 from fieldtwin.run.template import Ask, agree
-from fieldtwin.twin.site.data_files import network_file
+from fieldtwin.twin.site.groups import group_file
 from fieldtwin.twin.site.system import System, load_system
 
 
 def agree_to_scenario(
     ask: Ask, path: Path, profiles: Iterable[Path] = (), *, plant: bool = False, virtual: bool = False
 ) -> None:
-    """Ask about the system or network of the scenario in `path`, and its probes, if they are inside a template.
+    """Ask about the system of the scenario, or its several systems, in `path`, and its probes, if they are inside a template.
 
     `plant`: the run has no prototype; `virtual`: it opens no endpoint. A file that cannot be read is left to its next
     reader. Raises `NotAllowed`.
@@ -37,15 +37,16 @@ def agree_to_scenario(
 def _systems(path: Path, said: Mapping[str, Any], profiles: tuple[Path, ...]) -> list[tuple[System, Path | None]]:
     """Find the systems as `fieldtwin.scenarios.language.form` does: next to the scenario, or shipped.
 
-    A network yields all its members' systems.
+    A file with several systems yields all of them.
     """
     name, prototype = str(said.get("system", "")), said.get("prototype")
     beside = path.parent / name
     named = str(beside) if beside.exists() else name.removesuffix(".yaml")
-    if (at := network_file(named, profiles)) is not None:
-        from fieldtwin.twin.network.network import load_network  # takes emulators, as a plant does not
+    if group_file(named, profiles) is not None:
+        from fieldtwin.twin.prototype.group import load_group  # needs emulators, which a plant does not have
 
-        return [(member.system, member.prototype.path) for member in load_network(at, profiles).members.values()]
+        group = load_group(named, profiles)
+        return [(m.system, m.prototype.path) for m in group.members.values()] if group is not None else []
     return [(load_system(named, profiles), path.parent / prototype if isinstance(prototype, str) else None)]
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shlex
 import tempfile
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,24 +17,23 @@ from fieldtwin.reports.run.coverage import Collector
 from fieldtwin.reports.run.machines import machines_of
 from fieldtwin.results.model import ScenarioResult, Verdict
 from fieldtwin.results.trace import Trace, open_sink
-from fieldtwin.run.benches.virtual_bench import VirtualBench
 from fieldtwin.run.targets.run_checks import RunJudge
-from fieldtwin.run.virtual.network import VirtualNetwork
+from fieldtwin.run.virtual.group_kinds import VirtualSystems, virtual_kind
 from fieldtwin.scenarios.judging.runner import ByChance, Runner, gone
 from fieldtwin.scenarios.language.about import result_of
 from fieldtwin.scenarios.language.form import Scenario
 from fieldtwin.twin.prototype.file import load_prototype
+from fieldtwin.twin.prototype.group import SystemGroup, one_system
 
 
 def run_virtual(
     scenario: Scenario, seed: int | None = None, trace_file: Path | None = None, by_chance: ByChance | None = None
 ) -> ScenarioResult:
     """Run it. `seed` before the scenario's own and the prototype file's. `by_chance`: random faults of a campaign."""
-    prototype = load_prototype(scenario.system, prototype_of(scenario)) if scenario.network is None else None
-    own = prototype.seed if prototype is not None else scenario.network.seed if scenario.network is not None else 0
-    chosen = seed if seed is not None else scenario.form.seed if scenario.form.seed is not None else own
+    group = group_of(scenario)
+    chosen = seed if seed is not None else scenario.form.seed if scenario.form.seed is not None else group.seed
     judge = (
-        RunJudge(scenario, prototype, by_chance.faults if by_chance is not None else ())
+        RunJudge(scenario, group, by_chance.faults if by_chance is not None else ())
         if scenario.form.judge is not None
         else None
     )
@@ -50,14 +48,9 @@ def run_virtual(
         trace.listen(collector.feed)
 
         async def main() -> ScenarioResult:
-            if scenario.network is not None:
-                async with VirtualNetwork(scenario.network, loop, Path(folder), trace, seed=chosen) as whole:
-                    return await _judged(scenario, Runner(scenario, whole.bench, by_chance), judge, whole.systems)
-            assert prototype is not None
-            async with VirtualBench(
-                scenario.system, prototype, loop, Path(folder), trace, seed=chosen, probes=scenario.probes
-            ) as bench:
-                return await _judged(scenario, Runner(scenario, bench, by_chance), judge, {"": bench})
+            kind = virtual_kind(group)
+            async with kind.virtual(group, loop, Path(folder), trace, chosen, None, scenario.probes) as running:
+                return await _judged(Runner(scenario, running.bench, by_chance), judge, running)
 
         try:
             with seeded(chosen), sealed():
@@ -81,13 +74,11 @@ def run_virtual(
     )
 
 
-async def _judged(
-    scenario: Scenario, runner: Runner, judge: RunJudge | None, benches: Mapping[str, VirtualBench]
-) -> ScenarioResult:
+async def _judged(runner: Runner, judge: RunJudge | None, running: VirtualSystems) -> ScenarioResult:
     """Run the scenario, with the checks of a run in addition if it requests them."""
     if judge is None:
         return await runner.run()
-    judge.attach(benches)
+    judge.attach(running.systems)
     async with Nursery() as nursery:
         nursery.start(judge.watch(), "judge")
         result = await runner.run()
@@ -98,6 +89,13 @@ def reproduce(scenario: Scenario, *more: str) -> str:
     """Return the command line that repeats a scenario."""
     profiles = [word for folder in scenario.profiles for word in ("--profiles", str(folder))]
     return shlex.join(["fieldtwin", "test", str(scenario.path), *more, *profiles])
+
+
+def group_of(scenario: Scenario) -> SystemGroup:
+    """Return the systems of the scenario with their prototypes. Raises `FileInvalid`."""
+    if scenario.group is not None:
+        return scenario.group
+    return one_system(scenario.system, load_prototype(scenario.system, prototype_of(scenario)))
 
 
 def prototype_of(scenario: Scenario) -> Path | None:

@@ -17,8 +17,8 @@ from fieldtwin.emulators.faults.values.value_ranges import numbers
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.core.files.nearest import did_you_mean
-from fieldtwin.twin.network.network import WATER, Network
 from fieldtwin.twin.prototype.fault_aims import target
+from fieldtwin.twin.prototype.group import GroupMember, SystemGroup
 from fieldtwin.twin.site.system import System
 
 MEAN_S = 120.0
@@ -27,8 +27,6 @@ SHORTEST_S, LONGEST_S = 0.5, 20.0
 CALM_S = 120.0
 """Time in seconds without faults at the end."""
 MOST = 500
-WATER_MEAN_S = 300.0
-LONGEST_IN_WATER_S = 60.0
 NOT_BY_CHANCE = frozenset({"set", "late-frame"})
 """Faults that are never random.
 
@@ -44,15 +42,15 @@ class RandomFaults:
 
     `mean_s`: mean seconds between two faults. `kinds`: names of faults; empty: all that a gateway can detect, without
     faults of values. `aims`: DEVICE, BUS (each device on it) or DEVICE.TAG (the fault affects that register or object
-    only); in a network they are prefixed by the name of their system, and `water` is the acoustic channel. Empty: every
-    device.
+    only); in a group they are prefixed by the name of their system, and what the systems share has a name too. Empty:
+    every device.
     """
 
     mean_s: float = MEAN_S
     kinds: tuple[str, ...] = ()
     aims: tuple[str, ...] = ()
 
-    def check(self, system: System, network: Network | None = None) -> None:
+    def check(self, group: SystemGroup) -> None:
         """Raise `UsageError` for a fault or an aim that does not exist, and for kinds that fit no aim."""
         if self.mean_s <= 0:
             raise UsageError(
@@ -61,11 +59,10 @@ class RandomFaults:
         for name in self.kinds:
             if fault_class(name).name in NOT_BY_CHANCE:
                 raise UsageError(f"{name!r} cannot be chosen at random", hint="put it into the scenario as a step")
-        members = {"": system} if network is None else {f"{m.name}.": m.system for m in network.members.values()}
-        of = {prefix: self.under(prefix) for prefix in members}
-        known = [prefix + aim for prefix, one in members.items() for aim in _aims_of(one)]
+        members = group.members.values()
+        known = [m.prefix + aim for m in members for aim in _aims_of(m.system)] + list(group.shared)
         for aim in self.aims:
-            if aim in known or (network is not None and aim == WATER):
+            if aim in known:
                 continue
             hint = did_you_mean(aim, known)
             raise UsageError(
@@ -73,15 +70,15 @@ class RandomFaults:
                 expected="DEVICE, BUS or DEVICE.TAG",
                 hint=hint,
             )
-        choices = [choice for prefix, one in members.items() for choice in _choices(one, of[prefix])]
-        if not any(names for _, _, names in choices) and WATER not in self.aims:
+        choices = [choice for m in members for choice in _choices(m.system, self.under(m.prefix))]
+        if not any(names for _, _, names in choices) and not set(group.shared) & set(self.aims):
             raise UsageError(
                 "none of these faults fits the targets",
                 got=f"{', '.join(self.kinds)} at {', '.join(self.aims) or 'every device'}",
             )
 
     def under(self, prefix: str) -> RandomFaults:
-        """Return the same for one system of a network, whose names begin with `prefix` (empty: a system alone)."""
+        """Return the same for one system of a group, whose names begin with `prefix` (empty: a system alone)."""
         aims = tuple(aim.removeprefix(prefix) for aim in self.aims if aim.startswith(prefix))
         return RandomFaults(self.mean_s, self.kinds, aims or (("",) if self.aims else ()))
 
@@ -142,53 +139,33 @@ def _can_aim(system: System, name: str, device: str, tag: str) -> bool:
     return True
 
 
-def random_network_schedule(
-    network: Network, seed: int, duration_s: float, wanted: RandomFaults = ANY
+def random_schedule(
+    group: SystemGroup, seed: int, duration_s: float, wanted: RandomFaults = ANY
 ) -> tuple[dict[str, Any], ...]:
-    """Return the random faults of each system, drawn with its own seed, and packet losses of the acoustic channel."""
-    found = []
-    for member in network.members.values():
-        chosen = random_schedule(member.system, f"{seed} {member.name}", duration_s, wanted.under(f"{member.name}."))
-        for fault in chosen:
-            found.append({**fault, "id": f"{member.name}-{fault['id']}", "device": f"{member.name}.{fault['device']}"})
-    if (wanted.aims and WATER not in wanted.aims) or (wanted.kinds and "drop" not in wanted.kinds):
-        return tuple(sorted(found, key=lambda fault: float(fault["from"])))
-    random = Random(f"faults {seed} {WATER}")
-    mean_s = WATER_MEAN_S * wanted.mean_s / MEAN_S
-    at_s, last_s, number = random.expovariate(1 / mean_s), _last_s(duration_s), 0
-    while at_s < last_s and number < MOST:
-        number += 1
-        until_s = min(last_s, at_s + random.uniform(SHORTEST_S, LONGEST_IN_WATER_S))
-        lost: dict[str, Any] = {"id": f"{WATER}-f{number}", "name": "drop", "bus": WATER}
-        if random.random() < 0.5:
-            lost["device"] = random.choice(list(network.places))
-        lost |= {"from": round(at_s, 3), "until": round(until_s, 3), "probability": round(random.uniform(0.1, 1.0), 2)}
-        if lost["until"] > lost["from"]:
-            found.append(lost)
-        at_s += random.expovariate(1 / mean_s)
+    """Return faults in the form of a fault file; the same for the same systems, seed, duration and choice.
+
+    Each system's faults are drawn with its own seed. Then follow those of what the systems share.
+    """
+    last_s = duration_s - min(CALM_S, duration_s / 2)
+    found = [fault for member in group.members.values() for fault in _of_member(member, seed, last_s, wanted)]
+    if not wanted.aims or set(wanted.aims) & set(group.shared):
+        random = Random(f"faults {seed} {' '.join(group.shared)}")
+        found += group.random_shared_faults(random, wanted.kinds, wanted.mean_s, last_s)
     return tuple(sorted(found, key=lambda fault: float(fault["from"])))
 
 
-def _last_s(duration_s: float) -> float:
-    return duration_s - min(CALM_S, duration_s / 2)
-
-
-def random_schedule(
-    system: System, seed: int | str, duration_s: float, wanted: RandomFaults = ANY
-) -> tuple[dict[str, Any], ...]:
-    """Return faults in the form of a fault file; the same for the same system, seed, duration and choice."""
-    random = Random(f"faults {seed}")
-    choices = [choice for choice in _choices(system, wanted) if choice[2]]
-    last_s = _last_s(duration_s)
-    found: list[dict[str, Any]] = []
+def _of_member(member: GroupMember, seed: int, last_s: float, wanted: RandomFaults) -> Iterator[dict[str, Any]]:
+    system, number = member.system, 0
+    random = Random(f"faults {seed} {member.name}".strip())
+    choices = [choice for choice in _choices(system, wanted.under(member.prefix)) if choice[2]]
     at_s = random.expovariate(1 / wanted.mean_s)
-    while at_s < last_s and len(found) < MOST and choices:
+    while at_s < last_s and number < MOST and choices:
         device, tag, names = random.choice(choices)
         until_s = min(last_s, at_s + random.uniform(SHORTEST_S, LONGEST_S))
         fault: dict[str, Any] = {
-            "id": f"f{len(found) + 1}",
+            "id": f"{member.name}-f{number + 1}".removeprefix("-"),
             "name": random.choice(names),
-            "device": device,
+            "device": member.prefix + device,
             "from": round(at_s, 3),
             "until": round(until_s, 3),
         }
@@ -198,6 +175,6 @@ def random_schedule(
         if random.random() < 0.5 and not of_values:
             fault["probability"] = round(random.uniform(0.1, 1.0), 2)
         if fault["until"] > fault["from"]:
-            found.append(fault)
+            number += 1
+            yield fault
         at_s += random.expovariate(1 / wanted.mean_s)
-    return tuple(found)

@@ -1,4 +1,4 @@
-"""A run in virtual time: ``fieldtwin run SYSTEM --prototype --virtual --seed N --for 24h``.
+"""A run in virtual time, of one system or of several that run together: ``fieldtwin simulate SYSTEM --seed 7 --for 24h``.
 
 Everything happens in this thread, without access to clocks, sockets and threads; between two pieces of the run that
 access is allowed, to report progress. Everything that is the same from run to run is traced and hashed.
@@ -6,53 +6,43 @@ access is allowed, to report progress. Everything that is the same from run to r
 
 from __future__ import annotations
 
-from collections import deque
+import asyncio
+import tempfile
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from fieldtwin.emulators.faults.schema import seconds
+from fieldtwin.emulators.virtual.chance import seeded
 from fieldtwin.emulators.virtual.loop import VirtualLoop
-from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
+from fieldtwin.emulators.virtual.seal import sealed
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
-from fieldtwin.gateway.core.endpoint import Endpoint
-from fieldtwin.gateway.core.statemachine import encode_period
-from fieldtwin.gateway.core.values import Quality, TagValue
-from fieldtwin.gateway.runtime.buses.learnt_gaps import describe_learnt
-from fieldtwin.gateway.runtime.gateway import stale_limits
-from fieldtwin.gateway.runtime.status import describe
-from fieldtwin.plc.status import PlcStatus
-from fieldtwin.results.trace import Event, Kind
-from fieldtwin.run.benches.invariant_watch import InvariantWatch
-from fieldtwin.run.benches.virtual_bench import VirtualBench
-from fieldtwin.run.live.summary import RunFacts, summarise
-from fieldtwin.run.processes.states import StateWatch, expected_states
-from fieldtwin.run.processes.topside import TopsideController, script
-from fieldtwin.run.virtual.age_oracle import AgeOracle
-from fieldtwin.run.virtual.driven import DrivenRun
+from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid, UsageError
+from fieldtwin.results.trace import Trace, open_sink
+from fieldtwin.run.processes.topside import Scripted
 from fieldtwin.run.virtual.fault_schedule import RandomFaults, random_schedule
-from fieldtwin.run.virtual.message_oracle import MessageOracle
-from fieldtwin.scenarios.judging.runner import TICK_S
-from fieldtwin.twin.prototype.field import FieldSide
+from fieldtwin.run.virtual.group_kinds import VirtualSystems, virtual_kind
+from fieldtwin.run.virtual.system_check import SystemCheck
+from fieldtwin.scenarios.bench import Bench
 from fieldtwin.twin.prototype.field_process import FieldConfig, resolve
-from fieldtwin.twin.prototype.field_status import FieldStatus
+from fieldtwin.twin.prototype.group import SystemGroup, load_group, one_system
 
-SETTLE_S = 10.0
-"""Time in seconds for a command in progress after the end of the run."""
-LAST_REPLIES_S = 0.5
-CALM_S = 60.0
-"""Time in seconds after the last fault in which the system must recover."""
-CAN_WIRE_NS = 10 * NS_PER_MS
-"""The time that a frame may need on a CAN bus: several attempts, after other frames."""
-STALE_CHECK_NS = 100 * NS_PER_MS
-"""Minimum time between two checks for values that are still good although they exceed their maximum age."""
-_GOOD = Quality.GOOD  # an Enum's members are slow to look up
+TRACE_KEPT = 20_000
+"""Events that stay in memory; the hash and a file have them all."""
+PIECE_S = 10.0
+"""Virtual seconds between two progress reports, and between two checks."""
+MAX_ERRORS = 100
 
 
 @dataclass(frozen=True)
 class VirtualOptions:
-    """The system to run and the duration of the run. `faults` are injected in addition; `trace` is a file for every event."""
+    """The systems of a run, and its duration in virtual seconds. `system` names the file of one system or of several.
+
+    `faults` are injected in addition to those of `random_faults`, which the seed chooses; `trace` is a file for every
+    event. `commands`: the sample periods in seconds that are commanded; None: the usual script. `prototype_file`,
+    `recordings` and `speed` are for one system.
+    """
 
     system: str
     duration_s: float
@@ -61,273 +51,144 @@ class VirtualOptions:
     prototype_file: Path | None = None
     recordings: dict[str, str] = field(default_factory=dict)
     speed: float = 0.0
-    commands: tuple[int, ...] = ()
+    commands: tuple[int, ...] | None = ()
     faults: tuple[dict[str, Any], ...] = ()
     random_faults: RandomFaults | None = None
-    """The random faults that the seed chooses, in addition to `faults`."""
     trace: Path | None = None
 
-    def make(self) -> VirtualRun:
-        """Return the run of these options."""
-        return VirtualRun(self)
+
+def load_one(options: VirtualOptions) -> SystemGroup:
+    """Read the files of one system and check that its prototype can be made. Raises `FileInvalid` and `UsageError`."""
+    config = FieldConfig(
+        system=options.system,
+        run_dir="",
+        prototype=str(options.prototype_file) if options.prototype_file else "",
+        profiles=tuple(map(str, options.profiles)),
+        recordings=options.recordings,
+        speed=options.speed,
+    )
+    twin = resolve(config)
+    return one_system(twin.ecs.system, twin.prototype)
 
 
-class VirtualRun(DrivenRun):
-    """One run. `summary()` afterwards; `trace` and `oracle` while it runs."""
+class VirtualRun:
+    """One run: ``run()``, then `summary()`. `errors` are those of the run itself.
+
+    `checks` are those of each system, by its name in `group`. Raises `FileInvalid` and `UsageError` for files and options
+    that make no sense.
+    """
 
     def __init__(self, options: VirtualOptions) -> None:
-        config = FieldConfig(
-            system=options.system,
-            run_dir="",
-            prototype=str(options.prototype_file) if options.prototype_file else "",
-            profiles=tuple(map(str, options.profiles)),
-            recordings=options.recordings,
-            speed=options.speed,
-        )
-        twin = resolve(config)  # report errors in the files before anything starts
         self.options = options
-        self.system = twin.ecs.system
-        self.prototype = twin.prototype
-        super().__init__(
-            self.prototype.seed if options.seed is None else options.seed, options.duration_s, options.trace
-        )
+        self.group = load_group(options.system, options.profiles) or load_one(options)
+        self._kind = virtual_kind(self.group)
+        self.seed = self.group.seed if options.seed is None else options.seed
         self.faults = options.faults
+        """The injected faults, including those that the seed chose."""
         if options.random_faults is not None:
-            options.random_faults.check(self.system)
-            self.faults += random_schedule(self.system, self.seed, options.duration_s, options.random_faults)
-        self.states = StateWatch(self.system)
-        self.oracle = AgeOracle()
-        self.messages = MessageOracle()
-        """Compares the commands that reached the gateway through a mailbox with those that the remote client sent."""
-        self.invariants: InvariantWatch | None = None
-        """The invariants that this run checks; a scenario checks the invariants itself."""
-        self._stated = InvariantWatch(self.system)
-        self.gateway_status: dict[str, Any] | None = None
-        self.plc_status: PlcStatus | None = None
-        self.field_status: FieldStatus | None = None
-        self.may_refuse: tuple[str, ...] = ()
-        """Tags of which a scenario expects that their outputs are refused."""
-        self.outputs_confirmed_safe: bool | None = None
-        self.mapping: dict[Endpoint, Endpoint] = {}
-        self.far: dict[str, Endpoint] = {}
-        self.shore: TopsideController | None = None
-        self._numbers: dict[str, int] = {}
-        self._emulated: frozenset[str] = frozenset()
+            options.random_faults.check(self.group)
+            self.faults += random_schedule(self.group, self.seed, options.duration_s, options.random_faults)
+        placed = self.group.place(self.faults)
+        self.checks = {name: SystemCheck(m.system, placed.get(name, ())) for name, m in self.group.members.items()}
+        self.elapsed_s = 0.0
+        self.errors: list[str] = []
+        self.trace = Trace(TRACE_KEPT)
+        self._shared: dict[str, Any] = {}
+        self._judged = False
+        """False while the run cannot be judged: an error before that is a user's mistake and is raised."""
 
     @property
-    def scripted(self) -> list[tuple[float, int]]:
-        """The times (s) and periods of the remote client's commands; empty if the prototype has no link for them."""
-        o = self.options
-        if not o.commands or all(device.form.far is None for device in self.prototype.devices.values()):
-            return []
-        return [(one.at_s, one.period_s) for one in script(o.commands, o.duration_s)]
-
-    @property
-    def disturbed(self) -> bool:
-        return bool(self.faults)
-
-    @property
-    def calm(self) -> bool:
-        """Return whether every fault had been over for `CALM_S` at the end."""
-        ends = (fault.get("until") for fault in self.faults)
-        return all(end is not None and seconds(end) <= self.elapsed_s - CALM_S for end in ends)
+    def scripted(self) -> list[Scripted]:
+        """The commands of the run, with their times; empty if nothing in the group could send them."""
+        return self._kind.scripted(self.group, self.options.commands, self.options.duration_s)
 
     @property
     def files(self) -> tuple[str, ...]:
-        return self.system.hash, self.prototype.path.read_text(encoding="utf-8")
+        """Return the texts of the files that the run depends on, or their hashes; a changed file changes them."""
+        own = (self.group.path.read_text(encoding="utf-8"),) if self.group.kind else ()
+        members = self.group.members.values()
+        return *own, *(text for m in members for text in (m.system.hash, m.prototype.path.read_text(encoding="utf-8")))
 
-    async def _main(self, loop: VirtualLoop, run_dir: Path) -> None:
-        o = self.options
-        commands = script(o.commands, o.duration_s) if o.commands else []
-        async with VirtualBench(
-            self.system,
-            self.prototype,
-            loop,
-            run_dir,
-            self.trace,
-            seed=self.seed,
-            commands=commands,
-            far_end=bool(commands),
-        ) as bench:
-            self.attach(bench)
-            for fault in self.faults:  # each has its own start time
-                await bench.inject(fault)
-            async with Nursery() as nursery:
-                self.watch_invariants(bench, nursery)
-                await self._through(bench, loop, lambda: self.judge(bench))
-                await self._settle(bench)
-            if self.shore is not None:
-                await self.shore.halt()
-            await self.finish(bench)
+    def run(self, progress: Callable[[float], None] | None = None) -> None:
+        """Run the systems. `progress` is called from time to time with the elapsed virtual seconds.
 
-    def watch_invariants(self, bench: VirtualBench, nursery: Nursery) -> None:
-        """Judge the invariants of the system file from now on, as long as `nursery` is open."""
-        self.invariants = self._stated
-        if self._stated:
-            nursery.start(self._stated.run(bench, TICK_S), "invariants")
-
-    def attach(self, bench: VirtualBench) -> None:
-        """Begin to check the events on `bench`."""
-        self._judged = True
-        self.mapping, self.far, self.shore = bench.run.mapping, bench.run.field.far, bench.shore
-        self._emulated = frozenset(bench.run.field.devices)
-        bench.run.gateway.tags.subscribe(self._watched(bench))
-        if self.shore is not None:
-            for pump in bench.run.gateway.pumps:
-                if pump.driver.config.name in self.far:
-                    self.messages.watch(pump.driver.emitter)
-        bench.trace.listen(self._on_state, Kind.STATE)
-        self.states.knows(bench.run.twin.ecs.layout)
-        for program, state in bench.states().items():
-            self.states.note(program, state, bench.loop.now_ns)
-
-    def judge(self, bench: VirtualBench) -> None:
-        """Check the values published since the last call. Call it often enough that no journal overflows."""
-        self.elapsed_s = bench.now_s()
-        self._judge(bench.run.field)
-
-    async def finish(self, bench: VirtualBench) -> None:
-        """Stop the gateway in order and take the last figures; then `summary`."""
-        self.outputs_confirmed_safe = await bench.run.stop_gateway()
-        outputs = describe(bench.run.gateway, bench.loop.now_ns)["outputs"]  # a stopped node has no certain values
-        await bench.sleep_until_s(bench.now_s() + LAST_REPLIES_S)
-        self._judge(bench.run.field)
-        if self.shore is not None:
-            self.messages.judge([encode_period(period).data for period in self.shore.commands_sent])
-        self._take_status(bench, outputs)
-
-    async def _settle(self, bench: VirtualBench) -> None:
-        """Wait for a command in progress."""
-        deadline_s = bench.now_s() + SETTLE_S
-        while self.shore is not None and bench.now_s() < deadline_s:
-            expected = expected_states(self.shore.commands_sent)
-            if all(self.states.sequence(p) == expected for p in self.states.relays):
-                return
-            await bench.sleep_until_s(bench.now_s() + 0.1)
-
-    # -- checks
-    # ---------------------------------------------------------------------------------------------------------
-
-    def _watched(self, bench: VirtualBench) -> Callable[[str, TagValue], None]:
-        loop = bench.loop
-        asked_by_device = {
-            name: bench.asked_ns[device.bus]
-            for name, device in self.system.devices.items()
-            if not self.system.buses[device.bus].endpoint.is_can
-        }
-        check_ages = self._age_check(bench)
-        asked_of: dict[str, deque[int] | None] = {}
-        """By tag: the times of requests on its bus; None for a message that a node sends by itself."""
-
-        def put(name: str, value: TagValue) -> None:
-            check_ages()
-            if value.quality is _GOOD:
-                # A value is timed at the moment when its reply was complete; the device answered after the request. A
-                # node's unrequested message was on the bus for some time, longer if it had to be sent again.
-                try:
-                    asked = asked_of[name]
-                except KeyError:
-                    asked = asked_of[name] = asked_by_device.get(name.partition(".")[0])
-                since_ns = value.t_ns
-                if asked is None:
-                    since_ns -= CAN_WIRE_NS
-                else:
-                    for asked_ns in reversed(asked):
-                        if asked_ns <= since_ns:
-                            since_ns = asked_ns
-                            break
-                self.oracle.published(name, value.raw, value.value, since_ns, loop.now_ns)
-
-        return put
-
-    def _age_check(self, bench: VirtualBench) -> Callable[[], None]:
-        """Return a function that reports to the check which values the gateway still considers good, whether new or not.
-
-        The device must have held such a value within the value's maximum age, plus the time of one exchange. The
-        function does so at most every `STALE_CHECK_NS`.
+        Raises `FileInvalid` where the trace cannot be written, and `UsageError` for options that make no sense in this
+        system.
         """
-        tags, loop = bench.run.gateway.tags, bench.loop
-        limits_ns = {
-            tag: limit_ms * NS_PER_MS + self._exchange_ns(driver.config.bus)
-            for driver in bench.run.gateway.drivers.values()
-            for tag, limit_ms in stale_limits(driver).items()
-            if limit_ms is not None
-        }
-        next_ns = 0
+        loop = VirtualLoop()
+        with ExitStack() as stack:
+            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="ft-virtual-")))
+            file = self.options.trace
+            self.trace = Trace(TRACE_KEPT, open_sink(file) if file else None)
+            stack.callback(self.trace.close)
+            stack.callback(loop.close)
+            stack.enter_context(seeded(self.seed))
+            with sealed():
+                main = loop.create_task(self._main(loop, folder), name="run")
+                main.add_done_callback(lambda _: loop.stop())
+            while not main.done():
+                with sealed():
+                    loop.run_forever()
+                if progress is not None:
+                    progress(self.elapsed_s)
+            self._ended(main, loop)
 
-        def check() -> None:
-            nonlocal next_ns
-            if loop.now_ns < next_ns:
-                return
-            next_ns = loop.now_ns + STALE_CHECK_NS
-            for tag, limit_ns in limits_ns.items():
-                value = tags.current(tag, loop.now_ns)
-                if value.quality is _GOOD:
-                    self.oracle.still_good(tag, value.raw, value.value, loop.now_ns - limit_ns, loop.now_ns)
+    async def _main(self, loop: VirtualLoop, folder: Path) -> None:
+        kind, group, commands = self._kind, self.group, self.scripted
+        async with kind.virtual(group, loop, folder, self.trace, self.seed, commands) as running:
+            self.attach(running)
+            for fault in self.faults:  # each has its own start time
+                await running.bench.inject(fault)
+            async with Nursery() as nursery:
+                for name, check in self.checks.items():
+                    check.watch_invariants(running.systems[name], nursery)
+                await self._through(running.bench, loop, lambda: self._judge(running))
+                for name, check in self.checks.items():
+                    await check.settle(running.systems[name])
+            if running.shore is not None:
+                await running.shore.halt()
+            for name, check in self.checks.items():
+                await check.finish(running.systems[name])
+            self._shared = running.results()
 
-        return check
+    def attach(self, running: VirtualSystems) -> None:
+        """Begin to check the events of the systems."""
+        self._judged = True
+        for name, check in self.checks.items():
+            check.attach(running.systems[name])
 
-    def _exchange_ns(self, bus: str) -> int:
-        """Return in ns how much older than its last refresh a value may be, because the device held it before its reply came."""
-        config = self.system.buses[bus]
-        return CAN_WIRE_NS if config.endpoint.is_can else round(config.timeout_s * NS_PER_S)
+    def _judge(self, running: VirtualSystems) -> None:
+        for name, check in self.checks.items():
+            check.judge(running.systems[name])
 
-    def _on_state(self, event: Event) -> None:
-        if event.where.endswith(".state") and isinstance(event.data["value"], str):
-            self.states.note(event.where.removesuffix(".state"), event.data["value"], event.t_ns)
+    async def _through(self, bench: Bench, loop: VirtualLoop, judge: Callable[[], None]) -> None:
+        """Advance to the end of the run's time, piece by piece."""
+        while (left_s := self.options.duration_s - bench.now_s()) > 0:
+            await bench.sleep_until_s(bench.now_s() + min(left_s, PIECE_S))
+            self.elapsed_s = bench.now_s()
+            judge()
+            loop.stop()  # interrupt the loop to report progress
+            await asyncio.sleep(0)
 
-    def _judge(self, side: FieldSide) -> None:
-        for name, device in side.devices.items():
-            for held in device.journal.since(self._numbers.get(name, 0)):
-                self.oracle.held(f"{name}.{held.tag}", held.raw, held.t_ns)
-                self._numbers[name] = held.number
-        self.oracle.judge(self._emulated)
-
-    def _take_status(self, bench: VirtualBench, outputs: list[dict[str, Any]]) -> None:
-        now_ns = bench.loop.now_ns
-        gateway, plc = bench.run.gateway, bench.run.plc
-        self.gateway_status = {
-            **describe(gateway, now_ns),
-            "outputs": outputs,
-            "learnt": describe_learnt(gateway.drivers.values()),
-            "store_error": "",
-        }
-        self.plc_status = plc.status()
-        self.field_status = bench.run.field.status()
+    def _ended(self, main: asyncio.Task[None], loop: VirtualLoop) -> None:
+        error = None if main.cancelled() else main.exception()
+        if isinstance(error, FileInvalid | UsageError) and not self._judged:
+            raise error
+        if isinstance(error, FieldtwinError):
+            self.errors.append(str(error))
+        elif error is not None:
+            raise error
+        for context in loop.unhandled[:MAX_ERRORS]:
+            self.errors.append(
+                f"unhandled exception: {context.get('message')} {context.get('exception') or ''}".strip()
+            )
 
     def summary(self) -> dict[str, Any]:
-        """Return the summary of a run on this computer, with seed and trace; it does not depend on the speed of the run."""
+        """Return plain data, with seed and trace; it does not depend on the speed of the run."""
         return {
-            **summarise(self._facts()),
+            **self._kind.summary(self.group, self.checks, self._shared, self.errors, self.elapsed_s),
             "virtual": True,
             "seed": self.seed,
             "trace": {"events": self.trace.count, "sha256": self.trace.hexdigest()},
             "virtual_s": round(self.elapsed_s, 3),
         }
-
-    def _facts(self) -> RunFacts:
-        invariants, shore = self.invariants, self.shore
-        return RunFacts(
-            prototype=True,
-            system=self.system,
-            instance="virtual",
-            elapsed_s=self.elapsed_s,
-            disturbed=self.disturbed,
-            calm=self.calm,
-            errors=tuple(self.errors),
-            gateway=self.gateway_status,
-            plc=self.plc_status,
-            field=self.field_status,
-            counted_before={},
-            clients_before={},
-            mapping=self.mapping,
-            published=self.oracle.describe(),
-            wrong_messages=tuple(self.messages.wrong),
-            invariants=invariants.results() if invariants is not None else (),
-            invariant_errors=invariants.errors() if invariants is not None else (),
-            states=self.states.seen(),
-            topside=shore.describe() if shore is not None else None,
-            commands_sent=tuple(shore.commands_sent) if shore is not None else (),
-            outputs_confirmed_safe=self.outputs_confirmed_safe,
-            may_refuse=self.may_refuse,
-        )

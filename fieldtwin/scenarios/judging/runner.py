@@ -179,7 +179,7 @@ class Runner:
         check = deciding(self.results, verdict)
         if verdict in (Verdict.PASSED, Verdict.SKIPPED) or check is None:
             return ()
-        if self.scenario.network is not None or Can.SEE_WIRE not in self.bench.can:  # no exchange was decoded
+        if self.scenario.group is not None or Can.SEE_WIRE not in self.bench.can:  # no exchange was decoded
             return ()
         seen = [*self.exchanges, *self._decoder.pending()]
         return tuple(last_exchanges(seen, check, self.scenario.system.devices))

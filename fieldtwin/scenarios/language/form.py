@@ -15,10 +15,8 @@ from fieldtwin.scenarios.language.expression import QUALITIES, Expression, NotUn
 from fieldtwin.scenarios.language.invariants import Invariants, load_invariants
 from fieldtwin.scenarios.language.probe_form import Probe, read_probe
 from fieldtwin.scenarios.language.words import WORDS, Bounds, Expect, ScenarioForm, Set, Step, Time, WireForm
-from fieldtwin.twin.network.faults import check_network_fault
-from fieldtwin.twin.network.network import Network, load_network
 from fieldtwin.twin.prototype.fault_aims import target
-from fieldtwin.twin.site.data_files import network_file
+from fieldtwin.twin.prototype.group import SystemGroup, load_group
 from fieldtwin.twin.site.schema import NONE_STATED
 from fieldtwin.twin.site.system import System, load_system
 
@@ -51,12 +49,12 @@ class Scenario:
     """The possible words of each name whose value is a word: the states of programs."""
     probes: tuple[Probe, ...] = ()
     profiles: tuple[Path, ...] = ()
-    network: Network | None = None
-    """The network, if it is a network's scenario; `system` is then the network's `whole`."""
+    group: SystemGroup | None = None
+    """The systems, if the scenario's file describes several; `system` is then their `whole`."""
     used: set[str] = field(default_factory=set, compare=False)
     """The tags and variables that the scenario uses."""
     invariants: Invariants = field(default_factory=Invariants)
-    """The invariants of the system file, or of each system file of the network."""
+    """The invariants of the system file, or of each system file of the group."""
 
     def line(self, *loc: Key) -> str:
         """Return FILE:LINE of a part of the scenario."""
@@ -90,13 +88,13 @@ class Scenario:
         )  # fmt: skip
 
 
-def names_of(system: System, network: Network | None = None) -> dict[str, tuple[str, ...]]:
-    """Return the names that expressions may contain: DEVICE.TAG and PROGRAM.VARIABLE, in a network after the name of
+def names_of(system: System, group: SystemGroup | None = None) -> dict[str, tuple[str, ...]]:
+    """Return the names that expressions may contain: DEVICE.TAG and PROGRAM.VARIABLE, in a group after the name of
     their system. The value is a tuple of the words that a program's state can be, and empty for all other names."""
     from fieldtwin.twin.plant.physical import image_layout
 
-    if network is not None:
-        of_all = [(m.name, names_of(m.system)) for m in network.members.values()]
+    if group is not None:
+        of_all = [(m.name, names_of(m.system)) for m in group.members.values()]
         return {f"{member}.{name}": words for member, names in of_all for name, words in names.items()}
     names: dict[str, tuple[str, ...]] = {
         f"{d.name}.{t.name}": () for d in system.devices.values() for t in d.profile.tags.values()
@@ -108,11 +106,11 @@ def names_of(system: System, network: Network | None = None) -> dict[str, tuple[
     return names
 
 
-def invariants_of(system: System, network: Network | None = None) -> Invariants:
-    """Return the invariants of a system, or of all systems of a network. Raises `FileInvalid`."""
-    if network is None:
+def invariants_of(system: System, group: SystemGroup | None = None) -> Invariants:
+    """Return the invariants of a system, or of all systems of a group. Raises `FileInvalid`."""
+    if group is None:
         return load_invariants(system, names_of(system)) if system.invariants != NONE_STATED else Invariants()
-    every = [load_invariants(m.system, names_of(m.system), f"{m.name}.") for m in network.members.values()]
+    every = [load_invariants(m.system, names_of(m.system), m.prefix) for m in group.members.values()]
     return sum(every, Invariants())
 
 
@@ -121,10 +119,10 @@ def load_scenario(path: Path, profiles: tuple[Path, ...] = ()) -> Scenario:
     file = load(path)
     _check_one_thing(file)
     form = validate(file, ScenarioForm)
-    system, network = _system(file, form, profiles)
+    system, group = _system(file, form, profiles)
     served = [one.name for one in system.serving.serve]
     probes = tuple(read_probe(file, name, one, served) for name, one in form.probes.items())
-    own = names_of(system, network)
+    own = names_of(system, group)
     for probe in probes:
         if probe.name in system.devices or probe.name in system.plc.programs:
             raise file.error(("probes", probe.name), f"{probe.name!r} is already a device or program of the system")
@@ -142,8 +140,8 @@ def load_scenario(path: Path, profiles: tuple[Path, ...] = ()) -> Scenario:
         {name: words for name, words in own.items() if words},
         probes,
         profiles,
-        network,
-        invariants=invariants_of(system, network),
+        group,
+        invariants=invariants_of(system, group),
     )
     always = tuple(_looks(scenario, text, ("always", n)) for n, text in enumerate(form.always))
     never: list[Expression | WireForm] = []
@@ -182,17 +180,16 @@ def _check_one_thing(file: YamlFile) -> None:
             )
 
 
-def _system(file: YamlFile, form: ScenarioForm, profiles: tuple[Path, ...]) -> tuple[System, Network | None]:
-    """Return the system that the file names, from its folder or the shipped ones, or the `whole` of the network."""
+def _system(file: YamlFile, form: ScenarioForm, profiles: tuple[Path, ...]) -> tuple[System, SystemGroup | None]:
+    """Return the system that the file names, from its folder or the shipped ones, or the `whole` of a group."""
     folder = Path(file.path).parent
     beside = folder / form.system
     named = str(beside) if beside.exists() else form.system.removesuffix(".yaml")
     try:
-        at = network_file(named, profiles)
-        network = load_network(at, profiles) if at is not None else None
-        if network is not None:
-            _check_of_network(file, form)
-            return network.whole, network
+        group = load_group(named, profiles)
+        if group is not None:
+            _check_of_group(file, form, group)
+            return group.whole, group
         system = load_system(named, list(profiles))
     except UsageError as e:
         raise file.error(("system",), e.message, expected=e.expected, got=e.got, hint=e.hint) from e
@@ -269,19 +266,19 @@ def _check_set(scenario: Scenario, said: Set, loc: tuple[Key, ...]) -> None:
 
 
 def _aim(scenario: Scenario, spec: FaultSpec) -> None:
-    """Check a fault's aim. Raises `WrongAim` if it is neither in the system nor between the systems of a network."""
-    if scenario.network is not None:
-        check_network_fault(scenario.network, spec)
+    """Check a fault's aim. Raises `WrongAim` if it is neither in the system nor in what the systems of a group share."""
+    if scenario.group is not None:
+        scenario.group.check_fault(spec)
     else:
         target(scenario.system, spec)
 
 
-def _check_of_network(file: YamlFile, form: ScenarioForm) -> None:
+def _check_of_group(file: YamlFile, form: ScenarioForm, group: SystemGroup) -> None:
     """Refuse keys that apply to one system only."""
     for key in ("probes", "prototype"):
         if getattr(form, key):
             raise file.error(
-                (key,), f"{key!r} has no meaning for a network", expected="a scenario of one of its systems"
+                (key,), f"{key!r} has no meaning for a {group.kind}", expected="a scenario of one of its systems"
             )
 
 

@@ -21,6 +21,7 @@ from fieldtwin.gateway.runtime.buses.canopen_bus import CanopenBus
 from fieldtwin.plc.program import Program, ScanInfo, var_input, var_local, var_output
 from fieldtwin.results.trace import Event, Kind
 from fieldtwin.run.benches.virtual_bench import VirtualBench
+from fieldtwin.run.virtual.group_kinds import VirtualSystems
 from fieldtwin.run.virtual.run import VirtualOptions, VirtualRun
 
 LASTS_S, AFTER_S, FIRST_S = 2.0, 2.6, 5.0
@@ -169,7 +170,7 @@ class _Run(VirtualRun):
         self.before: Callable[[VirtualBench], Awaitable[None]] | None = None
         self.seen = {(row.wire, row.name): Seen() for row in rows}
 
-    async def _through(self, bench: VirtualBench, loop: VirtualLoop, judge: Callable[[], None]) -> None:
+    async def _through(self, bench: Any, loop: VirtualLoop, judge: Callable[[], None]) -> None:
         values_before: dict[str, int] = {}
         while bench.now_s() < self.options.duration_s:
             await bench.sleep_until_s(bench.now_s() + 0.1)
@@ -180,12 +181,12 @@ class _Run(VirtualRun):
                 at_s = bench.now_s() - row.begins_s
                 if 0 <= at_s < ROW_S - 0.05:
                     self._look(bench, row, self.seen[row.wire, row.name], at_s, values_before)
-        self._judge(bench.run.field)
+        judge()
         self.elapsed_s = bench.now_s()
 
-    def attach(self, bench: VirtualBench) -> None:
-        super().attach(bench)
-        bench.trace.listen(self._on_tag, Kind.TAG)
+    def attach(self, running: VirtualSystems) -> None:
+        super().attach(running)
+        running.systems[""].trace.listen(self._on_tag, Kind.TAG)
 
     def _on_tag(self, event: Event) -> None:
         """States shorter than a scan count as well."""

@@ -146,7 +146,7 @@ def test_each_fault_has_its_effect_and_ends_with_its_time() -> None:
     assert run.errors == []
     wrong = [f"{row.wire} {row.name}: {what}" for row in ROWS for what in _wrong(row, run.seen[row.wire, row.name])]
     assert wrong == []
-    told = run.oracle.describe()
+    told = run.checks[""].oracle.describe()
     assert told["wrong"] == 0, told
     assert told["checked"] > 3000
 

@@ -25,6 +25,8 @@ from fieldtwin.run.targets.scenario_targets import Target, run_scenario
 from fieldtwin.run.virtual.fault_schedule import RandomFaults, random_schedule
 from fieldtwin.scenarios.language.form import load_scenario
 from fieldtwin.twin.prototype.fault_aims import target
+from fieldtwin.twin.prototype.file import load_prototype
+from fieldtwin.twin.prototype.group import one_system
 
 PROFILE = """device: fieldtwin/tank
 source: "made for this test"
@@ -142,7 +144,8 @@ def test_a_value_too_large_for_bits_of_a_register_is_limited_and_does_not_wrap(t
 def test_random_value_faults_are_all_accepted(tmp_path: Path) -> None:
     system = load_scenario(scenario(tmp_path, "  - pause: 1s\n")).system
     wanted = RandomFaults(20.0, kinds=("out-of-range", "stuck", "nan"))
-    chosen = [fault for seed in range(5) for fault in random_schedule(system, seed, 3600, wanted)]
+    group = one_system(system, load_prototype(system))
+    chosen = [fault for seed in range(5) for fault in random_schedule(group, seed, 3600, wanted)]
     for fault in chosen:
         target(system, parse_fault(fault))  # raises if the value does not fit
     assert {fault["name"] for fault in chosen} == set(wanted.kinds)

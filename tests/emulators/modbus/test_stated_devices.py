@@ -251,8 +251,8 @@ def test_a_prototype_of_a_device_without_a_recording(tmp_path: Path) -> None:
     assert run.errors == []
     assert summary["published"]["checked"] > 100
     assert summary["published"]["wrong"] == 0
-    assert run.gateway_status is not None
-    tags = run.gateway_status["tags"]
+    assert run.checks[""].gateway_status is not None
+    tags = run.checks[""].gateway_status["tags"]
     assert {name.removeprefix("tank."): tag["value"] for name, tag in tags.items()} == {
         "level": 1.5,
         "total": 1000,
@@ -265,8 +265,8 @@ def test_a_prototype_of_a_device_without_a_recording(tmp_path: Path) -> None:
         "model": "TK",
         "valve": True,
     }
-    assert run.field_status is not None
-    assert run.field_status.devices["tank"].counters["exceptions"] > 3, "busy, and the gaps between its tags"
+    assert run.checks[""].field_status is not None
+    assert run.checks[""].field_status.devices["tank"].counters["exceptions"] > 3, "busy, and the gaps between its tags"
 
 
 @pytest.mark.parametrize(

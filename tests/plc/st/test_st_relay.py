@@ -59,7 +59,7 @@ def hash_of(source: str, folder: Path, seed: int) -> tuple[str, int, list[str]]:
     run = VirtualRun(VirtualOptions(str(folder / "observatory.yaml"), 12.0, seed=seed, commands=(1, -1)))
     run.run()
     assert run.errors == []
-    return run.trace.hexdigest(), run.trace.count, run.states.sequence("relay")
+    return run.trace.hexdigest(), run.trace.count, run.checks[""].states.sequence("relay")
 
 
 def test_the_observatory_gives_the_same_trace(tmp_path: Path) -> None:

@@ -10,9 +10,10 @@ from itertools import combinations
 from math import dist
 from typing import Any
 
+from fieldtwin.acoustic.network import Network
+from fieldtwin.acoustic.schema import SHIP
 from fieldtwin.reports.drawing.svg import CHAR, EDGE, LINE, document
 from fieldtwin.reports.markup import Markup, el
-from fieldtwin.twin.network.network import SHIP, Network
 
 WIDE, HIGH, LOW = 760.0, 420.0, 120.0
 """The area for the places, in px: its width, its greatest and its smallest height."""

@@ -1,4 +1,4 @@
-"""`fieldtwin run NETWORK`: several systems and the acoustic channel between them, in virtual time or on this host."""
+"""`fieldtwin run NETWORK`: several systems and the acoustic channel between them, as processes on this host."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import json
 import signal
 import sys
 from contextlib import AsyncExitStack
-from pathlib import Path
 from typing import Any
 
 from rich.console import Group
@@ -15,68 +14,25 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from fieldtwin.acoustic.network import Network
+from fieldtwin.acoustic.schema import SHIP
+from fieldtwin.acoustic.session import NetworkOptions, NetworkSession
+from fieldtwin.acoustic.ship import scripted_commands
+from fieldtwin.acoustic.summary import summarise_network
 from fieldtwin.cli.run.live_view import print_faults, troubles
-from fieldtwin.cli.run.network_request import NetworkRequest
-from fieldtwin.cli.run.virtual_view import parse_seeds, progress_bar, run_many, shown_time
-from fieldtwin.cli.template_question import consent
 from fieldtwin.console import show_warnings, stderr, stdout
-from fieldtwin.emulators.faults.schema import load_faults
 from fieldtwin.gateway.core.errors import FieldtwinError, UsageError
-from fieldtwin.gateway.wallclock import WallClock
-from fieldtwin.run.live.network_session import NetworkOptions, NetworkSession
-from fieldtwin.run.live.network_summary import summarise_network
 from fieldtwin.run.live.session import RunSession
-from fieldtwin.run.processes.topside import Scripted, script
-from fieldtwin.run.template import agree
-from fieldtwin.run.virtual.network_run import VirtualNetworkOptions
-from fieldtwin.twin.network.faults import check_network_fault
-from fieldtwin.twin.network.network import SHIP, Network, load_network
+from fieldtwin.run.virtual.group_kinds import LiveRequest
 
-FIRST_S = 1.0
-BASE_S = 10
-"""The default commands of the topside controller, with their times."""
 THREAD = "tcp://127.0.0.1:0"
 REFRESH_S = 0.25
 LINE_S = 5.0
 MAX_TROUBLES = 5
 
 
-def run_network(request: NetworkRequest) -> int:
-    """Run the network and return the exit status: 0 if every system passed."""
-    if request.virtual and request.duration_s <= 0:
-        raise UsageError("--virtual needs an end time", expected="--for 24h")
-    if not request.virtual and (request.seed is not None or request.trace):
-        raise UsageError("--seed and --trace need --virtual")
-    if request.thread and (request.virtual or request.thread != THREAD):
-        raise UsageError(
-            "each system of a network has a separate thread and port",
-            expected=f"--thread {THREAD}, without --virtual",
-        )
-    if not request.virtual and (request.seeds or request.faults == "random"):
-        raise UsageError("--seeds and random faults need --virtual")
-    network = load_network(request.path, [Path(p) for p in request.profiles])
-    members = [(member.system, member.prototype.path) for member in network.members.values()]
-    agree(consent(trust=request.trust), request.path, members, beside=request.path, virtual=request.virtual)
-    if request.virtual and request.seeds:
-        return _many(request, network)
-    _print_network(network)
-    return _virtual(request, network) if request.virtual else asyncio.run(_on_this_host(request, network))
-
-
-def _faults(request: NetworkRequest, network: Network) -> tuple[dict[str, Any], ...]:
-    if request.faults in ("", "random"):
-        return ()
-    return load_faults(Path(request.faults), lambda spec: check_network_fault(network, spec))
-
-
-def _commands(request: NetworkRequest) -> tuple[Scripted, ...]:
-    if request.commands is None:
-        return (Scripted(FIRST_S, BASE_S),)
-    return tuple(script(request.commands, request.duration_s or 20.0)) if request.commands else ()
-
-
-def _print_network(network: Network) -> None:
-    """Print the members of the network, and which of them hear each other."""
+def introduce(network: Network) -> None:
+    """Print the members of the network on stderr, and which of them hear each other."""
     show_warnings(dict.fromkeys(warning for member in network.members.values() for warning in member.system.warnings))
     sea = network.medium(network.seed)
     stderr.print(f"[bold]network[/bold] {network.name}, prototypes of {len(network.members)} systems", highlight=False)
@@ -86,53 +42,23 @@ def _print_network(network: Network) -> None:
         stderr.print(f"  {name}{what}: hears {heard}", soft_wrap=True, highlight=False)
 
 
-def _options(request: NetworkRequest, network: Network) -> VirtualNetworkOptions:
-    return VirtualNetworkOptions(
-        str(request.path),
-        request.duration_s,
-        request.seed,
-        tuple(Path(p) for p in request.profiles),
-        _commands(request),
-        _faults(request, network),
-        request.random_faults,
-        Path(request.trace) if request.trace else None,
-    )
+def run_live(network: Network, request: LiveRequest, *, as_json: bool) -> int:
+    """Run the network's systems on this host and return the exit status: 0 if every system passed."""
+    if request.thread not in ("", THREAD):
+        raise UsageError("each system of a network has a separate thread and port", expected=f"--thread {THREAD}")
+    introduce(network)
+    return asyncio.run(_on_this_host(network, request, as_json))
 
 
-def _many(request: NetworkRequest, network: Network) -> int:
-    if request.trace or request.seed is not None:
-        raise UsageError("--seeds, which makes several runs", hint="--seed and --trace need a single run")
-    ledger = Path(request.ledger) if request.ledger else None
-    return run_many(_options(request, network), parse_seeds(request.seeds), request.jobs, request.as_json, ledger)
-
-
-def _virtual(request: NetworkRequest, network: Network) -> int:
-    options = _options(request, network)
-    run = options.make()
-    stderr.print(f"virtual time, seed {run.seed}, {shown_time(options.duration_s)}", markup=False, highlight=False)
-    began_ns = WallClock().monotonic_ns()
-    with progress_bar(options.duration_s) as at:
-        run.run(at)
-    took_s = (WallClock().monotonic_ns() - began_ns) / 1e9
-    summary = run.summary()
-    if request.as_json:
-        return _as_json(summary)
-    print_network_summary(summary)
-    trace = summary["trace"]
-    stdout.print(f"  trace          {trace['events']} events, sha256 {trace['sha256']}", soft_wrap=True)
-    stdout.print(f"  took           {took_s:.1f} s, {run.elapsed_s / took_s:,.0f} times real time", soft_wrap=True)
-    return _verdict(summary)
-
-
-async def _on_this_host(request: NetworkRequest, network: Network) -> int:
+async def _on_this_host(network: Network, request: LiveRequest, as_json: bool) -> int:
     options = NetworkOptions(
         request.instance,
         request.duration_s,
         None,
-        tuple(Path(p) for p in request.profiles),
+        request.profiles,
         request.cold,
-        commands=_commands(request),
-        faults=_faults(request, network),
+        commands=scripted_commands(network, request.commands, request.duration_s),
+        faults=request.faults,
         thread=request.thread,
     )
     session = NetworkSession(network, options)
@@ -166,7 +92,7 @@ async def _on_this_host(request: NetworkRequest, network: Network) -> int:
                 stderr.print(f"  {name}: digital thread  ←  {one.thread_place}", soft_wrap=True, highlight=False)
         if session.ship is not None:
             stderr.print(f"  the ship's modem  →  {session.ship}", soft_wrap=True, highlight=False)
-        showing = asyncio.create_task(_show(session, quiet=request.as_json))
+        showing = asyncio.create_task(_show(session, quiet=as_json))
         try:
             await session.wait()
         finally:
@@ -176,15 +102,15 @@ async def _on_this_host(request: NetworkRequest, network: Network) -> int:
     if not showing.cancelled() and (failed := showing.exception()) is not None:
         raise failed
     systems = {name: one.summary() for name, one in session.sessions.items()}
-    ship = session.shore.describe() if session.shore is not None else None
-    summary = summarise_network(network, systems, session.counters(), ship, [], session.faults.history.describe())
-    summary["duration_s"] = round(elapsed_s, 3)
-    if request.as_json:
-        code = _as_json(summary)
+    summary = summarise_network(network.name, systems, session.results(), [], elapsed_s)
+    if as_json:
+        json.dump(summary, sys.stdout, indent=2)
+        sys.stdout.write("\n")
     else:
         print_network_summary(summary)
-        code = _verdict(summary)
-    return 130 if interrupted and options.duration_s else code
+    if interrupted and options.duration_s:
+        return 130
+    return 0 if summary["ok"] else 1
 
 
 # -- while it runs ------------------------------------------------------------------------------------------------------
@@ -251,19 +177,8 @@ def _troubles(session: NetworkSession) -> list[str]:
 # -- at the end ---------------------------------------------------------------------------------------------------------
 
 
-def _as_json(summary: dict[str, Any]) -> int:
-    json.dump(summary, sys.stdout, indent=2)
-    sys.stdout.write("\n")
-    return 0 if summary["ok"] else 1
-
-
-def _verdict(summary: dict[str, Any]) -> int:
-    stdout.print("[bold green]ok[/bold green]" if summary["ok"] else "[bold red]not ok[/bold red]")
-    return 0 if summary["ok"] else 1
-
-
 def print_network_summary(summary: dict[str, Any]) -> None:
-    """Print the summary of a network run on stdout, without the verdict."""
+    """Print the summary of a network run on stdout, with the verdict."""
     stdout.print(f"[bold]{summary['network']}[/bold] (network of prototypes), {summary['duration_s']:.1f} s")
     for name, one in summary["systems"].items():
         good = [device for device, d in one["devices"].items() if d["state"] == "good"]
@@ -297,3 +212,4 @@ def print_network_summary(summary: dict[str, Any]) -> None:
         stdout.print(f"  {SHIP:<14} commands {ship['commands_sent']}, heard {ship['responses']}", highlight=False)
     for error in summary["errors"]:
         stdout.print(f"  [red]error[/red]          {error}", soft_wrap=True)
+    stdout.print("[bold green]ok[/bold green]" if summary["ok"] else "[bold red]not ok[/bold red]")

@@ -7,10 +7,15 @@ end the others.
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from fieldtwin.acoustic.faults import AcousticFaults
+from fieldtwin.acoustic.network import Network
+from fieldtwin.acoustic.schema import WATER
+from fieldtwin.acoustic.ship import TopsideModem
 from fieldtwin.emulators.endpoints.acoustic_end import AcousticServer
 from fieldtwin.emulators.endpoints.ports import OsPorts
 from fieldtwin.gateway.core.concurrency.async_resource import AsyncResource
@@ -20,10 +25,6 @@ from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.run.live.options import RunOptions
 from fieldtwin.run.live.session import RunSession
 from fieldtwin.run.processes.topside import Scripted, TopsideController
-from fieldtwin.twin.network.faults import placed_all
-from fieldtwin.twin.network.network import WATER, Network
-from fieldtwin.twin.network.ship import TopsideModem
-from fieldtwin.twin.network.water_faults import AcousticFaults
 from fieldtwin.twin.plant.instance import Instance
 
 
@@ -41,7 +42,7 @@ class NetworkOptions:
     cold: bool = False
     capture: bool = False
     """Whether each system's bus traffic is written to ``capture.jsonl`` in its run directory."""
-    commands: tuple[Scripted, ...] = ()
+    commands: Sequence[Scripted] = ()
     faults: tuple[dict[str, Any], ...] = ()
     """The faults of the systems and of the acoustic channel, under the network's names."""
     thread: str = ""
@@ -57,7 +58,7 @@ class NetworkSession(AsyncResource):
         self.options = options
         self.seed = network.seed if options.seed is None else options.seed
         self.clock = WallClock()
-        self.faults = AcousticFaults(network, self.seed)
+        self.faults = AcousticFaults(network.places, self.seed)
         self.medium = network.medium(self.seed, self.faults.spoils)
         self.instance = Instance(options.instance or network.name)
         self.sessions: dict[str, RunSession] = {}
@@ -65,7 +66,7 @@ class NetworkSession(AsyncResource):
         self.ship: Endpoint | None = None
         self.stopped = asyncio.Event()
         self.started_ns = 0
-        self._faults = placed_all(network, options.faults)
+        self._faults = network.place(options.faults)
         self._nursery = Nursery()
 
     async def _start(self) -> None:
@@ -125,6 +126,11 @@ class NetworkSession(AsyncResource):
     @property
     def elapsed_s(self) -> float:
         return (self.clock.monotonic_ns() - self.started_ns) / 1e9
+
+    def results(self) -> dict[str, Any]:
+        """Return the counters of the acoustic channel, its faults, and what the topside modem sent and heard."""
+        ship = self.shore.describe() if self.shore is not None else None
+        return {"water": self.counters(), "faults": self.faults.history.describe(), "ship": ship}
 
     def counters(self) -> dict[str, dict[str, int]]:
         """Return the counters of each modem in the acoustic channel."""

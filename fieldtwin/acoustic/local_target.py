@@ -7,14 +7,16 @@ import shutil
 from collections.abc import Callable
 from contextlib import AsyncExitStack
 from pathlib import Path
+from typing import cast
 
+from fieldtwin.acoustic.bench import MemberTrace, NetworkBench, Part
+from fieldtwin.acoustic.network import Network
+from fieldtwin.acoustic.session import NetworkOptions, NetworkSession
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.errors import FieldtwinError
 from fieldtwin.results.model import ScenarioResult
 from fieldtwin.results.trace import FAR_END, Kind, Trace
 from fieldtwin.run.benches.control_bench import ControlBench, Where
-from fieldtwin.run.benches.network_bench import MemberTrace, NetworkBench, Part
-from fieldtwin.run.live.network_session import NetworkOptions, NetworkSession
 from fieldtwin.run.live.session import RunSession
 from fieldtwin.scenarios.judging.runner import Runner
 from fieldtwin.scenarios.language.form import Scenario
@@ -22,19 +24,19 @@ from fieldtwin.scenarios.language.form import Scenario
 
 async def run_network(scenario: Scenario, seed: int | None, trace: Trace) -> ScenarioResult:
     """Start the network, run the scenario, stop everything. Raises `FieldtwinError` for a part that has ended."""
-    assert scenario.network is not None
+    network = cast(Network, scenario.group)
     chosen = seed if seed is not None else scenario.form.seed
     options = NetworkOptions(f"test-{os.getpid()}", 0.0, chosen, scenario.profiles, cold=True, capture=True)
-    session = NetworkSession(scenario.network, options)
+    session = NetworkSession(network, options)
     async with AsyncExitStack() as stack:
         kept = stack.enter_context(_Tidy())
         await stack.enter_async_context(session)
         kept.folders += [session.instance.dir, *(one.instance.dir for one in session.sessions.values())]
-        bench = NetworkBench(scenario.network, trace, "local", session.faults)
+        bench = NetworkBench(network, trace, "local", session.faults)
         for name, one in session.sessions.items():
             notes = MemberTrace(trace, name, _later(bench, name))
             names = sorted(scenario.used | scenario.invariants.names)
-            used = [local for member, local in map(scenario.network.split, names) if member == name]
+            used = [local for member, local in map(network.split, names) if member == name]
             part = ControlBench(
                 one.system,
                 Where(one.instance.dir, capture=one.options.capture, own=True),

@@ -11,6 +11,11 @@ from pydantic import ConfigDict, Field
 
 from fieldtwin.twin.site.schema import Name, Strict
 
+WATER = "water"
+"""The name of the acoustic channel in faults, used like the name of a bus."""
+SHIP = "ship"
+"""The name of the topside modem among the modems of the acoustic channel."""
+
 Place = Annotated[list[float], Field(min_length=2, max_length=3)]
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from fieldtwin.acoustic.network import Network
+from fieldtwin.acoustic.schema import SHIP
 from fieldtwin.emulators.endpoints.modbus_server import serve_mbap
 from fieldtwin.emulators.endpoints.ports import Listening, Ports
 from fieldtwin.emulators.modbus.mbap import MbapSlave
@@ -11,10 +13,26 @@ from fieldtwin.emulators.models.mailbox_modem import MailboxModem
 from fieldtwin.emulators.wires.acoustic import AcousticMedium
 from fieldtwin.gateway.core.clock import NS_PER_S, Clock
 from fieldtwin.gateway.core.endpoint import Endpoint
-from fieldtwin.twin.network.network import SHIP, Network
+from fieldtwin.run.processes.topside import Scripted, script
 from fieldtwin.twin.prototype.field import unit_limits
 
 MOST_CLIENTS = 4
+FIRST_S = 1.0
+BASE_S = 10
+"""The usual command of the topside modem: a period of 10 s, commanded 1 s after the start."""
+ENDLESS_S = 20.0
+"""The time in seconds over which the commands of a run without an end are spread."""
+
+
+def scripted_commands(network: Network, commands: tuple[int, ...] | None, duration_s: float) -> list[Scripted]:
+    """Return the commands of the topside modem in a run; None stands for the usual command. A network without
+    a topside modem has no commands.
+    """
+    if network.ship is None:
+        return []
+    if commands is None:
+        return [Scripted(FIRST_S, BASE_S)]
+    return script(commands, duration_s or ENDLESS_S) if commands else []
 
 
 class TopsideModem:

@@ -5,10 +5,15 @@ Each system behaves as it does alone (`VirtualBench`); the systems affect each o
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+from fieldtwin.acoustic.bench import MemberTrace, NetworkBench, Part
+from fieldtwin.acoustic.faults import AcousticFaults
+from fieldtwin.acoustic.network import Network
+from fieldtwin.acoustic.ship import TopsideModem
 from fieldtwin.emulators.endpoints.memory_ports import MemoryNet
 from fieldtwin.emulators.models.acoustic_link import AcousticLink
 from fieldtwin.emulators.virtual.clock import VirtualClock
@@ -16,12 +21,8 @@ from fieldtwin.emulators.virtual.loop import VirtualLoop
 from fieldtwin.gateway.core.concurrency.async_resource import AsyncResource
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.results.trace import FAR_END, Kind, Trace
-from fieldtwin.run.benches.network_bench import MemberTrace, NetworkBench, Part
 from fieldtwin.run.benches.virtual_bench import VirtualBench
 from fieldtwin.run.processes.topside import Scripted, TopsideController
-from fieldtwin.twin.network.network import Network
-from fieldtwin.twin.network.ship import TopsideModem
-from fieldtwin.twin.network.water_faults import AcousticFaults
 
 SEEDS_APART = 1_000_003
 """Distance between the seeds of a run's systems, so that none repeats the random numbers of another."""
@@ -42,19 +43,19 @@ class VirtualNetwork(AsyncResource):
         trace: Trace,
         *,
         seed: int,
-        commands: list[Scripted] | None = None,
+        commands: Sequence[Scripted] = (),
     ) -> None:
         super().__init__()
         self.network = network
         self.trace = trace
-        self.faults = AcousticFaults(network, seed)
+        self.faults = AcousticFaults(network.places, seed)
         self.medium = network.medium(seed, self.faults.spoils)
         self.bench = NetworkBench(network, trace, "virtual", self.faults)
         self.systems: dict[str, VirtualBench] = {}
         self._loop = loop
         self._folder = folder
         self._seed = seed
-        self._commands = commands or []
+        self._commands = list(commands)
 
     async def _start(self) -> None:
         for number, (name, member) in enumerate(self.network.members.items()):
@@ -77,6 +78,18 @@ class VirtualNetwork(AsyncResource):
         self.faults.start_ns = next(iter(self.systems.values())).run.started_ns
         if self.network.ship is not None:
             await self._board()
+
+    @property
+    def shore(self) -> TopsideController | None:
+        return self.bench.shore
+
+    def results(self) -> dict[str, Any]:
+        """Return the counters of the acoustic channel, its faults, and what the topside modem sent and heard."""
+        return {
+            "water": {name: counters.as_dict() for name, counters in self.medium.counters.items()},
+            "faults": self.faults.history.describe(),
+            "ship": self.bench.shore.describe() if self.bench.shore is not None else None,
+        }
 
     def _later(self, name: str) -> Callable[[], int]:
         """Return how much later than the first a system began."""

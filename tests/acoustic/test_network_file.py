@@ -8,15 +8,15 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
+from fieldtwin.acoustic.faults import AcousticFaults
+from fieldtwin.acoustic.network import load_network
 from fieldtwin.cli.main import cli
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.scenarios.language.form import load_scenario
-from fieldtwin.twin.network.network import load_network
-from fieldtwin.twin.network.water_faults import AcousticFaults
-from fieldtwin.twin.site.data_files import network_file
+from fieldtwin.twin.site.groups import group_file
 from fieldtwin.twin.site.system import load_system
 
-SYSTEMS = Path(__file__).resolve().parents[3] / "profiles" / "systems"
+SYSTEMS = Path(__file__).resolve().parents[2] / "profiles" / "systems"
 SHIPPED = SYSTEMS / "ocean_network.yaml"
 
 
@@ -97,11 +97,11 @@ def test_an_error_in_a_system_is_named_there(tmp_path: Path) -> None:
 
 
 def test_a_network_is_not_a_system_and_a_system_not_a_network() -> None:
-    found = network_file("ocean_network")
+    found = group_file("ocean_network")
     assert found is not None
-    assert found.resolve() == SHIPPED
-    assert network_file("observatory") is None
-    assert network_file("no such thing") is None
+    assert (found[0], found[1].resolve()) == ("network", SHIPPED)
+    assert group_file("observatory") is None
+    assert group_file("no such thing") is None
     with pytest.raises(FileInvalid, match=r"a network, not a system.*west, middle, east"):
         load_system(str(SHIPPED))
 
@@ -137,7 +137,7 @@ def test_a_scenario_of_a_network_has_no_probes(tmp_path: Path) -> None:
 
 
 def test_faults_of_the_acoustic_channel_start_and_end() -> None:
-    faults = AcousticFaults(load_network(SHIPPED), 1)
+    faults = AcousticFaults(load_network(SHIPPED).places, 1)
     assert faults.inject({"id": "deaf", "name": "drop", "bus": "water", "device": "east"}) == "deaf"
     assert [faults.spoils(5, listener, b"x") for listener in (1, 2, 3, 4)] == [False, False, True, False]
     assert faults.describe() == [{"id": "deaf", "name": "drop", "bus": "water", "device": "east", "struck": 1}]

@@ -6,33 +6,33 @@ all systems, for scenarios and reports: every name is prefixed with its system's
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from random import Random
+from typing import Any
 
+from fieldtwin.acoustic.faults import check_water_fault, random_losses
+from fieldtwin.acoustic.schema import SHIP, WATER, NetworkForm, TopsideForm
+from fieldtwin.emulators.faults.loss.drop import Drop
+from fieldtwin.emulators.faults.schema import FaultSpec
 from fieldtwin.emulators.wires.acoustic import AcousticMedium, AcousticProperties, Spoils
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.core.files.nearest import did_you_mean
 from fieldtwin.gateway.core.files.profile import DeviceProfile
 from fieldtwin.gateway.core.files.yaml_file import Key, YamlFile, load, validate
-from fieldtwin.twin.network.schema import NetworkForm, TopsideForm
-from fieldtwin.twin.prototype.file import Prototype, load_prototype
+from fieldtwin.twin.prototype.fault_aims import target
+from fieldtwin.twin.prototype.file import load_prototype
+from fieldtwin.twin.prototype.group import GroupMember, SystemGroup
 from fieldtwin.twin.site.data_files import find, search_path
 from fieldtwin.twin.site.schema import InputForm, PlcForm, ProgramForm
 from fieldtwin.twin.site.system import System, load_system
 
-WATER = "water"
-"""The name of the acoustic channel in faults, used like the name of a bus."""
-SHIP = "ship"
-
 
 @dataclass(frozen=True)
-class Member:
+class Member(GroupMember):
     """A system of a network. `modem` is the device in the acoustic channel, at position `at_m`."""
 
-    name: str
-    system: System
-    prototype: Prototype
     modem: str
     at_m: tuple[float, ...]
 
@@ -43,16 +43,19 @@ class Member:
 
 
 @dataclass(frozen=True)
-class Network:
-    """A network file, resolved. `members` are in the file's order."""
+class Network(SystemGroup):
+    """A network file, resolved."""
 
-    name: str
-    path: Path
-    seed: int
+    members: Mapping[str, Member]
     water: AcousticProperties
-    members: dict[str, Member]
     ship: TopsideForm | None
     file: YamlFile
+
+    kind = "network"
+
+    @property
+    def shared(self) -> tuple[str, ...]:
+        return (WATER,)
 
     @property
     def places(self) -> dict[str, tuple[float, ...]]:
@@ -65,7 +68,6 @@ class Network:
         return AcousticMedium(self.water, self.places, seed, spoils)
 
     def split(self, name: str) -> tuple[str, str]:
-        """Split ``west.ctd.pressure`` into ``west`` and ``ctd.pressure``. Raises `UsageError`."""
         member, _, local = name.partition(".")
         if member not in self.members or not local:
             raise UsageError(
@@ -75,9 +77,37 @@ class Network:
             )
         return member, local
 
+    def check_fault(self, spec: FaultSpec) -> None:
+        if spec.aim.bus == WATER:
+            check_water_fault(self.places, spec)
+        else:
+            target(self.whole, spec)
+
+    def place(self, faults: Iterable[Mapping[str, Any]]) -> dict[str, tuple[dict[str, Any], ...]]:
+        found: dict[str, tuple[dict[str, Any], ...]] = {}
+        for fault in faults:
+            where, local = self.place_of(fault)
+            found[where] = (*found.get(where, ()), local)
+        return found
+
+    def place_of(self, fault: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
+        """Return the system of a fault, or `WATER`, and the fault with that system's own names.
+
+        Raises `UsageError` for an unknown system.
+        """
+        if fault.get("bus") == WATER:
+            return WATER, dict(fault)
+        member, _ = self.split(str(fault.get("device") or fault.get("bus") or ""))
+        local = {key: self.split(said)[1] if key in ("device", "bus") else said for key, said in fault.items()}
+        return member, local
+
+    def random_shared_faults(
+        self, random: Random, kinds: Collection[str], mean_s: float, last_s: float
+    ) -> list[dict[str, Any]]:
+        return [] if kinds and Drop.name not in kinds else random_losses(self.places, random, mean_s, last_s)
+
     @property
     def whole(self) -> System:
-        """All systems combined as one, under prefixed names. For readers only; it must never be run."""
         first = next(iter(self.members.values())).system
         return System(
             name=self.name,
@@ -135,7 +165,7 @@ def load_network(path: Path, profiles: Iterable[Path] = ()) -> Network:
         form.water.overhead_bytes,
         form.water.loss,
     )
-    return Network(form.network, path, form.seed, water, members, form.ship, file)
+    return Network(form.network, path, form.seed, members, water, form.ship, file)
 
 
 def _member(file: YamlFile, form: NetworkForm, name: str, path: Path, profiles: tuple[Path, ...]) -> Member:

@@ -9,24 +9,23 @@ from typing import Any
 import pytest
 from click.testing import CliRunner
 
+from fieldtwin.acoustic.network import load_network
+from fieldtwin.acoustic.schema import WATER
 from fieldtwin.cli.main import cli
 from fieldtwin.emulators.faults.schema import parse_fault
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.results.model import Verdict
 from fieldtwin.results.trace import read_trace
-from fieldtwin.run.processes.topside import Scripted
 from fieldtwin.run.targets.virtual_scenario import run_virtual
-from fieldtwin.run.virtual.fault_schedule import CALM_S, random_network_schedule
-from fieldtwin.run.virtual.network_run import VirtualNetworkOptions, VirtualNetworkRun
+from fieldtwin.run.virtual.fault_schedule import CALM_S, random_schedule
+from fieldtwin.run.virtual.run import VirtualOptions, VirtualRun
 from fieldtwin.scenarios.language.form import load_scenario
-from fieldtwin.twin.network.faults import check_network_fault, placed_all
-from fieldtwin.twin.network.network import WATER, load_network
 
-SHIPPED = Path(__file__).resolve().parents[3] / "profiles" / "systems" / "ocean_network.yaml"
+SHIPPED = Path(__file__).resolve().parents[2] / "profiles" / "systems" / "ocean_network.yaml"
 
 
-def run(seed: int, trace: Path | None = None) -> VirtualNetworkRun:
-    made = VirtualNetworkOptions(str(SHIPPED), 12.0, seed, commands=(Scripted(0.5, 3),), trace=trace).make()
+def run(seed: int, trace: Path | None = None) -> VirtualRun:
+    made = VirtualRun(VirtualOptions(str(SHIPPED), 12.0, seed, commands=(3,), trace=trace))
     made.run()
     return made
 
@@ -97,14 +96,14 @@ def test_a_fault_without_a_target_is_an_error_with_its_place(tmp_path: Path) -> 
 
 def test_a_seed_chooses_faults_of_all_systems_and_of_the_acoustic_channel() -> None:
     network = load_network(SHIPPED)
-    found = random_network_schedule(network, 3, 20_000.0)
-    assert found == random_network_schedule(network, 3, 20_000.0) != random_network_schedule(network, 4, 20_000.0)
-    assert {where for where, faults in placed_all(network, found).items() if faults} == {WATER, *network.members}
+    found = random_schedule(network, 3, 20_000.0)
+    assert found == random_schedule(network, 3, 20_000.0) != random_schedule(network, 4, 20_000.0)
+    assert {where for where, faults in network.place(found).items() if faults} == {WATER, *network.members}
     assert len({fault["id"] for fault in found}) == len(found)
     assert list(found) == sorted(found, key=lambda fault: fault["from"])
     for number, said in enumerate(found, 1):
         spec = parse_fault(dict(said), number=number)
-        check_network_fault(network, spec)
+        network.check_fault(spec)
         assert spec.until_s is not None
         assert spec.until_s <= 20_000 - CALM_S
 

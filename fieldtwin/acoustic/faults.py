@@ -5,10 +5,11 @@ Aimed by the network file, and written like those of a bus.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from random import Random
 from typing import Any
 
+from fieldtwin.acoustic.schema import WATER
 from fieldtwin.emulators.faults.engine import WireFaults
 from fieldtwin.emulators.faults.fault import Active
 from fieldtwin.emulators.faults.frames import Frame, Framing, Way
@@ -17,24 +18,29 @@ from fieldtwin.emulators.faults.schema import FaultSpec, parse_fault
 from fieldtwin.emulators.faults.wrong_aim import WrongAim
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.errors import UsageError
-from fieldtwin.twin.network.network import WATER, Network
 from fieldtwin.twin.prototype.fault_aims import known
 from fieldtwin.twin.prototype.fault_history import FaultHistory
 
 MOST = 1_000
+MOST_AT_RANDOM = 500
+RARER = 2.5
+"""How much longer the mean time between two random losses is than that between two faults of a system."""
+SHORTEST_S, LONGEST_S = 0.5, 60.0
+"""The shortest and the longest random loss, in seconds."""
 _AIMS = frozenset({"bus", "device", "nth", "every", "from_", "until", "probability", "optional"})
 
 
 class AcousticFaults:
     """The active faults. `start_ns` is when the run began; `from` and `until` count from then."""
 
-    def __init__(self, network: Network, seed: int) -> None:
+    def __init__(self, places: Collection[str], seed: int) -> None:
+        """`places`: the names of the modems in the channel."""
         self.start_ns = 0
-        self._network = network
+        self._places = places
         self._seed = seed
         self._wire = WireFaults(Framing.RAW)
         self.history = FaultHistory()
-        self._numbers = {name: number for number, name in enumerate(network.places, 1)}
+        self._numbers = {name: number for number, name in enumerate(places, 1)}
 
     def spoils(self, t_ns: int, listener: int, payload: bytes) -> bool:
         """Return whether a fault strikes this packet (`fieldtwin.emulators.wires.acoustic.Spoils`)."""
@@ -43,7 +49,7 @@ class AcousticFaults:
     def inject(self, said: Mapping[str, Any]) -> str:
         """Inject a fault and return its id. Raises `UsageError`."""
         spec = parse_fault(dict(said), number=len(self._wire.active) + 1)
-        check_water_fault(self._network, spec)
+        check_water_fault(self._places, spec)
         if spec.id in self._wire.active:
             raise UsageError(
                 f"the fault {spec.id!r} is already active", hint="clear it first, or choose a different id"
@@ -77,8 +83,8 @@ class AcousticFaults:
         ]
 
 
-def check_water_fault(network: Network, spec: FaultSpec) -> None:
-    """Raises `WrongAim` for a fault that does not apply to the acoustic channel, or a modem that is not in it."""
+def check_water_fault(places: Collection[str], spec: FaultSpec) -> None:
+    """Raise `WrongAim` for a fault that does not apply to the acoustic channel, or a modem that is not in it."""
     if spec.kind is not Drop:
         raise WrongAim("name", f"fault {spec.kind.name!r} does not exist on the acoustic channel", expected=Drop.name)
     for key in sorted(spec.aim.model_fields_set - _AIMS):
@@ -86,4 +92,25 @@ def check_water_fault(network: Network, spec: FaultSpec) -> None:
             key, f"{key!r} has no meaning on the acoustic channel", expected="device: the modem that receives nothing"
         )
     if spec.aim.device:
-        known("modem on the acoustic channel", spec.aim.device, network.places, "device")
+        known("modem on the acoustic channel", spec.aim.device, places, "device")
+
+
+def random_losses(places: Collection[str], random: Random, mean_s: float, last_s: float) -> list[dict[str, Any]]:
+    """Return random losses of packets, at all modems or at one, in the form of a fault file.
+
+    `mean_s`: mean seconds between two faults of a system; `last_s`: the time in seconds at which all are over.
+    """
+    found: list[dict[str, Any]] = []
+    mean_s *= RARER
+    at_s, number = random.expovariate(1 / mean_s), 0
+    while at_s < last_s and number < MOST_AT_RANDOM:
+        number += 1
+        until_s = min(last_s, at_s + random.uniform(SHORTEST_S, LONGEST_S))
+        lost: dict[str, Any] = {"id": f"{WATER}-f{number}", "name": Drop.name, "bus": WATER}
+        if random.random() < 0.5:
+            lost["device"] = random.choice(list(places))
+        lost |= {"from": round(at_s, 3), "until": round(until_s, 3), "probability": round(random.uniform(0.1, 1.0), 2)}
+        if lost["until"] > lost["from"]:
+            found.append(lost)
+        at_s += random.expovariate(1 / mean_s)
+    return found

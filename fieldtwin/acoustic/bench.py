@@ -10,6 +10,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
+from fieldtwin.acoustic.faults import AcousticFaults
+from fieldtwin.acoustic.network import Network
+from fieldtwin.acoustic.schema import WATER
 from fieldtwin.conformance.core.case import Impact
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.errors import UsageError
@@ -18,9 +21,6 @@ from fieldtwin.results.model import Struck
 from fieldtwin.results.trace import Kind, Trace
 from fieldtwin.run.processes.topside import TopsideController
 from fieldtwin.scenarios.bench import Bench, Can, Stopped, TagReading
-from fieldtwin.twin.network.faults import placed
-from fieldtwin.twin.network.network import WATER, Network
-from fieldtwin.twin.network.water_faults import AcousticFaults
 
 
 class MemberTrace(Trace):
@@ -140,7 +140,7 @@ class NetworkBench:
         await part.bench.set_value(local, tag, value)
 
     async def inject(self, fault: dict[str, Any]) -> None:
-        where, local = placed(self.network, fault)
+        where, local = self.network.place_of(fault)
         if where == WATER:
             id = self.faults.inject(fault)
             self._where[id] = WATER

@@ -1,0 +1,32 @@
+"""The verdict on a run of a network: those on its systems, and the events in the acoustic channel."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from fieldtwin.__about__ import __version__
+
+
+def summarise_network(
+    name: str,
+    systems: Mapping[str, dict[str, Any]],
+    channel: Mapping[str, Any],
+    errors: Sequence[str],
+    elapsed_s: float,
+) -> dict[str, Any]:
+    """Return plain data for `--json` and for printing. `ok` if all systems are, and nothing else failed.
+
+    `systems`: each system's own summary. `channel`: ``water`` (the counters of each modem), ``faults`` (of the channel)
+    and ``ship`` (what the topside modem sent and heard; None without one).
+    """
+    return {
+        "fieldtwin": __version__,
+        "network": name,
+        "prototype": True,
+        "systems": dict(systems),
+        **channel,
+        "errors": list(errors),
+        "ok": not errors and all(one["ok"] for one in systems.values()),
+        "duration_s": round(elapsed_s, 3),
+    }

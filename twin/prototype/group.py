@@ -1,0 +1,115 @@
+"""Systems that run together as prototypes. A system alone is a group of one, whose name is empty.
+
+A file that describes several systems has a kind (`fieldtwin.twin.site.groups`), which says what the systems share.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from random import Random
+from typing import Any, ClassVar, cast
+
+from fieldtwin.emulators.faults.schema import FaultSpec
+from fieldtwin.twin.prototype.fault_aims import target
+from fieldtwin.twin.prototype.file import Prototype
+from fieldtwin.twin.site.groups import group_file, group_module
+from fieldtwin.twin.site.system import System
+
+
+@dataclass(frozen=True)
+class GroupMember:
+    """One of the systems. `name` is empty for a system alone."""
+
+    name: str
+    system: System
+    prototype: Prototype
+
+    @property
+    def prefix(self) -> str:
+        """The beginning of each of this system's names in the group: ``west.``; empty for a system alone."""
+        return f"{self.name}." if self.name else ""
+
+
+@dataclass(frozen=True)
+class SystemGroup(ABC):
+    """The systems of a run, and how names and faults are assigned to them. `members` are in the file's order; `seed` is the file's."""
+
+    name: str
+    path: Path
+    seed: int
+    members: Mapping[str, GroupMember]
+
+    kind: ClassVar[str] = ""
+    """The registered kind of the file; empty for a system alone."""
+
+    @property
+    @abstractmethod
+    def whole(self) -> System:
+        """All systems combined as one, under the group's names. For readers only; it must never be run."""
+
+    @property
+    def shared(self) -> tuple[str, ...]:
+        """The names of what the systems share, at which faults can be aimed as at a bus."""
+        return ()
+
+    @abstractmethod
+    def split(self, name: str) -> tuple[str, str]:
+        """Split ``west.ctd.pressure`` into ``west`` and ``ctd.pressure``. Raises `UsageError` for an unknown system."""
+
+    @abstractmethod
+    def check_fault(self, spec: FaultSpec) -> None:
+        """Check a fault's aim. Raises `WrongAim` if it is neither in a system nor in what they share."""
+
+    @abstractmethod
+    def place(self, faults: Iterable[Mapping[str, Any]]) -> dict[str, tuple[dict[str, Any], ...]]:
+        """Return the faults by system, under that system's own names, or by what the systems share.
+
+        A system without a fault is not included. Raises `UsageError` for an unknown system.
+        """
+
+    def random_shared_faults(
+        self, random: Random, kinds: Collection[str], mean_s: float, last_s: float
+    ) -> list[dict[str, Any]]:
+        """Return random faults of what the systems share, in the form of a fault file, all over by `last_s` seconds.
+
+        `kinds`: names of faults; empty: all. `mean_s`: mean seconds between two faults of a system.
+        """
+        return []
+
+
+class OneSystem(SystemGroup):
+    """A system alone, as `one_system` makes it."""
+
+    @property
+    def whole(self) -> System:
+        return self.members[""].system
+
+    def split(self, name: str) -> tuple[str, str]:
+        return "", name
+
+    def check_fault(self, spec: FaultSpec) -> None:
+        target(self.whole, spec)
+
+    def place(self, faults: Iterable[Mapping[str, Any]]) -> dict[str, tuple[dict[str, Any], ...]]:
+        return {"": tuple(dict(fault) for fault in faults)}
+
+
+def one_system(system: System, prototype: Prototype) -> OneSystem:
+    """Return a system as a group of one."""
+    return OneSystem(system.name, system.path, prototype.seed, {"": GroupMember("", system, prototype)})
+
+
+def load_group(name: str, profiles: Iterable[Path] = ()) -> SystemGroup | None:
+    """Read the file that `name` refers to if it describes several systems, with all files that it names; else None.
+
+    Raises `FileInvalid` with the place of the error.
+    """
+    profiles = tuple(profiles)
+    found = group_file(name, profiles)
+    if found is None:
+        return None
+    kind, path = found
+    return cast(SystemGroup, group_module(kind).load(path, profiles))

@@ -35,7 +35,10 @@ class GroupMember:
 
 @dataclass(frozen=True)
 class SystemGroup(ABC):
-    """The systems of a run, and how names and faults are assigned to them. `members` are in the file's order; `seed` is the file's."""
+    """The systems of a run, and how names and faults are assigned to them.
+
+    `members` are in the file's order; `seed` is the file's.
+    """
 
     name: str
     path: Path

@@ -1,6 +1,7 @@
 """The interface of a kind of file that describes several systems, for runs, scenarios and commands.
 
-The kinds are registered in `fieldtwin.twin.site.groups`. A system alone runs in virtual time by the same interface (`virtual_kind`).
+The kinds are registered in `fieldtwin.twin.site.groups`. A system alone runs in virtual time by the same
+interface (`virtual_kind`).
 """
 
 from __future__ import annotations

@@ -194,10 +194,19 @@ class Place:
         """Return ``pump.st:14``; the path alone if the line is not known, "" if neither is known."""
         path, line = self.path, self.line
         if self.code is not None:
-            path = self.code.co_filename
+            path = _within_its_import_path(self.code.co_filename)
             lines = [place[0] for place in self.code.co_positions()]
             line = (lines[self.instruction // 2] if self.instruction // 2 < len(lines) else None) or 0
         return f"{path}:{line}" if line else path
+
+
+def _within_its_import_path(path: str) -> str:
+    """Return ``plc/control.py``, the file of a module as seen from its entry of `sys.path`.
+
+    A place is recorded in traces, which must not differ between two computers or folders.
+    """
+    folders = [entry for entry in sys.path if entry and path.startswith(entry.rstrip("/") + "/")]
+    return path[len(max(folders, key=len).rstrip("/")) + 1 :] if folders else path
 
 
 class _Assigned:

@@ -102,6 +102,10 @@ COMMANDS = {
         "Show the events of a run: decoded frames, JSON, or waveforms.",
     ),
     "schema": ("fieldtwin.cli.system.schema_command", "Print the JSON schema of a kind of file."),
+    "explain": (
+        "fieldtwin.cli.system.explain_command",
+        "Explain a test case, a fault, a code or a word of a message.",
+    ),
     "doctor": ("fieldtwin.cli.system.doctor_command", "Check what this computer supports, and what to change."),
 }
 SECTIONS = {

@@ -23,7 +23,7 @@ class Blame(Enum):
 
     USER = "the command line"
     FILE = "the file"
-    WIRE = "the wire"
+    WIRE = "the bus or link"
     DEVICE = "the device"
     HOST = "this computer"
     FIELDTWIN = "fieldtwin itself"

@@ -1,0 +1,28 @@
+"""An explanation: what an ID, a code or a word means, where it is defined, and what to do about it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Explanation:
+    """An entry of `fieldtwin explain`.
+
+    `id` is what is printed elsewhere, such as ``MB-015`` or ``exception 02``. `also` are further spellings that find it.
+    `meaning` says in a few sentences what it is and how it comes about, `todo` what to do. `source` is the clause of the
+    standard, or the page of the documentation.
+    """
+
+    id: str
+    kind: str
+    title: str
+    meaning: str
+    todo: str
+    source: str = ""
+    also: tuple[str, ...] = ()
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """All spellings that find the entry, in lower case."""
+        return tuple(dict.fromkeys(word.lower() for word in (self.id, *self.also)))

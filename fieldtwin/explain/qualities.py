@@ -32,8 +32,8 @@ _REASONS: dict[Reason, tuple[str, str]] = {
     ),
     Reason.STALE: (
         "The last good value is older than the tag's maximum age, so it may no longer be true.",
-        "The device is polled too seldom (`period_ms`), answers too slowly, or the bus is full: see the exchanges per "
-        "second in the live view. `stale_after_ms` of the device sets the maximum age.",
+        "The device is polled too seldom (`every_ms` under `poll`), answers too slowly, or the bus is full: see the exchanges "
+        "per second in the live view. `stale_after_ms` of the device sets the maximum age.",
     ),
     Reason.NOT_SAMPLING: (
         "The device answers, but its sample counter does not advance: it repeats an old measurement.",

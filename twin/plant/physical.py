@@ -41,10 +41,12 @@ PLC_LOST_CYCLES = 50
 PLC_LOST_MS = 500
 GATEWAY_LOST_MS = 1000
 MIN_STUCK_MS = 200
+IDLE_CYCLE_MS = 100
+"""The cycle of a PLC without programs, which only publishes its heartbeat."""
 
 
 def fastest_ms(system: System) -> int:
-    """Return the interval of the PLC's fastest cyclic task, which is how often the PLC publishes."""
+    """Return the interval of the PLC's fastest cyclic task, which is how often gateway and PLC publish."""
     intervals = [task.interval_ms for task in system.plc.tasks.values() if task.interval_ms]
     return min(intervals, default=system.plc.cycle_ms)
 
@@ -204,7 +206,7 @@ def plc_config(system: System, run_dir: Path, *, cold: bool = False) -> PlcConfi
         control_path=str(run_dir / "plc.sock"),
         audit_path=str(run_dir / "audit.jsonl"),
         programs=programs_of(system),
-        cycle_ms=float(fastest_ms(system)),
+        cycle_ms=float(fastest_ms(system) if system.plc.programs else IDLE_CYCLE_MS),
         late_ms=float(watchdog.late_ms),
         stop_after=watchdog.stop_after,
         heartbeat_limit_ms=float(gateway_lost_ms(system)),

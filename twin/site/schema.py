@@ -213,7 +213,7 @@ class PlcForm(Strict):
         default="end", description="start: a scan's outputs change at the next cycle"
     )
     tasks: dict[Name, TaskForm] = Field(default={}, description="default: one, every cycle_ms")
-    programs: dict[Name, ProgramForm] = Field(min_length=1)
+    programs: dict[Name, ProgramForm] = Field(default={}, description="none: another controller commands, or nobody")
 
 
 class ServedTagForm(Strict):
@@ -323,7 +323,7 @@ class SystemForm(Strict):
     system: Name
     buses: dict[Name, BusForm] = Field(min_length=1)
     devices: dict[Name, DeviceForm] = Field(min_length=1)
-    plc: PlcForm
+    plc: PlcForm = Field(default=PlcForm(), description="default: no programs, only the gateway")
     remote: Literal["local", "remote"] = "local"
     commands: CommandsForm = CommandsForm()
     serve: dict[Name, ServeForm] = {}

@@ -214,7 +214,7 @@ def line(session: RunSession) -> str:
     parts.append(f"tags_good={sum(t['quality'] == 'good' for t in tags.values())}/{len(tags)}")
     requests = sum(_requests(bus) for bus in gateway.get("buses", {}).values())
     parts.append(f"requests={requests}")
-    if plc is not None:
+    if plc is not None and session.system.plc.programs:
         parts.append(f"scans={plc.scans} late_p99_us={_p99(plc)}")
     parts.append(f"errors={len(session.errors)}")
     if plc is not None and plc.state == "paused":
@@ -322,13 +322,13 @@ def age_text(age_s: float | None) -> str:
 def _foot(session: RunSession) -> Text:
     gateway, plc = session.gateway_status or {}, session.plc_status
     text = Text()
-    if plc is not None:
+    if plc is not None and session.system.plc.programs:
         late = plc.lateness_us
         lateness = " ".join(f"{key} {_us(late, key)}" for key in ("p50", "p99", "max"))
         text.append("scan ", "dim")
         text.append(f"{plc.cycle_ms:g} ms  #{plc.scans}  late {lateness}")
         text.append(f"  missed {plc.missed_periods}  {plc.state}")
-    elif session.children.get("plc"):
+    elif plc is None and session.children.get("plc"):
         text.append("PLC: no answer", "bold red")
     for name, box in gateway.get("mailboxes", {}).items():
         text.append(f"\n{name} ", "dim")

@@ -17,7 +17,8 @@ def tree(wires: Wiring, columns: int = 1000) -> str:
     branches: list[tuple[str, str, list[Cells]]] = [
         (wire.name, _wire_line(wire), [_station_cells(station) for station in wire.stations]) for wire in wires.wires
     ]
-    branches.append(("plc", "", [_logic_cells(logic) for logic in wires.programs]))
+    if wires.programs:
+        branches.append(("plc", "", [_logic_cells(logic) for logic in wires.programs]))
     if wires.servers:
         branches.append(("answers", "", [_server_cells(server) for server in wires.servers]))
     widest = max(len(name) for name, _, _ in branches)

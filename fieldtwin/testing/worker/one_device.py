@@ -59,7 +59,6 @@ def write_system(wanted: Wanted, folder: Path, profiles: tuple[Path, ...] = (), 
         "system": "test",
         "buses": {BUS: {"url": plant}},
         "devices": {DEVICE: {"profile": str(path.resolve()), "bus": BUS, "node" if can else "unit": unit}},
-        "plc": {"programs": {"none": {"source": "none.st"}}},  # no PLC runs here, but a system file must have a program
     }
     emulated = _stand_in(wanted, profile, path, beside)
     prototype = {

@@ -1,13 +1,13 @@
-"""Options of campaigns: seeds, and faults that each seed chooses."""
+"""Options of many runs in virtual time: seeds, and faults that each seed chooses."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import wraps
-from typing import TYPE_CHECKING, Any, NamedTuple
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import click
 
+from fieldtwin.cli.option_groups import option
 from fieldtwin.cli.options import Duration
 from fieldtwin.gateway.core.errors import UsageError
 
@@ -19,58 +19,43 @@ def _each(context: click.Context, param: click.Parameter, value: str) -> tuple[s
     return tuple(part.strip() for part in value.split(",") if part.strip())
 
 
-_CHOICE = (
-    click.option(
+@dataclass(frozen=True)
+class SeedOptions:
+    """The seeds of several runs, as text such as ``1..200`` or empty, and the number of runs at a time."""
+
+    seeds: str = option(
+        "--seeds",
+        default="",
+        metavar="1..200",
+        help="In virtual time: one run for each of these seeds, such as 1..200.",
+    )
+    jobs: int = option("--jobs", type=click.IntRange(1, 256), default=1, help="Number of --seeds runs at a time.")
+
+
+@dataclass(frozen=True)
+class FaultChoice:
+    """The faults from which a seed chooses. `fault_every` is in seconds; None: the default interval."""
+
+    fault_every: float | None = option(
         "--fault-every",
         type=Duration(),
         default=None,
         help="With random faults: mean time between two faults; default: 2min.",
-    ),
-    click.option(
+    )
+    fault_kinds: tuple[str, ...] = option(
         "--fault-kinds",
         default="",
         callback=_each,
         metavar="NAME,...",
         help="With random faults: only these (see fieldtwin faults); value faults occur only if they are named here.",
-    ),
-    click.option(
+    )
+    fault_aims: tuple[str, ...] = option(
         "--fault-aims",
         default="",
         callback=_each,
         metavar="AIM,...",
         help="With random faults: only on these targets (DEVICE, BUS or DEVICE.TAG); default: every device.",
-    ),
-)
-_CAMPAIGN = (
-    click.option(
-        "--seeds",
-        default="",
-        metavar="1..200",
-        help="In virtual time: one run for each of these seeds, such as 1..200.",
-    ),
-    click.option("--jobs", type=click.IntRange(1, 256), default=1, help="Number of --seeds runs at a time."),
-    click.option(
-        "--faults",
-        type=click.Choice(["random"]),
-        default=None,
-        help="With --seeds: random faults, chosen by each seed. Only always, never, within and invariants are then checked.",
-    ),
-    click.option(
-        "--for",
-        "duration_s",
-        type=Duration(),
-        default=0.0,
-        help="With random faults: length of a run; default: the maximum time of the steps, at least 10min.",
-    ),
-)
-
-
-class Choice(NamedTuple):
-    """The options for random faults. `every_s` None: the default interval."""
-
-    every_s: float | None
-    kinds: tuple[str, ...]
-    aims: tuple[str, ...]
+    )
 
     def of(self, faults: str | None) -> RandomFaults | None:
         """Return the faults that seeds may choose; None without random faults.
@@ -78,7 +63,7 @@ class Choice(NamedTuple):
         Raise `UsageError` for options without effect.
         """
         if faults != "random":
-            if self.every_s is not None or self.kinds or self.aims:
+            if self.fault_every is not None or self.fault_kinds or self.fault_aims:
                 raise UsageError(
                     "--fault-every, --fault-kinds and --fault-aims choose random faults", expected="--faults random"
                 )
@@ -86,52 +71,36 @@ class Choice(NamedTuple):
         # imported here, because it loads emulators, which a plant does not need
         from fieldtwin.run.virtual.fault_schedule import MEAN_S, RandomFaults
 
-        return RandomFaults(MEAN_S if self.every_s is None else self.every_s, self.kinds, self.aims)
+        every_s = MEAN_S if self.fault_every is None else self.fault_every
+        return RandomFaults(every_s, self.fault_kinds, self.fault_aims)
 
 
-class CampaignRequest(NamedTuple):
-    """The options of a campaign. `seeds` is empty if no campaign was requested."""
+@dataclass(frozen=True)
+class _ScenarioRuns(SeedOptions):
+    """The runs of a campaign of scenarios: their faults, and their length in seconds, 0 for the default."""
 
-    seeds: str
-    jobs: int
-    faults: str | None
-    duration_s: float
-    choice: Choice
+    faults: str | None = option(
+        "--faults",
+        type=click.Choice(["random"]),
+        default=None,
+        help="With --seeds: random faults, chosen by each seed. Only always, never, within and invariants are then checked.",
+    )
+    duration_s: float = option(
+        "--for",
+        type=Duration(),
+        default=0.0,
+        help="With random faults: length of a run; default: the maximum time of the steps, at least 10min.",
+    )
+
+
+@dataclass(frozen=True)
+class CampaignOptions(FaultChoice, _ScenarioRuns):
+    """The options of a campaign of scenarios. `seeds` is empty if no campaign was requested."""
 
     def check(self) -> None:
         """Raise `UsageError` for options that have no effect without --seeds, or without random faults."""
-        self.choice.of(self.faults)
+        self.of(self.faults)
         if not self.seeds and (self.faults or self.jobs != 1 or self.duration_s):
             raise UsageError("--faults, --for and --jobs of scenarios need --seeds", expected="--seeds 1..200")
         if self.duration_s and not self.faults:
             raise UsageError("--for needs --faults random: without it the steps determine the length of a run")
-
-
-def fault_choice(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options that choose random faults; the command gets them as `choice`."""
-
-    @wraps(function)
-    def with_choice(*args: Any, **named: Any) -> Any:
-        said = Choice(named.pop("fault_every"), named.pop("fault_kinds"), named.pop("fault_aims"))
-        return function(*args, choice=said, **named)
-
-    return _with(with_choice, _CHOICE)
-
-
-def campaign_options(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options of a campaign of scenarios; the command gets them as `campaign`."""
-
-    @wraps(function)
-    def with_campaign(*args: Any, choice: Choice, **named: Any) -> Any:
-        request = CampaignRequest(
-            named.pop("seeds"), named.pop("jobs"), named.pop("faults"), named.pop("duration_s"), choice
-        )
-        return function(*args, campaign=request, **named)
-
-    return _with(fault_choice(with_campaign), _CAMPAIGN)
-
-
-def _with(function: Callable[..., Any], options: tuple[Callable[..., Any], ...]) -> Callable[..., Any]:
-    for option in reversed(options):
-        function = option(function)
-    return function

@@ -21,6 +21,10 @@ from fieldtwin.cli.broken_pipe import VERDICTS, talk_unheard, to_nowhere, verdic
 
 COMMANDS = {
     "run": ("fieldtwin.cli.run.run_command", "Run a system: the plant, or its prototype."),
+    "simulate": (
+        "fieldtwin.cli.run.simulate_command",
+        "Simulate a system in virtual time, with seeds and random faults.",
+    ),
     "reload": ("fieldtwin.cli.run.reload_command", "Let a running instance read its files again, between two polls."),
     "emulate": ("fieldtwin.cli.emulate.emulate_command", "Emulate the field devices of a system, or one device."),
     "plc": (
@@ -110,7 +114,7 @@ COMMANDS = {
 }
 SECTIONS = {
     "Run a system, or parts of it": (
-        *("run", "reload", "emulate", "with", "plc"),
+        *("run", "simulate", "reload", "emulate", "with", "plc"),
         *("shore", "link", "bridge", "can-bus", "draw"),
     ),
     "Examine a device": (

@@ -102,9 +102,10 @@ def pairs(values: tuple[str, ...], what: str) -> dict[str, str]:
 
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print data as JSON on stdout.")
-profiles_option = click.option(
-    "--profiles",
-    multiple=True,
-    type=click.Path(exists=True, file_okay=False),
-    help="A folder with devices/ and systems/, searched before FIELDTWIN_PROFILES, ./profiles and the shipped ones.",
-)
+PROFILES: dict[str, Any] = {
+    "multiple": True,
+    "type": click.Path(exists=True, file_okay=False, path_type=Path),
+    "help": "A folder with devices/ and systems/, searched before FIELDTWIN_PROFILES, ./profiles and the shipped ones.",
+}
+"""The arguments of `profiles_option`, also for groups of options."""
+profiles_option = click.option("--profiles", **PROFILES)

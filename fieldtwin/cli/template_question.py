@@ -3,29 +3,42 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import click
 from rich.markup import escape
 
+from fieldtwin.cli.option_groups import option
+from fieldtwin.cli.options import PROFILES
 from fieldtwin.console import stderr
 from fieldtwin.run.template import Ask, ForeignParts
 
 SHOWN = 5
+TRUST: dict[str, Any] = {
+    "is_flag": True,
+    "help": "Do not ask before running a template's Python code and opening its endpoints.",
+}
+"""The arguments of the option --trust."""
 
-trust_option = click.option(
-    "--trust", is_flag=True, help="Do not ask before running a template's Python code and opening its endpoints."
-)
+
+@dataclass(frozen=True)
+class SourceOptions:
+    """The folders in which profiles and systems are searched first, and the user's consent to a template's code."""
+
+    profiles: tuple[Path, ...] = option("--profiles", **PROFILES)
+    trust: bool = option("--trust", **TRUST)
+
+    def ask(self, *, runs_code: bool = True) -> Ask:
+        """Return how consent is given: by the user at the terminal, or beforehand with --trust, or if no code is run."""
+        return lambda template: self.trust or not runs_code or ask_about(template)
 
 
 def shown(what: tuple[str, ...], between: str = ", ") -> str:
     """Return the first few names, and the number of the rest."""
     more = f"{between}and {len(what) - SHOWN} more" if len(what) > SHOWN else ""
     return escape(between.join(what[:SHOWN])) + more
-
-
-def consent(*, trust: bool) -> Ask:
-    """How consent is given: by the user at the terminal, or beforehand with --trust."""
-    return lambda template: trust or ask_about(template)
 
 
 def ask_about(template: ForeignParts) -> bool:

@@ -154,9 +154,8 @@ def test_faults_of_the_acoustic_channel_start_and_end() -> None:
     [
         (["--plant"], "each of its systems is a separate plant"),
         (["--prototype", "--speed", "2"], "--speed: not available for a network"),
-        (["--prototype", "--virtual"], "--virtual needs an end time"),
         (["--prototype", "--thread", "tcp://127.0.0.1:7700"], "a separate thread and port"),
-        (["--prototype", "--seed", "3"], "--seed and --trace need --virtual"),
+        (["--prototype", "--seed", "3"], "use `fieldtwin simulate"),
     ],
 )
 def test_unsupported_requests_of_a_network(words: list[str], said: str) -> None:

@@ -52,7 +52,7 @@ def test_the_same_seed_gives_the_same_run_and_everything_is_checked(tmp_path: Pa
 
 
 def test_a_run_on_the_command_line() -> None:
-    words = ["run", "ocean_network", "--prototype", "--virtual", "--for", "3s", "--commands", "none"]
+    words = ["simulate", "ocean_network", "--for", "3s", "--commands", "none"]
     result = CliRunner().invoke(cli, [*words, "--json"], standalone_mode=False)
     summary = json.loads(result.stdout)
     assert summary["ok"]
@@ -70,7 +70,7 @@ FAULTS = """faults:
 
 def on_the_command_line(folder: Path, *words: str) -> Any:
     (folder / "f.yaml").write_text(FAULTS)
-    line = ["run", "ocean_network", "--prototype", "--virtual", *words]
+    line = ["simulate", "ocean_network", *words]
     return CliRunner().invoke(cli, line, standalone_mode=False)
 
 

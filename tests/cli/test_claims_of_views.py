@@ -19,23 +19,23 @@ from rich.console import Console
 from rich.table import Table
 from support import eventually, run
 
-from fieldtwin.cli.run.run_command import command as run_system
+from fieldtwin.cli.run.simulate_command import command as simulate
 from fieldtwin.console import stderr, stdout
 from fieldtwin.gateway.core.files.recording import looks_like_another_file
 from fieldtwin.gateway.devices.config import Heartbeat
 from fieldtwin.run.processes import plc_client
 
 SILENT = "faults: [{name: silence, device: ctd}]\n"
-VIRTUAL = ["observatory", "--prototype", "--virtual", "--for", "5s"]
+VIRTUAL = ["observatory", "--for", "5s"]
 
 
 def test_a_run_with_faults_reports_that_it_did_not_check_devices(tmp_path: Path) -> None:
     (tmp_path / "faults.yaml").write_text(SILENT)
-    done = CliRunner().invoke(run_system, [*VIRTUAL, "--faults", str(tmp_path / "faults.yaml")], standalone_mode=False)
+    done = CliRunner().invoke(simulate, [*VIRTUAL, "--faults", str(tmp_path / "faults.yaml")], standalone_mode=False)
     assert (
         "not checked    whether devices and outputs were good at the end, because faults were injected" in done.stdout
     )
-    assert "not checked" not in CliRunner().invoke(run_system, VIRTUAL, standalone_mode=False).stdout
+    assert "not checked" not in CliRunner().invoke(simulate, VIRTUAL, standalone_mode=False).stdout
 
 
 def test_the_audit_log_names_only_writes_of_the_start_up(tmp_path: Path) -> None:

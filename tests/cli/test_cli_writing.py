@@ -51,7 +51,7 @@ def test_a_command_that_was_nearly_meant() -> None:
 
 def test_a_locale_without_arrows() -> None:
     ended = subprocess.run(
-        [sys.executable, "-m", "fieldtwin", "run", "observatory", "--prototype", "--virtual", "--for", "4s"],
+        [sys.executable, "-m", "fieldtwin", "simulate", "observatory", "--for", "4s"],
         capture_output=True, check=False, env={**os.environ, "PYTHONPATH": str(ROOT), "PYTHONIOENCODING": "ascii"},
     )  # fmt: skip
     assert ended.returncode == 0, ended.stderr

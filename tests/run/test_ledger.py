@@ -56,10 +56,10 @@ def test_a_campaign_that_the_ledger_knows_as_failed_does_not_end_ok(tmp_path: Pa
     """Defect: with --ledger a seed that had failed was not repeated, and the campaign ended with ok."""
     from click.testing import CliRunner
 
-    from fieldtwin.cli.run.run_command import command
+    from fieldtwin.cli.run.simulate_command import command
 
     path = tmp_path / "ledger.jsonl"
-    words = ["observatory", "--prototype", "--virtual", "--for", "2s", "--seeds", "1..2", "--jobs", "1"]
+    words = ["observatory", "--for", "2s", "--seeds", "1..2", "--jobs", "1"]
     words += ["--ledger", str(path)]
     assert CliRunner().invoke(command, words, standalone_mode=False).return_value == 0
     first, second = path.read_text().splitlines()

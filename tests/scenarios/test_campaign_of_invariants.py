@@ -1,6 +1,6 @@
 """A scenario's rules and the invariants of the system file are checked while faults chosen by each seed are active.
 
-Defect: random faults were only available in ``run --virtual``, which checks published values only. A campaign never found a
+Defect: random faults were only available in `fieldtwin simulate`, which checks published values only. A campaign never found a
 pump that runs on while its level sensor is silent (no dry-run protection).
 """
 
@@ -13,7 +13,7 @@ from xml.etree import ElementTree as ET
 import pytest
 from click.testing import CliRunner
 
-from fieldtwin.cli.run.run_command import command as run_command
+from fieldtwin.cli.run.simulate_command import command as simulate_command
 from fieldtwin.cli.test.test_command import command as judge_command
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.results.model import Verdict
@@ -157,23 +157,23 @@ def test_an_invariant_of_the_system_file_holds_in_scenarios_campaigns_and_runs(f
     assert run_virtual(load_scenario(path)).reason.startswith("invariant within 1: ")
     faults = folder / "faults.yaml"
     faults.write_text("faults:\n  - {id: dead, name: silence, device: sensor, from: 5s, until: 20s}\n")
-    words = ["plant.yaml", "--prototype", "--virtual", "--for", "100s", "--faults", str(faults), "--json"]
-    summary = json.loads(CliRunner().invoke(run_command, words, standalone_mode=False).stdout)
+    words = ["plant.yaml", "--for", "100s", "--faults", str(faults), "--json"]
+    summary = json.loads(CliRunner().invoke(simulate_command, words, standalone_mode=False).stdout)
     assert not summary["ok"]
     assert [one["verdict"] for one in summary["invariants"]] == ["passed", "failed"]
     assert any("invariant within 1: not well.runs" in error and "plant.yaml:" in error for error in summary["errors"])
     (folder / "well.st").write_text(PROTECTED)
     assert run_virtual(load_scenario(path)).verdict is Verdict.PASSED
     assert judge("plain.scenario.yaml", "--seeds", "1..4", *RANDOM)[0] == 0
-    summary = json.loads(CliRunner().invoke(run_command, words, standalone_mode=False).stdout)
+    summary = json.loads(CliRunner().invoke(simulate_command, words, standalone_mode=False).stdout)
     assert summary["ok"], summary["errors"]
     assert [one["verdict"] for one in summary["invariants"]] == ["passed", "passed"]
 
 
 def test_a_campaign_of_runs_finds_a_broken_invariant_and_confirms_its_scenario(folder: Path) -> None:
     (folder / "plant.yaml").write_text(PLANT + INVARIANTS)
-    words = ["plant.yaml", "--prototype", "--virtual", "--for", "6min", "--seeds", "1..4", *RANDOM[:2], *RANDOM[4:]]
-    told = CliRunner().invoke(run_command, words, standalone_mode=False)
+    words = ["plant.yaml", "--for", "6min", "--seeds", "1..4", *RANDOM[:2], *RANDOM[4:]]
+    told = CliRunner().invoke(simulate_command, words, standalone_mode=False)
     assert (told.return_value, CONFIRMED in told.output) == (1, True), told.output
     assert "invariant within 1: not well.runs" in told.output
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from fieldtwin.cli.run.run_command import command
+from fieldtwin.cli.run.simulate_command import command
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -34,7 +34,7 @@ def test_a_run_without_identities_is_ok(tmp_path: Path, system: str, files: str)
     prototype.write_text(re.sub(r",? *identity: \{[^}]*\}", "", stated))
     assert prototype.read_text() != stated
     plant.write_text(re.sub(r" +expect: \{[^}]*\}", "", plant.read_text()))
-    words = [str(plant), "--prototype", "--virtual", "--for", "20s", "--json"]
+    words = [str(plant), "--for", "20s", "--json"]
     told = CliRunner().invoke(command, words, standalone_mode=False)
     summary = json.loads(told.stdout)
     assert summary["ok"], summary["errors"]

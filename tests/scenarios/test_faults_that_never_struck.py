@@ -13,7 +13,7 @@ from xml.etree import ElementTree as ET
 import pytest
 from click.testing import CliRunner
 
-from fieldtwin.cli.run.run_command import command as run_command
+from fieldtwin.cli.run.simulate_command import command as simulate_command
 from fieldtwin.cli.test.test_command import command as judge_command
 from fieldtwin.reports.junit import write_junit
 from fieldtwin.reports.run.html import write_html
@@ -103,18 +103,18 @@ def test_a_run_reports_how_often_each_of_its_faults_took_effect(tmp_path: Path) 
         "faults:\n  - {id: lost, name: lost-frame, device: inclinometer, from: 2s, until: 4s}\n"
         "  - {id: idle, name: silence, device: modem, function: 23}\n"
     )
-    words = ["observatory", "--prototype", "--virtual", "--for", "5s", "--faults", str(faults)]
-    told = CliRunner().invoke(run_command, words, standalone_mode=False)
+    words = ["observatory", "--for", "5s", "--faults", str(faults)]
+    told = CliRunner().invoke(simulate_command, words, standalone_mode=False)
     assert "lost (lost-frame on inclinometer): struck" in told.output
     assert "idle (silence on modem): never struck" in told.output
-    summary = json.loads(CliRunner().invoke(run_command, [*words, "--json"], standalone_mode=False).stdout)
+    summary = json.loads(CliRunner().invoke(simulate_command, [*words, "--json"], standalone_mode=False).stdout)
     assert [(one["id"], one["struck"] > 0) for one in summary["faults"]] == [("lost", True), ("idle", False)]
 
 
 @pytest.mark.parametrize(("seeds", "for_", "ended"), [("1..2", "10s", "inconclusive"), ("3..4", "6min", "ok")])
 def test_a_campaign_reports_how_often_faults_took_effect_and_needs_one(seeds: str, for_: str, ended: str) -> None:
-    words = ["observatory", "--prototype", "--virtual", "--for", for_, "--seeds", seeds, "--faults", "random"]
-    told = CliRunner().invoke(run_command, [*words, "--jobs", "1"], standalone_mode=False)
+    words = ["observatory", "--for", for_, "--seeds", seeds, "--faults", "random"]
+    told = CliRunner().invoke(simulate_command, [*words, "--jobs", "1"], standalone_mode=False)
     assert told.output.rstrip().endswith(ended)
     assert told.return_value == (0 if ended == "ok" else 1)
     assert ("none was injected" in told.output) == (ended == "inconclusive")

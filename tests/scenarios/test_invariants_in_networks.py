@@ -11,6 +11,7 @@ import pytest
 from click.testing import CliRunner
 
 from fieldtwin.cli.run.run_command import command as run_command
+from fieldtwin.cli.run.simulate_command import command as simulate_command
 from fieldtwin.cli.test.test_command import command as judge_command
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.run.campaigns.confirming import CONFIRMED
@@ -71,8 +72,8 @@ def test_a_broken_invariant_of_a_member_fails_the_scenario_of_the_network(folder
 
 def test_a_run_of_a_network_with_a_broken_invariant_is_not_ok(folder: Path) -> None:
     add(folder, "middle", ACTIVE)
-    words = ["ocean_network.yaml", "--prototype", "--virtual", "--for", "60s", "--json"]
-    told = CliRunner().invoke(run_command, words, standalone_mode=False)
+    words = ["ocean_network.yaml", "--for", "60s", "--json"]
+    told = CliRunner().invoke(simulate_command, words, standalone_mode=False)
     summary = json.loads(told.stdout)
     assert (told.return_value, summary["ok"]) == (1, False)
     assert [one["verdict"] for one in summary["systems"]["middle"]["invariants"]] == ["failed"]
@@ -112,9 +113,8 @@ def test_a_campaign_outside_of_virtual_time_is_refused(
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (("--prototype", "--faults", "random"), "random faults need --virtual"),
-        (("--prototype", "--seeds", "1..2"), "need --virtual"),
-        (("--plant", "--faults", "random"), "plant"),
+        (("--prototype", "--faults", "random"), "`fieldtwin run` has no --faults random: use `fieldtwin simulate"),
+        (("--prototype", "--seeds", "1..2"), "`fieldtwin run` has no --seeds: use `fieldtwin simulate"),
     ],
 )
 @pytest.mark.parametrize("system", ["observatory", "ocean_network"])

@@ -154,7 +154,7 @@ def test_a_scenario_takes_something_to_expect() -> None:
 
 def test_a_virtual_run_becomes_a_scenario_that_passes_and_sees_a_change(tmp_path: Path) -> None:
     runner, trace, made = CliRunner(), tmp_path / "run.jsonl", tmp_path / "run.scenario.yaml"
-    run = ["run", "observatory", "--prototype", "--virtual", "--for", "12s", "--commands", "1,0", "--seed", "3"]
+    run = ["simulate", "observatory", "--for", "12s", "--commands", "1,0", "--seed", "3"]
 
     def said(*argv: str, code: int) -> str:
         result = runner.invoke(cli, argv, standalone_mode=False)

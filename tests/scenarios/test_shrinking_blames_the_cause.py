@@ -13,7 +13,7 @@ import pytest
 from click.testing import CliRunner
 from tank_plant import write_plant
 
-from fieldtwin.cli.run.run_command import command as run_command
+from fieldtwin.cli.run.simulate_command import command as simulate_command
 from fieldtwin.results.model import ScenarioResult, Verdict
 from fieldtwin.run.campaigns.confirming import CONFIRMED
 from fieldtwin.run.campaigns.shrink import same_failure, smallest
@@ -56,8 +56,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def campaign(program: str, seeds: str = "1..3") -> tuple[int, str]:
     Path("pump.st").write_text(program)
-    words = ["plant.yaml", "--prototype", "--virtual", "--for", "6min", "--seeds", seeds, "--faults", "random"]
-    told = CliRunner().invoke(run_command, words, standalone_mode=False)
+    words = ["plant.yaml", "--for", "6min", "--seeds", seeds, "--faults", "random"]
+    told = CliRunner().invoke(simulate_command, words, standalone_mode=False)
     assert told.exception is None, told.output
     return told.return_value, told.output
 

@@ -81,7 +81,7 @@ def test_a_program_that_waits_for_its_own_command_is_named_when_the_file_is_load
     assert "program sampling waits for ctd.pressure before its first scan" in warning
     assert "ctd measures only after this program has written ctd.sample_period_s" in warning
     assert "`start: {timeout_ms: 1000, at_timeout: start_anyway}` in sampling" in warning
-    told = CliRunner().invoke(cli, ["run", str(path), "--prototype", "--virtual", "--for", "2s"])
+    told = CliRunner().invoke(cli, ["simulate", str(path), "--for", "2s"])
     assert "measures only after" in " ".join(told.output.split())
     verdict, _, _, reason = judged(tmp_path, "  - pause: 30s\n  - expect: {that: 'ctd.pressure == 10'}\n")
     assert verdict is Verdict.FAILED

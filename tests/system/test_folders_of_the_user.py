@@ -137,7 +137,7 @@ def did(site: Path, environment: dict[str, str], *words: str) -> subprocess.Comp
     "words",
     [
         ("run", "shed.yaml", "--prototype", "--for", "2s"),
-        ("run", "shed.yaml", "--prototype", "--virtual", "--for", "10s"),
+        ("simulate", "shed.yaml", "--for", "10s"),
         ("test", "valve.scenario.yaml"),
         ("test", "valve.scenario.yaml", "--target", "local"),
         ("with", "shed.yaml", "--", "true"),

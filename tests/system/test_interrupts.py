@@ -54,8 +54,8 @@ def _interrupted(process: subprocess.Popen[str], number: int = signal.SIGINT) ->
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_virtual_run_ends_without_a_traceback(tmp_path: Path, number: int, code: int) -> None:
     trace = tmp_path / "run.jsonl"
-    options = ["--prototype", "--virtual", "--for", "24h", "--trace", str(trace)]
-    process = _started([sys.executable, "-m", "fieldtwin", "run", "observatory", *options], tmp_path)
+    options = ["--for", "24h", "--trace", str(trace)]
+    process = _started([sys.executable, "-m", "fieldtwin", "simulate", "observatory", *options], tmp_path)
 
     async def until_it_runs() -> None:
         await eventually(lambda: trace.exists() and trace.stat().st_size > 100_000, within_s=30)

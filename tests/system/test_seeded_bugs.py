@@ -1,4 +1,4 @@
-"""Five bugs, planted one at a time in a copy of the program: `run --virtual` with faults must end as not ok for each of them.
+"""Five bugs, planted one at a time in a copy of the program: `fieldtwin simulate` with faults must end as not ok for each.
 
 Without its bug the same copy, with the same faults and seed, must end as ok. Two of the five were not caught before the oracle
 checked values that stay good (`AgeOracle.still_good`) and repeated commands (`MessageOracle`).
@@ -70,9 +70,9 @@ def files(tmp_path: Path) -> Path:
 
 def run(program: Path, files: Path, faults: str = "faults.yaml") -> tuple[int, dict[str, Any]]:
     """Return exit code and summary of the run, with the program in the folder `program`."""
-    words = ["--prototype", "--virtual", "--for", "20s", "--seed", "3", "--commands", "1,2,0,-1", "--json"]
+    words = ["--for", "20s", "--seed", "3", "--commands", "1,2,0,-1", "--json"]
     ended = subprocess.run(
-        [sys.executable, "-m", "fieldtwin", "run", "observatory.yaml", "--faults", faults, *words],
+        [sys.executable, "-m", "fieldtwin", "simulate", "observatory.yaml", "--faults", faults, *words],
         cwd=files,
         env=os.environ | {"PYTHONPATH": str(program), "PYTHONDONTWRITEBYTECODE": "1"},
         capture_output=True,

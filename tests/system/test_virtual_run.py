@@ -13,12 +13,12 @@ import pytest
 
 from fieldtwin.run.virtual.run import VirtualOptions, VirtualRun
 
-SHORT = ["--prototype", "--virtual", "--for", "20s", "--json"]
+SHORT = ["--for", "20s", "--json"]
 
 
 def fieldtwin(*words: str, hash_seed: str = "0") -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-m", "fieldtwin", "run", "observatory", *words],
+        [sys.executable, "-m", "fieldtwin", "simulate", "observatory", *words],
         capture_output=True,
         text=True,
         timeout=50,
@@ -60,17 +60,16 @@ def test_many_seeds() -> None:
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (["--plant", "--virtual", "--for", "1s"], "buses in memory"),
-        (["--prototype", "--virtual"], "needs an end"),
-        (["--prototype", "--seed", "1"], "need --virtual"),
-        (["--prototype", "--virtual", "--for", "1s", "--seeds", "5..1"], "the lower first"),
-        (["--prototype", "--virtual", "--for", "1s", "--seeds", "1..2", "--seed", "1"], "need a single run"),
+        ([], "simulate needs an end time"),
+        (["--for", "1s", "--ledger", "hours.jsonl"], "--ledger needs --seeds"),
+        (["--for", "1s", "--seeds", "5..1"], "the lower first"),
+        (["--for", "1s", "--seeds", "1..2", "--seed", "1"], "need a single run"),
     ],
 )
 def test_invalid_options_are_refused(words: list[str], told: str) -> None:
     from click.testing import CliRunner
 
-    from fieldtwin.cli.run.run_command import command
+    from fieldtwin.cli.run.simulate_command import command
     from fieldtwin.gateway.core.errors import UsageError
 
     result = CliRunner().invoke(command, ["observatory", *words])

@@ -82,7 +82,7 @@ class Instance:
 
     def __enter__(self) -> Instance:
         if not LOCKS:
-            hint = "available on this system: emulate, record, read, scan, check, and run --virtual"
+            hint = "available on this system: emulate, record, read, scan, check, and simulate"
             raise Unreachable("a run needs Unix sockets and locks, which this system does not have", hint=hint)
         try:
             self.dir.parent.mkdir(parents=True, exist_ok=True, mode=0o700)

@@ -15,7 +15,7 @@ from fieldtwin.gateway.core.files.input_file import open_input
 from fieldtwin.results.trace import Event, Kind, refusal_data
 from fieldtwin.twin.site.system import System
 
-_EXPECTED = "[ns, kind, where, data], as `fieldtwin run --virtual --trace` writes it"
+_EXPECTED = "[ns, kind, where, data], as `fieldtwin simulate --trace` writes it"
 
 
 def read_events(path: Path, system: System) -> Iterator[Event]:

@@ -79,7 +79,7 @@ def target_from(endpoint: str, options: dict[str, Any]) -> Target:
         address=node if unit is None else unit,
         profile_name=options["profile_name"],
         eds=options["eds"],
-        folders=[Path(p) for p in options["profiles"]],
+        folders=options["profiles"],
         bitrate=options["bitrate"] or 0,
         timeout_s=options["timeout_s"],
         echo=options["echo"],

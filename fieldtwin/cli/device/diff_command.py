@@ -50,7 +50,7 @@ def command(
     ignore: tuple[str, ...],
     tolerance: tuple[str, ...],
     settings: bool,
-    profiles: tuple[str, ...],
+    profiles: tuple[Path, ...],
     as_json: bool,
 ) -> int:
     """Compare a DUMP with another dump, a PROFILE or an EDS. Exit code 1 if they differ.
@@ -60,17 +60,16 @@ def command(
     fieldtwin diff meter.jsonl eastron-sdm630
     fieldtwin diff drive.jsonl drive.eds
     """
-    folders = [Path(p) for p in profiles]
     one = _dump(left)
     leave = Leave(ignore, _tolerances(tolerance), settings)
     if _is_dump(Path(right)):
         other = _dump(Path(right))
         if one.protocol != other.protocol:
             raise FileInvalid("dumps of two protocols", path=right, expected=one.protocol, got=other.protocol)
-        profile = _named(one, profile_name, folders)
+        profile = _named(one, profile_name, profiles)
         found = diff_dumps(one, other, profile, _sheet(one, profile), leave)
     else:
-        found = _against(one, right, folders, leave)
+        found = _against(one, right, profiles, leave)
     if as_json:
         h = one.header
         endpoint, when = str(h.get("endpoint", "")), str(h.get("started", ""))
@@ -81,7 +80,7 @@ def command(
     return DIFFERENT if found.found or not found.compared else 0  # without a compared field there is no result
 
 
-def _against(one: Dump, right: str, folders: list[Path], leave: Leave) -> Differences:
+def _against(one: Dump, right: str, folders: tuple[Path, ...], leave: Leave) -> Differences:
     if Path(right).suffix.lower() in (".eds", ".dcf"):
         if one.protocol != "canopen":
             raise UsageError("an EDS is for the dump of a CANopen node", got=one.path)
@@ -110,7 +109,7 @@ def _is_dump(path: Path) -> bool:
         return False
 
 
-def _named(dump: Dump, name: str, folders: list[Path]) -> DeviceProfile | None:
+def _named(dump: Dump, name: str, folders: tuple[Path, ...]) -> DeviceProfile | None:
     """Return the requested profile, else the profile that the dump was made with, if it is installed."""
     if name:
         return load_profile(find("devices", name, extra=folders))

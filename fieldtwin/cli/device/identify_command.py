@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -67,7 +67,7 @@ def command(
     dry_run: bool,
     show_all: bool,
     log: Path | None,
-    profiles: tuple[str, ...],
+    profiles: tuple[Path, ...],
     as_json: bool,
 ) -> int:
     """Read the identification of one device at ENDPOINT, and show which profile fits, with confidence and reasons. It sends
@@ -84,7 +84,7 @@ def command(
         for line in _first_frames(endpoint, node or 1) if can else modbus_frames(endpoint, 1 if unit is None else unit):
             click.echo(line)
         return 0
-    known = known_profiles([Path(p) for p in profiles])
+    known = known_profiles(profiles)
     with logged(log) as taps, _progress() as show:
         if can:
             result: CanIdentity | ModbusIdentity = run_precise(
@@ -130,7 +130,7 @@ def _first_frames(endpoint: str, node: int) -> Iterator[str]:
         yield f"{0x600 + node:03X}#40{index.to_bytes(2, 'little').hex().upper()}{sub:02X}00000000"
 
 
-def known_profiles(folders: list[Path]) -> list[DeviceProfile]:
+def known_profiles(folders: Iterable[Path]) -> list[DeviceProfile]:
     """Return every device profile in the search path, the first of each file name.
 
     A profile that cannot be read is reported and skipped.

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from fieldtwin.cli.options import Secret, pairs, profiles_option
-from fieldtwin.cli.template_question import consent, trust_option
+from fieldtwin.cli.option_groups import GroupedCommand, group
+from fieldtwin.cli.options import Secret, pairs
+from fieldtwin.cli.template_question import SourceOptions
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.run.processes.field_contact import DEFAULT_CONTROL_PORT
 from fieldtwin.twin.site.data_files import data_root, find
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
     from fieldtwin.run.emulate.device import Extras
 
 
-@click.command("emulate")
+@click.command("emulate", cls=GroupedCommand)
 @click.argument("what")
 @click.option(
     "--on", "endpoints", multiple=True, metavar="ENDPOINT", help="For a device or recording: the endpoint to listen on."
@@ -85,7 +86,9 @@ if TYPE_CHECKING:
     help="For one Modbus device on TCP, TLS or UDP: answer to every unit ID, as some devices do.",
 )
 @click.option(
-    "--prototype-file", type=click.Path(exists=True, dir_okay=False), help="For a system: use this prototype file."
+    "--prototype-file",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    help="For a system: use this prototype file.",
 )
 @click.option(
     "--listen", multiple=True, metavar="BUS=ENDPOINT", help="For a system: endpoint for the emulators of a bus."
@@ -105,8 +108,7 @@ if TYPE_CHECKING:
     help="Token that --control requires from its clients; needed if not on loopback. Or FIELDTWIN_EMULATE_TOKEN.",
 )
 @click.option("--instance", default="", help="Name of the run directory; default: the system's name and -field.")
-@trust_option
-@profiles_option
+@group("Profiles and templates", sources=SourceOptions)
 def command(
     what: str,
     endpoints: tuple[str, ...],
@@ -123,13 +125,12 @@ def command(
     faults_file: str | None,
     seed: int,
     any_unit: bool,
-    prototype_file: str | None,
+    prototype_file: Path | None,
     listen: tuple[str, ...],
     control: str,
     token: str,
     instance: str,
-    trust: bool,
-    profiles: tuple[str, ...],
+    sources: SourceOptions,
 ) -> int:
     """Emulate WHAT: a system, a device profile, a recording, or an EDS or DCF file. A plain name is a profile, else a system.
 
@@ -150,7 +151,7 @@ def command(
       fieldtwin emulate drive.eds --node 5 --on can:fieldtwin/127.0.0.1:0
       fieldtwin emulate bus.log --node 5 --on can:fieldtwin/127.0.0.1:29536
     """
-    kind, path = _kind(what, tuple(Path(p) for p in profiles))
+    kind, path = _kind(what, sources.profiles)
     if kind != "recording" and (unknown or at_end):
         raise UsageError("--unknown and --at-end need a recording", got=f"a {kind}")
     if (values or faults_file or any_unit) and kind not in ("device", "recording"):
@@ -172,21 +173,20 @@ def command(
         from fieldtwin.run.emulate.field import FieldOptions, run_field
         from fieldtwin.run.template import system_file
 
-        file, folders = Path(prototype_file) if prototype_file else None, tuple(Path(p) for p in profiles)
-        agreed = system_file(str(path), consent(trust=trust), prototype_file=file, profiles=folders)
+        agreed = system_file(str(path), sources.ask(), prototype_file=prototype_file, profiles=sources.profiles)
 
         return run_precise(
             run_field(
                 FieldOptions(
                     system=Path(agreed),
-                    prototype_file=file,
+                    prototype_file=prototype_file,
                     recordings=pairs(recordings, "--recording"),
                     speed=speed,
                     listen=pairs(listen, "--listen"),
                     control=control,
                     token=token,
                     instance=instance,
-                    profiles=folders,
+                    profiles=sources.profiles,
                 )
             )
         )

@@ -196,7 +196,7 @@ def _latency(text: str) -> Tolerance | None:
 
 def _profile(options: dict[str, Any]) -> DeviceProfile | None:
     name = options["profile_name"]
-    return load_profile(find("devices", name, extra=[Path(p) for p in options["profiles"]])) if name else None
+    return load_profile(find("devices", name, extra=options["profiles"])) if name else None
 
 
 def _files(recording: Path, other: Path, rules: Rules, options: dict[str, Any]) -> Comparison:

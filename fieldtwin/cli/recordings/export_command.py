@@ -35,7 +35,13 @@ from fieldtwin.twin.site.data_files import find
 @profiles_option
 @json_option
 def command(
-    recording: Path, out: Path, profile_name: str, framing: str, endpoint: str, profiles: tuple[str, ...], as_json: bool
+    recording: Path,
+    out: Path,
+    profile_name: str,
+    framing: str,
+    endpoint: str,
+    profiles: tuple[Path, ...],
+    as_json: bool,
 ) -> int:
     """Convert RECORDING to OUT; the suffix selects the format: .csv, .parquet, .log (candump) or .pcap.
 
@@ -49,7 +55,7 @@ def command(
     """
     from fieldtwin.capture.recordings.exporting import export
 
-    profile = load_profile(find("devices", profile_name, extra=[Path(p) for p in profiles])) if profile_name else None
+    profile = load_profile(find("devices", profile_name, extra=profiles)) if profile_name else None
     count = export(recording, out, profile=profile, framing=framing, url=endpoint)
     if as_json:
         json.dump({"out": str(out), "records": count}, sys.stdout)

@@ -162,15 +162,15 @@ def command(
     return job.polls(target, ProfileRound(target.profile, target.address, options["groups"]), target.profile.name)
 
 
-def _scenario_of(run: str | None, system: str, out: Path, profiles: tuple[str, ...]) -> int:
+def _scenario_of(run: str | None, system: str, out: Path, profiles: tuple[Path, ...]) -> int:
     """Write a recorded run as a scenario, with the default tolerances of `fieldtwin trace --as-scenario`."""
     from fieldtwin.cli.recordings.regression_view import write_scenario
     from fieldtwin.scenarios.regression.comparing import Allowed
     from fieldtwin.twin.site.system import load_system
 
     if run is None:
-        raise UsageError("which run?", expected="the file of run --virtual --trace, or of run --capture")
-    plant = load_system(system, [Path(p) for p in profiles])
+        raise UsageError("which run?", expected="the file of simulate --trace, or of run --capture")
+    plant = load_system(system, profiles)
     return write_scenario(plant, Path(run), out, system, allowed=Allowed(), seed=None, values=False)
 
 

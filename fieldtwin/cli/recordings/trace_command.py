@@ -11,19 +11,19 @@ import click
 from fieldtwin.capture.decoding.decoder import Decoder
 from fieldtwin.capture.decoding.exchange import Decoded, DecodedExchange
 from fieldtwin.capture.decoding.trace_file import read_events
-from fieldtwin.cli.options import Duration, json_option, profiles_option
+from fieldtwin.cli.option_groups import GroupedCommand, group
+from fieldtwin.cli.options import Duration, json_option
 from fieldtwin.cli.recordings.regression_options import tolerance_options
-from fieldtwin.cli.template_question import consent, trust_option
+from fieldtwin.cli.template_question import SourceOptions
 from fieldtwin.console import stderr
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.results.trace import Event, Kind
 
 
-@click.command("trace")
+@click.command("trace", cls=GroupedCommand)
 @click.argument("file", type=click.Path(path_type=Path))
 @click.argument("system")
-@profiles_option
 @click.option(
     "--only", multiple=True, help="Show only the events of this bus, device, tag, program or fault. Repeatable."
 )
@@ -44,18 +44,16 @@ from fieldtwin.results.trace import Event, Kind
 )
 @tolerance_options
 @click.option("--vcd", type=click.Path(path_type=Path), help="Write waveforms (IEEE 1364) for GTKWave instead.")
-@trust_option
+@group("Profiles and templates", sources=SourceOptions)
 @json_option
 def command(
     file: Path,
     system: str,
-    profiles: tuple[str, ...],
     only: tuple[str, ...],
     start_s: float,
     end_s: float | None,
     problems: bool,
     vcd: Path | None,
-    trust: bool,
     against: Path | None,
     as_scenario: Path | None,
     seed: int | None,
@@ -63,9 +61,10 @@ def command(
     tolerances: tuple[str, ...],
     window_s: float,
     ignored: tuple[str, ...],
+    sources: SourceOptions,
     as_json: bool,
 ) -> int:
-    """Show FILE, a trace (run --virtual --trace) or a capture (run --capture) of SYSTEM, with decoded frames. With --json,
+    """Show FILE, a trace (simulate --trace) or a capture (run --capture) of SYSTEM, with decoded frames. With --json,
     each request with its answer, and each message, is one line.
 
     \b
@@ -77,11 +76,10 @@ def command(
     from fieldtwin.run.template import system_file
     from fieldtwin.twin.site.system import load_system
 
-    folders = [Path(p) for p in profiles]
-    agreed = consent(
-        trust=trust or vcd is None
+    ask = sources.ask(
+        runs_code=vcd is not None
     )  # only waveforms need the programs' types, so only they import the programs
-    plant = load_system(system_file(system, agreed, plant=True, profiles=folders), folders)
+    plant = load_system(system_file(system, ask, plant=True, profiles=sources.profiles), sources.profiles)
     if against is not None or as_scenario is not None:
         from fieldtwin.cli.recordings import regression_view
 

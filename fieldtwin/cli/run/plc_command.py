@@ -10,9 +10,10 @@ from typing import Any
 import click
 import msgspec
 
-from fieldtwin.cli.options import NegativeNumbers, json_option, profiles_option
+from fieldtwin.cli.option_groups import group
+from fieldtwin.cli.options import NegativeNumbers, json_option
 from fieldtwin.cli.output_files import write_text
-from fieldtwin.cli.template_question import consent, trust_option
+from fieldtwin.cli.template_question import SourceOptions
 from fieldtwin.console import stderr
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.plc.status import PlcStatus
@@ -218,26 +219,24 @@ def why(tag: str, instance: str, as_json: bool) -> int:
     return 0
 
 
-def _agreed(system: str, profiles: tuple[str, ...], *, trust: bool) -> System:
+def _agreed(system: str, sources: SourceOptions) -> System:
     """Return the system whose program is inspected: the program is imported, and nothing is opened."""
     from fieldtwin.run.template import system_file
 
-    folders = [Path(p) for p in profiles]
-    return load_system(system_file(system, consent(trust=trust), plant=True, profiles=folders), folders)
+    return load_system(system_file(system, sources.ask(), plant=True, profiles=sources.profiles), sources.profiles)
 
 
 @command.command("diagram")
 @click.argument("system")
 @click.option("--program", default="", metavar="NAME", help="The program; default: the only one with a state table.")
 @click.option("-o", "--output", type=click.Path(dir_okay=False, path_type=Path), help="Output file; default: stdout.")
-@trust_option
-@profiles_option
-def diagram(system: str, program: str, output: Path | None, trust: bool, profiles: tuple[str, ...]) -> int:
+@group("Options", sources=SourceOptions)
+def diagram(system: str, program: str, output: Path | None, sources: SourceOptions) -> int:
     """Draw the state table of a program of SYSTEM as SVG."""
     from fieldtwin.plc.diagram import svg
     from fieldtwin.run.processes.plc_client import chosen, table_of
 
-    loaded = _agreed(system, profiles, trust=trust)
+    loaded = _agreed(system, sources)
     name, table = chosen(loaded, program, table_of, "a state table")
     drawn = svg(table, f"{loaded.name}: {name}")
     if output is None:
@@ -257,16 +256,14 @@ def diagram(system: str, program: str, output: Path | None, trust: bool, profile
     type=click.Path(dir_okay=False, path_type=Path),
     help="Write a counterexample to this file, as a scenario.",
 )
-@trust_option
-@profiles_option
+@group("Options", sources=SourceOptions)
 @json_option
 def prove(
     system: str,
     program: str,
     max_states: int,
     output: Path | None,
-    trust: bool,
-    profiles: tuple[str, ...],
+    sources: SourceOptions,
     as_json: bool,
 ) -> int:
     """Check all reachable states of a program of SYSTEM against its invariants.
@@ -280,7 +277,7 @@ def prove(
     from fieldtwin.run.processes.plc_client import chosen, proof_of
     from fieldtwin.scenarios.language.counterexample import scenario
 
-    loaded = _agreed(system, profiles, trust=trust)
+    loaded = _agreed(system, sources)
     name, proof = chosen(loaded, program, proof_of, "a proof")
     result = look(proof, max_states)
     text = scenario(loaded, name, proof, result) if result.broken else ""

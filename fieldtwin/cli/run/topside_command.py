@@ -61,11 +61,11 @@ def command(
     device: str,
     commands: str,
     duration_s: float,
-    profiles: tuple[str, ...],
+    profiles: tuple[Path, ...],
     as_json: bool,
 ) -> int:
     """Send commands to SYSTEM from the topside end of its modem, and show the responses."""
-    loaded = load_system(system, tuple(Path(p) for p in profiles))
+    loaded = load_system(system, profiles)
     if bool(far) == bool(field_host):
         raise UsageError("the endpoint of the topside modem is missing", expected="--far ENDPOINT or --field HOST")
     periods = parse_periods(commands)

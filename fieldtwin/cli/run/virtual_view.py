@@ -1,4 +1,4 @@
-"""`fieldtwin run --virtual` on a terminal: progress, results, and the failed seeds."""
+"""`fieldtwin simulate` on a terminal: progress, results, and the failed seeds."""
 
 from __future__ import annotations
 

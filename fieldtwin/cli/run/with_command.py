@@ -8,8 +8,9 @@ from typing import Any
 import click
 from rich.markup import escape
 
-from fieldtwin.cli.options import pairs, profiles_option
-from fieldtwin.cli.template_question import consent, trust_option
+from fieldtwin.cli.option_groups import group
+from fieldtwin.cli.run.run_options import ReplayOptions, listen_option
+from fieldtwin.cli.template_question import SourceOptions
 from fieldtwin.console import show_warnings, stderr
 from fieldtwin.gateway.core.errors import UsageError
 
@@ -20,29 +21,20 @@ LONG = ("_URL", "_TTY", "_BAUDRATE", "_FRAME", "_HOST", "_PORT", "_INTERFACE", "
 @click.command("with", context_settings={"allow_interspersed_args": False})
 @click.argument("system")
 @click.argument("argv", nargs=-1, type=click.UNPROCESSED, metavar="-- CMD [ARG]...")
-@click.option("--prototype-file", type=click.Path(exists=True, dir_okay=False), help="Use this prototype file.")
-@click.option(
-    "--recording", "recordings", multiple=True, metavar="DEVICE=FILE", help="Replay this recording for a device."
-)
-@click.option("--speed", type=float, default=0.0, help="Speed factor for recordings.")
-@click.option("--listen", multiple=True, metavar="BUS=ENDPOINT", help="Endpoint for the emulators of a bus.")
+@group("Simulated devices", listen_option, replay=ReplayOptions)
 @click.option("--faults", default="", metavar="FILE", help="Inject these faults (see fieldtwin faults).")
 @click.option("--instance", default="", help="Name of a permanent run directory; default: a temporary one.")
 @click.option("--quiet", is_flag=True, help="Do not print the environment.")
-@trust_option
-@profiles_option
+@group("Profiles and templates", sources=SourceOptions)
 def command(
     system: str,
     argv: tuple[str, ...],
-    prototype_file: str | None,
-    recordings: tuple[str, ...],
-    speed: float,
-    listen: tuple[str, ...],
+    listen: dict[str, str],
+    replay: ReplayOptions,
     faults: str,
     instance: str,
     quiet: bool,
-    trust: bool,
-    profiles: tuple[str, ...],
+    sources: SourceOptions,
 ) -> int:
     """Run CMD against the simulated field devices of SYSTEM, or of a template, and end with CMD's exit status.
 
@@ -67,17 +59,18 @@ def command(
     words = argv[1:] if argv[:1] == ("--",) else argv
     if not words:
         raise UsageError("`fieldtwin with` needs a command", expected=f"fieldtwin with {system} -- CMD [ARG]...")
-    folders = [Path(p) for p in profiles]
-    file = Path(prototype_file) if prototype_file else None
-    loaded = load_system(system_file(system, consent(trust=trust), prototype_file=file, profiles=folders), folders)
+    file = replay.prototype_file
+    loaded = load_system(
+        system_file(system, sources.ask(), prototype_file=file, profiles=sources.profiles), sources.profiles
+    )
     config = FieldConfig(
         system=str(loaded.path.resolve()),
         run_dir="",
-        prototype=str(Path(prototype_file).resolve()) if prototype_file else "",
-        profiles=tuple(str(Path(p).resolve()) for p in profiles),
-        recordings={d: str(Path(p).resolve()) for d, p in pairs(recordings, "--recording").items()},
-        speed=speed,
-        listen=pairs(listen, "--listen"),
+        prototype=str(file.resolve()) if file else "",
+        profiles=tuple(str(p.resolve()) for p in sources.profiles),
+        recordings={d: str(Path(p).resolve()) for d, p in replay.recordings.items()},
+        speed=replay.speed,
+        listen=listen,
     )
     put_in: tuple[dict[str, Any], ...] = ()
     if faults:

@@ -26,7 +26,7 @@ from fieldtwin.gateway.core.errors import UsageError
 )
 @profiles_option
 @json_option
-def command(system: str, prototype: bool, output: Path | None, profiles: tuple[str, ...], as_json: bool) -> int:
+def command(system: str, prototype: bool, output: Path | None, profiles: tuple[Path, ...], as_json: bool) -> int:
     """Draw the buses of SYSTEM with their devices: as text, or with -o as SVG, which follows the reader's light or dark theme.
     For a network, such as `ocean_network`: the positions of its systems, and which of them hear each other.
 
@@ -43,11 +43,10 @@ def command(system: str, prototype: bool, output: Path | None, profiles: tuple[s
 
     if as_json and output is not None:
         raise UsageError("--json and -o exclude each other", expected="one of them")
-    folders = [Path(folder) for folder in profiles]
-    if (group := load_group(system, folders)) is not None:
+    if (group := load_group(system, profiles)) is not None:
         drawn = kind_named(group.kind).drawing(group)
         return _put(drawn.data, drawn.text, drawn.svg, output, as_json)
-    loaded = load_system(system_file(system, lambda _: True, plant=False), folders)
+    loaded = load_system(system_file(system, lambda _: True, plant=False), profiles)
     wires = wiring(loaded, load_prototype(loaded) if prototype else None)
     return _put(wires.as_data(), tree(wires, *_room()), lambda: svg(wires), output, as_json)
 

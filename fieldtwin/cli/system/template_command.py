@@ -68,14 +68,13 @@ def pack_command(
     prototype_file: Path | None,
     documents: tuple[str, ...],
     wheel: Path | None,
-    profiles: tuple[str, ...],
+    profiles: tuple[Path, ...],
     as_json: bool,
 ) -> int:
     """Pack SYSTEM and every file that it names into a template. Equal files give an identical template."""
-    folders = tuple(Path(p) for p in profiles)
-    loaded = load_system(system, folders)
+    loaded = load_system(system, profiles)
     beside = prototype_path(loaded)
-    collected = collect(loaded, folders, prototype_file or (beside if beside.is_file() else None))
+    collected = collect(loaded, profiles, prototype_file or (beside if beside.is_file() else None))
     manifest = pack(loaded, collected, Extras(_documents(documents), wheel), __version__, out)
     if as_json:
         _print_json({"template": str(out), **_described(manifest)})

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rich.markup import escape
 
-from fieldtwin.cli.campaign_options import CampaignRequest
+from fieldtwin.cli.campaign_options import CampaignOptions
 from fieldtwin.cli.output_files import write_text
 from fieldtwin.cli.run.virtual_view import parse_seeds, progress_bar, shrunk_texts
 from fieldtwin.console import stderr, stdout
@@ -21,15 +21,15 @@ FAULTS_SHOWN = 12
 
 
 def run_scenario_campaign(
-    path: Path, profiles: tuple[Path, ...], request: CampaignRequest, show: Callable[[ScenarioResult], None] | None
+    path: Path, profiles: tuple[Path, ...], options: CampaignOptions, show: Callable[[ScenarioResult], None] | None
 ) -> list[ScenarioResult]:
     """Run a scenario with each seed.
 
     Return the result of the whole campaign, of each seed, and of the scenario that the first failing seed was shrunk to. `show`
     None: nothing is printed to stdout.
     """
-    seeds = parse_seeds(request.seeds)
-    campaign = Campaign(path, profiles, request.choice.of(request.faults), request.duration_s, _words(request))
+    seeds = parse_seeds(options.seeds)
+    campaign = Campaign(path, profiles, options.of(options.faults), options.duration_s, _words(options))
     with progress_bar(float(len(seeds)), "seeds") as at:
         count = 0
 
@@ -38,7 +38,7 @@ def run_scenario_campaign(
             count += 1
             at(float(count))
 
-        results = run_campaign(campaign, seeds, request.jobs, ended)
+        results = run_campaign(campaign, seeds, options.jobs, ended)
     whole = verdict_of(campaign, results)
     if show is not None:
         for result in results:
@@ -50,15 +50,14 @@ def run_scenario_campaign(
     return [whole, *results, *found]
 
 
-def _words(request: CampaignRequest) -> tuple[str, ...]:
+def _words(options: CampaignOptions) -> tuple[str, ...]:
     """Return the options that define a seed's run, without the seed."""
-    every_s, kinds, aims = request.choice
     said = {
-        "--faults": request.faults or "",
-        "--for": f"{request.duration_s:g}s" if request.duration_s else "",
-        "--fault-every": f"{every_s:g}s" if every_s is not None else "",
-        "--fault-kinds": ",".join(kinds),
-        "--fault-aims": ",".join(aims),
+        "--faults": options.faults or "",
+        "--for": f"{options.duration_s:g}s" if options.duration_s else "",
+        "--fault-every": f"{options.fault_every:g}s" if options.fault_every is not None else "",
+        "--fault-kinds": ",".join(options.fault_kinds),
+        "--fault-aims": ",".join(options.fault_aims),
     }
     return tuple(word for option, value in said.items() if value for word in (option, value))
 

@@ -19,9 +19,10 @@ from rich.markup import escape
 from rich.table import Table
 
 from fieldtwin.__about__ import __version__
-from fieldtwin.cli.campaign_options import CampaignRequest, campaign_options
-from fieldtwin.cli.options import Secret, json_option, junit_flavour_option, profiles_option
-from fieldtwin.cli.template_question import consent, trust_option
+from fieldtwin.cli.campaign_options import CampaignOptions
+from fieldtwin.cli.option_groups import GroupedCommand, group
+from fieldtwin.cli.options import Secret, json_option, junit_flavour_option
+from fieldtwin.cli.template_question import SourceOptions
 from fieldtwin.conformance.core.case import Impact
 from fieldtwin.console import show_warnings, stdout
 from fieldtwin.gateway.core.errors import UsageError
@@ -35,7 +36,7 @@ _CONTROLLER = "fieldtwin.controller"
 _COLOUR = {"passed": "green", "failed": "red", "error": "red", "inconclusive": "yellow", "skipped": "yellow"}
 
 
-class _WithCommand(click.Command):
+class _WithCommand(GroupedCommand):
     """A command whose line may end with ``--with -- CMD [ARG]...``: CMD and its arguments go to `controller_words`."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
@@ -113,9 +114,8 @@ class _WithCommand(click.Command):
 @click.option(
     "--trace", type=click.Path(dir_okay=False), help="Write every event of a single scenario to this file (JSON lines)."
 )
-@campaign_options
-@trust_option
-@profiles_option
+@group("Campaign of seeds, in virtual time", campaign=CampaignOptions)
+@group("Profiles and templates", sources=SourceOptions)
 @json_option
 def command(
     files: tuple[str, ...],
@@ -135,10 +135,9 @@ def command(
     junit_flavour: str,
     html: str | None,
     trace: str | None,
-    trust: bool,
-    profiles: tuple[str, ...],
+    campaign: CampaignOptions,
+    sources: SourceOptions,
     as_json: bool,
-    campaign: CampaignRequest,
 ) -> int:
     """Run the scenarios in FILES (*.scenario.yaml; for a folder, all in it; default: those of the working directory).
 
@@ -176,9 +175,9 @@ def command(
             expected="--allow read, or no retries",
         )
     _check_campaign(campaign, target, (seed, trace, retries))
-    folders = tuple(map(Path, profiles))
+    folders = sources.profiles
     for path in paths:
-        agree_to_scenario(consent(trust=trust), path, folders, plant=target == "real", virtual=target == "virtual")
+        agree_to_scenario(sources.ask(), path, folders, plant=target == "real", virtual=target == "virtual")
     scenarios = [load_scenario(path, folders) for path in paths]
     show_warnings(dict.fromkeys(warning for one in scenarios for warning in one.system.warnings))
     known = [id for one in scenarios for id in ids_of(one.path, one.form.scenario)]
@@ -251,7 +250,7 @@ def _counts(results: Sequence[ScenarioResult], of: str) -> str:
     return of + ", ".join(f"{n} {verdict}" for verdict, n in counts.items())
 
 
-def _check_campaign(campaign: CampaignRequest, target: str, of_one_run: tuple[object, ...]) -> None:
+def _check_campaign(campaign: CampaignOptions, target: str, of_one_run: tuple[object, ...]) -> None:
     """Raise `UsageError` if a campaign cannot be combined with the other options."""
     campaign.check()
     if campaign.seeds and target != "virtual":

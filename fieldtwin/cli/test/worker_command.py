@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import click
 
-from fieldtwin.cli.template_question import trust_option
+from fieldtwin.cli.template_question import TRUST
 
 
 @click.command("test-host")
-@trust_option
+@click.option("--trust", **TRUST)
 def command(trust: bool) -> int:
     """Emulate devices for tests in any language, controlled over standard input and output.
 

@@ -80,7 +80,7 @@ def _clock(when: datetime) -> str:
 @profiles_option
 @json_option
 def command(
-    system: str, place: str, store: str, duration_s: float, instance: str, profiles: tuple[str, ...], as_json: bool
+    system: str, place: str, store: str, duration_s: float, instance: str, profiles: tuple[Path, ...], as_json: bool
 ) -> int:
     """Follow SYSTEM as its digital shadow: receive the plant's data, update the digital model, and report differences.
 
@@ -88,7 +88,7 @@ def command(
     with which delay plant and model agree. A shadow sends no commands. Exit code 1 if the states differed. SYSTEM may be a
     template.
     """
-    loaded = load_system(system_file(system, lambda template: True, plant=True), tuple(Path(p) for p in profiles))
+    loaded = load_system(system_file(system, lambda template: True, plant=True), profiles)
     with Instance(instance or f"{loaded.name}-shadow") as here:
         seen = asyncio.run(_run(loaded, place, here, store, duration_s, as_json))
     if as_json:

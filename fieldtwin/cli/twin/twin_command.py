@@ -10,8 +10,9 @@ from typing import Any
 
 import click
 
-from fieldtwin.cli.options import Duration, json_option, profiles_option
-from fieldtwin.cli.template_question import consent, trust_option
+from fieldtwin.cli.option_groups import GroupedCommand, group
+from fieldtwin.cli.options import Duration, json_option
+from fieldtwin.cli.template_question import SourceOptions
 from fieldtwin.cli.twin.shadow_command import ShadowTalk, print_shadow, why_nothing
 from fieldtwin.console import stderr
 from fieldtwin.gateway.core.concurrency.stop_signal import stop_signal
@@ -30,7 +31,7 @@ from fieldtwin.twin.plant.instance import Instance
 from fieldtwin.twin.site.system import System, load_system
 
 
-@click.command("twin")
+@click.command("twin", cls=GroupedCommand)
 @click.argument("system")
 @click.option(
     "--from", "place", required=True, metavar="URL", help="Address of the plant's thread, as for `fieldtwin shadow`."
@@ -77,8 +78,7 @@ from fieldtwin.twin.site.system import System, load_system
     help="Stop after a time such as 20s; default: run until Ctrl-C.",
 )
 @click.option("--instance", default="", help="Name of the run directory; default: the system's name and -twin.")
-@trust_option
-@profiles_option
+@group("Profiles and templates", sources=SourceOptions)
 @json_option
 def command(
     system: str,
@@ -93,8 +93,7 @@ def command(
     store: str,
     duration_s: float,
     instance: str,
-    trust: bool,
-    profiles: tuple[str, ...],
+    sources: SourceOptions,
     as_json: bool,
 ) -> int:
     """Run the digital twin of SYSTEM: like `fieldtwin shadow`, and command the plant by rules for its findings.
@@ -104,10 +103,10 @@ def command(
     executes a command only while its own switch is set to `remote`, within the limits and the rate of its own file, and never
     the same command number twice.
     """
-    folders = tuple(Path(p) for p in profiles)
+    folders = sources.profiles
     runs_code = bool(horizon_s or planner)  # for prototypes and planners in Python from a template
-    agreed = consent(trust=trust or not runs_code)
-    system = system_file(system, agreed, virtual=True, prototype_file=prototype_file, profiles=folders)
+    ask = sources.ask(runs_code=runs_code)
+    system = system_file(system, ask, virtual=True, prototype_file=prototype_file, profiles=folders)
     loaded = load_system(system, folders)
     plans = load_planner(planner, loaded) if planner else Plans(RulePlanner(()), limits=limits_of(loaded))
     question = _question(horizon_s, require, finally_) or plans.question

@@ -10,8 +10,9 @@ from typing import Any
 import click
 from rich.markup import escape
 
-from fieldtwin.cli.options import Duration, json_option, profiles_option
-from fieldtwin.cli.template_question import consent, trust_option
+from fieldtwin.cli.option_groups import GroupedCommand, group
+from fieldtwin.cli.options import Duration, json_option
+from fieldtwin.cli.template_question import SourceOptions
 from fieldtwin.cli.twin.what_if_view import show
 from fieldtwin.console import stderr, stdout
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
@@ -20,7 +21,7 @@ from fieldtwin.run.template import system_file
 from fieldtwin.run.what_if.state import KnownState
 
 
-@click.command("what-if")
+@click.command("what-if", cls=GroupedCommand)
 @click.argument("system", required=False)
 @click.option(
     "--from", "source", default="", help="The present state: a state file, a knowledge store, or instance:NAME."
@@ -53,8 +54,7 @@ from fieldtwin.run.what_if.state import KnownState
     "--prototype-file", type=click.Path(path_type=Path), help="Prototype file; default: next to the system file."
 )
 @click.option("--save-state", type=click.Path(path_type=Path), help="Write the present state to a file, and exit.")
-@trust_option
-@profiles_option
+@group("Profiles and templates", sources=SourceOptions)
 @json_option
 def command(
     system: str | None,
@@ -71,8 +71,7 @@ def command(
     seed: int | None,
     prototype_file: Path | None,
     save_state: Path | None,
-    trust: bool,
-    profiles: tuple[str, ...],
+    sources: SourceOptions,
     as_json: bool,
 ) -> int:
     """Simulate SYSTEM in virtual time from its present state, and show the effect of a plan.
@@ -92,9 +91,8 @@ def command(
         system = system or (str(beside) if beside.exists() else named)
     if system is None:
         raise UsageError("which system?", expected="SYSTEM, or --plans FILE which names it")
-    folders = tuple(Path(p) for p in profiles)
-    agreed = consent(trust=trust)
-    system = system_file(system, agreed, virtual=True, prototype_file=prototype_file, profiles=folders)
+    folders = sources.profiles
+    system = system_file(system, sources.ask(), virtual=True, prototype_file=prototype_file, profiles=folders)
     loaded = load_system(system, folders)
     state = _state(source, origin, system, folders)
     if save_state is not None:

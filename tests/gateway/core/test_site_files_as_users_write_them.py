@@ -109,7 +109,7 @@ def test_a_prototype_of_another_system_names_the_key(site: Path) -> None:
 
 
 def test_a_device_of_a_prototype_may_start_with_a_named_value(site: Path) -> None:
-    done = fieldtwin(site.parent, "run", str(site), "--prototype", "--virtual", "--for", "2s")
+    done = fieldtwin(site.parent, "simulate", str(site), "--for", "2s")
     assert done.returncode == 0, done.stderr
 
 

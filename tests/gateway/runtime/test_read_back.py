@@ -65,7 +65,7 @@ def test_a_register_that_can_only_be_written_gives_no_warning(tmp_path: Path) ->
 def test_the_warning_is_shown_when_the_file_is_loaded(tmp_path: Path) -> None:
     system = hall(tmp_path)
     system.write_text(system.read_text().replace("    poll: {status: {every_ms: 500}}\n", ""))
-    words = ("run", str(system), "--prototype", "--virtual", "--for", "2s", "--json")
+    words = ("simulate", str(system), "--for", "2s", "--json")
     run = subprocess.run(
         [sys.executable, "-m", "fieldtwin", *words], capture_output=True, text=True, timeout=60, check=True
     )

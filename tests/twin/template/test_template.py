@@ -72,7 +72,7 @@ def test_from_a_template_alone_a_prototype_runs_on_a_machine_without_its_files(d
     empty.mkdir()
     environment = {k: v for k, v in os.environ.items() if not k.startswith("FIELDTWIN")}
     environment |= {"PYTHONPATH": str(CHECKOUT), "FIELDTWIN_RUN": str(tmp_path / "r")}
-    run = [sys.executable, "-m", "fieldtwin", "run", "../T.zip", "--prototype", "--virtual", "--for", "5s", "--json"]
+    run = [sys.executable, "-m", "fieldtwin", "simulate", "../T.zip", "--for", "5s", "--json"]
     ended = subprocess.run(run, cwd=empty, env=environment, capture_output=True, text=True, check=False, timeout=50)
     assert ended.returncode == 0, ended.stderr
     summary = json.loads(ended.stdout)

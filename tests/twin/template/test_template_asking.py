@@ -64,7 +64,7 @@ def fieldtwin(*words: object) -> Result:
 
 VERBS = {
     "run --prototype": ("run", "X", "--prototype"),
-    "run --virtual": ("run", "X", "--prototype", "--virtual", "--for", "1s"),
+    "simulate": ("simulate", "X", "--for", "1s"),
     "run --plant": ("run", "X", "--plant"),
     "emulate": ("emulate", "X"),
     "with": ("with", "X", "--", "true"),
@@ -85,7 +85,7 @@ VERBS = {
     "what-if": ("what-if", "X", "--horizon", "1min"),
 }
 OPENS_NOTHING = {
-    "run --virtual",
+    "simulate",
     "run --plant",
     "plc prove",
     "plc diagram",
@@ -140,7 +140,7 @@ def test_a_probe_of_an_untrusted_scenario_is_named(site: Site) -> None:
 def test_a_yes_beforehand_lets_each_of_them_run(site: Site) -> None:
     prototype = site.system.with_name("dam.prototype.yaml")
     prototype.write_text(prototype.read_text().replace("can:socketcan/can0", "can:fieldtwin/127.0.0.1:0"))
-    assert fieldtwin("run", site.system, "--prototype", "--virtual", "--for", "1s", "--trust").exit_code == 0
+    assert fieldtwin("simulate", site.system, "--for", "1s", "--trust").exit_code == 0
     assert site.ran()
     assert fieldtwin("test", site.outside, "--trust").exit_code == 0
     unproved = fieldtwin("plc", "prove", site.system, "--trust")
@@ -157,11 +157,9 @@ def test_a_network_with_an_untrusted_system_is_asked_about(site: Site) -> None:
             for name, at_m in (("a", 0), ("b", 9000))
         )
     )
-    assert fieldtwin("run", site.network, "--prototype", "--virtual", "--for", "1s").exit_code in (0, 1), (
-        "it keeps to itself"
-    )
+    assert fieldtwin("simulate", site.network, "--for", "1s").exit_code in (0, 1), "it keeps to itself"
     (site.folder.with_name("O") / "systems" / "evil.py").write_text("")
-    done = fieldtwin("run", site.network, "--prototype", "--virtual", "--for", "1s")
+    done = fieldtwin("simulate", site.network, "--for", "1s")
     assert isinstance(done.exception, NotAllowed), done.exception
     assert "systems/evil.py" in done.stderr
 

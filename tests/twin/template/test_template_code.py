@@ -43,7 +43,7 @@ def test_without_a_terminal_the_answer_is_no_and_trust_answers_yes(dam: Path, tm
     checked = fieldtwin(tmp_path, "template", "check", str(tmp_path / "T.zip"))
     assert (checked.returncode, marker.exists()) == (0, False), checked.stderr
     assert "its control logic was not checked" in checked.stderr
-    run = ["run", str(tmp_path / "T.zip"), "--prototype", "--virtual", "--for", "1s"]
+    run = ["simulate", str(tmp_path / "T.zip"), "--for", "1s"]
     refused = fieldtwin(tmp_path, *run)
     assert "control logic in Python: systems/helper.py, systems/site_logic.py" in refused.stderr
     assert (refused.returncode, marker.exists()) == (2, False), refused.stderr

@@ -1,0 +1,149 @@
+"""`fieldtwin simulate`: run prototypes in virtual time, with seeds, ledgers, random faults and comparisons of traces."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
+
+import click
+
+from fieldtwin.cli.campaign_options import FaultChoice, SeedOptions
+from fieldtwin.cli.option_groups import GroupedCommand, group, option
+from fieldtwin.cli.options import Duration, json_option
+from fieldtwin.cli.run.run_options import ReplayOptions, commands_option, faults_of, systems_of
+from fieldtwin.cli.run.virtual_view import parse_seeds, run_many, run_one
+from fieldtwin.cli.template_question import SourceOptions
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.run.template import system_file
+
+if TYPE_CHECKING:
+    from fieldtwin.run.virtual.run import VirtualOptions
+
+OF_A_GROUP = "--for, --seed, --seeds, --jobs, --ledger, --commands, --faults, --trace, --json"
+
+
+@dataclass(frozen=True)
+class ManyRuns(SeedOptions):
+    """The seeds of several runs, and the file that records each run."""
+
+    ledger: Path | None = option(
+        "--ledger",
+        type=click.Path(dir_okay=False, path_type=Path),
+        help="With --seeds: record each run in this file, and skip seeds that it contains.",
+    )
+
+
+@click.command("simulate", cls=GroupedCommand)
+@click.argument("system")
+@group(
+    "Virtual time and seeds",
+    click.option(
+        "--for", "duration_s", type=Duration(), default=0.0, help="Length in virtual time, such as 24h; required."
+    ),
+    click.option("--seed", type=int, default=None, help="Use this seed instead of the prototype file's."),
+    runs=ManyRuns,
+)
+@group("Simulated devices", commands_option, replay=ReplayOptions)
+@group(
+    "Faults",
+    click.option(
+        "--faults",
+        default="",
+        metavar="FILE|random",
+        help="Inject the faults of this file (see fieldtwin faults); random: the seed chooses them.",
+    ),
+    choice=FaultChoice,
+)
+@group("Profiles and templates", sources=SourceOptions)
+@group(
+    "Output",
+    click.option(
+        "--trace",
+        type=click.Path(dir_okay=False, path_type=Path),
+        help="Write every event to this file (JSON lines).",
+    ),
+    click.option(
+        "--compare",
+        type=click.Path(exists=True, dir_okay=False, path_type=Path),
+        help="Compare the run with an older trace, as fieldtwin trace --against; exit code 1 if it differs.",
+    ),
+    json_option,
+)
+def command(
+    system: str,
+    duration_s: float,
+    seed: int | None,
+    runs: ManyRuns,
+    commands: tuple[int, ...] | None,
+    replay: ReplayOptions,
+    faults: str,
+    choice: FaultChoice,
+    sources: SourceOptions,
+    trace: Path | None,
+    compare: Path | None,
+    as_json: bool,
+) -> int:
+    """Simulate SYSTEM in virtual time, as fast as possible: its prototype, with gateway and PLC, in one process.
+
+    SYSTEM is a file, the name of a shipped system such as `observatory`, a template (see fieldtwin template), or a network of
+    several systems, such as `ocean_network`. The same seed gives the same run, byte for byte. No endpoint is opened.
+
+    \b
+    fieldtwin simulate observatory --for 24h --seed 7
+    fieldtwin simulate observatory --for 2h --faults random \\
+        --seeds 1..50 --jobs 2 --ledger hours.jsonl
+
+    Exit code 0 if the run, or each of the runs, passed; else 1.
+    """
+    if duration_s <= 0:
+        raise UsageError("simulate needs an end time", expected="--for 24h")
+    random_faults = choice.of(faults)
+    systems = systems_of(system, sources, {**replay.given(), "--compare": compare}, OF_A_GROUP, virtual=True)
+    if systems is None:
+        system = system_file(
+            system, sources.ask(), virtual=True, prototype_file=replay.prototype_file, profiles=sources.profiles
+        )
+    from fieldtwin.run.virtual.run import VirtualOptions
+
+    options = VirtualOptions(
+        system=system if systems is None else str(systems.path),
+        duration_s=duration_s,
+        seed=seed,
+        profiles=sources.profiles,
+        prototype_file=replay.prototype_file,
+        recordings=replay.recordings,
+        speed=replay.speed,
+        commands=commands,
+        faults=faults_of(faults if random_faults is None else "", system, sources.profiles, systems),
+        random_faults=random_faults,
+        trace=trace,
+    )
+    if runs.seeds:
+        if trace or compare or seed is not None:
+            raise UsageError(
+                "--seeds, which makes several runs", hint="--seed, --trace and --compare need a single run"
+            )
+        return run_many(options, parse_seeds(runs.seeds), runs.jobs, as_json, runs.ledger)
+    if runs.ledger is not None:
+        raise UsageError("--ledger needs --seeds", expected="--seeds 1..200")
+    return run_one(options, as_json) if compare is None else _run_against(options, compare, as_json)
+
+
+def _run_against(options: VirtualOptions, old: Path, as_json: bool) -> int:
+    """Run, then compare the run with the trace `old`; return the worse of the two exit codes."""
+    from fieldtwin.cli.recordings.regression_view import judged, show
+    from fieldtwin.scenarios.regression.comparing import Allowed
+    from fieldtwin.twin.site.system import load_system
+
+    if as_json:
+        raise UsageError(
+            "--compare with --json", hint="--trace NEW, then fieldtwin trace NEW SYSTEM --against OLD --json"
+        )
+    with TemporaryDirectory(prefix="ft-") as folder:
+        trace = options.trace or Path(folder) / "trace.jsonl"
+        code = run_one(replace(options, trace=trace), as_json)
+        return max(
+            code, show(judged(load_system(options.system, options.profiles), old, trace, Allowed()), old, as_json=False)
+        )

@@ -40,7 +40,7 @@ MOVED = (
 
 @dataclass(frozen=True)
 class PlaceOptions:
-    """The kind of a run, and its length in seconds; `duration_s` 0 means until stopped. Exactly one of `prototype` and `plant` is needed."""
+    """The kind of a run: either `prototype` or `plant`. `duration_s` 0 means until stopped."""
 
     prototype: bool = option(
         "--prototype", is_flag=True, help="Emulate the field devices as defined in NAME.prototype.yaml."

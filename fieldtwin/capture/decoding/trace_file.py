@@ -1,4 +1,4 @@
-"""Read recorded traffic: a run's trace (`fieldtwin run --trace`) or a capture of its buses (`--capture`)."""
+"""Read recorded traffic: a run's trace (`fieldtwin simulate --trace`) or a capture of its buses (`--capture`)."""
 
 from __future__ import annotations
 

@@ -5,14 +5,16 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import click
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from fieldtwin.cli.device.device_options import device_options, target_from, words
+from fieldtwin.cli.device.device_options import DeviceOptions, log_option, words
 from fieldtwin.cli.device.dump_view import estimate_text, notes, profile_gaps, summary, unknown_text
+from fieldtwin.cli.option_groups import GroupedCommand, group, option
 from fieldtwin.cli.options import Duration, json_option
 from fieldtwin.commissioning.dump.dump import DEFAULT_BUDGET_S, Job
 from fieldtwin.commissioning.dump.dump import Progress as Told
@@ -24,62 +26,72 @@ from fieldtwin.gateway.core.errors import Unreachable, UsageError
 from fieldtwin.gateway.wallclock import run as run_precise
 
 
-@click.command("dump")
+@dataclass(frozen=True)
+class ReadingOptions:
+    """The reads of a dump: ranges, repetitions and rate. `longest` None: as many values as the device accepts."""
+
+    thorough: bool = option(
+        "--thorough",
+        is_flag=True,
+        help="Read every address; by default only every eighth one, and round numbers, in unreadable ranges.",
+    )
+    budget_s: float = option(
+        "--budget",
+        type=Duration(),
+        default=f"{DEFAULT_BUDGET_S / 60:g}m",
+        show_default=True,
+        help="Time for each table to search unreadable ranges: after silence, and with different read lengths.",
+    )
+    longest: int | None = option(
+        "--longest", type=click.IntRange(1, 2000), help="Values per read; default: as many as the device accepts."
+    )
+    pairs: bool = option("--pairs", is_flag=True, help="The device supports only pairs of registers.")
+    no_functions: bool = option(
+        "--no-functions", is_flag=True, help="Do not test functions 07h, 08h, 0Bh, 0Ch, 11h, 2Bh."
+    )
+    passes: int = option(
+        "--passes", type=click.IntRange(1, 100_000), default=1, show_default=True, help="Number of passes, for `infer`."
+    )
+    every_s: float = option(
+        "--every", type=Duration(), default="10s", show_default=True, help="Time from pass to pass."
+    )
+    rate: float = option(
+        "--rate",
+        type=click.FloatRange(0, 1000),
+        default=50,
+        show_default=True,
+        help="Maximum requests per second; 0: no limit.",
+    )
+    retries: int = option(
+        "--retries", type=click.IntRange(0, 10), default=2, show_default=True, help="Repetitions without a valid reply."
+    )
+
+
+@click.command("dump", cls=GroupedCommand)
 @click.argument("endpoint")
 @click.argument("ranges", nargs=-1, metavar="[RANGE]...")
-@device_options
-@click.option(
-    "-o", "--out", type=click.Path(dir_okay=False, path_type=Path), help="The dump; default dump-ADDRESS.jsonl."
+@group("Device", device=DeviceOptions)
+@group("What is read", reading=ReadingOptions)
+@group(
+    "Output",
+    click.option(
+        "-o", "--out", type=click.Path(dir_okay=False, path_type=Path), help="The dump; default dump-ADDRESS.jsonl."
+    ),
+    click.option("--resume", is_flag=True, help="Continue the existing file."),
+    click.option("--dry-run", is_flag=True, help="Print the frames for a device that refuses nothing; send nothing."),
+    log_option,
+    json_option,
 )
-@click.option("--resume", is_flag=True, help="Continue the existing file.")
-@click.option(
-    "--passes", type=click.IntRange(1, 100_000), default=1, show_default=True, help="Number of passes, for `infer`."
-)
-@click.option("--every", "every_s", type=Duration(), default="10s", show_default=True, help="Time from pass to pass.")
-@click.option(
-    "--rate",
-    type=click.FloatRange(0, 1000),
-    default=50,
-    show_default=True,
-    help="Maximum requests per second; 0: no limit.",
-)
-@click.option(
-    "--thorough",
-    is_flag=True,
-    help="Read every address; by default only every eighth one, and round numbers, in unreadable ranges.",
-)
-@click.option(
-    "--budget", "budget_s", type=Duration(), default=f"{DEFAULT_BUDGET_S / 60:g}m", show_default=True,
-    help="Time for each table to search unreadable ranges: after silence, and with different read lengths.",
-)  # fmt: skip
-@click.option(
-    "--longest", type=click.IntRange(1, 2000), help="Values per read; default: as many as the device accepts."
-)
-@click.option("--pairs", is_flag=True, help="The device supports only pairs of registers.")
-@click.option(
-    "--retries", type=click.IntRange(0, 10), default=2, show_default=True, help="Repetitions without a valid reply."
-)
-@click.option("--no-functions", is_flag=True, help="Do not test functions 07h, 08h, 0Bh, 0Ch, 11h, 2Bh.")
-@click.option("--dry-run", is_flag=True, help="Print the frames for a device that refuses nothing; send nothing.")
-@json_option
 def command(
     endpoint: str,
     ranges: tuple[str, ...],
+    device: DeviceOptions,
+    reading: ReadingOptions,
     out: Path | None,
     resume: bool,
-    passes: int,
-    every_s: float,
-    rate: float,
-    thorough: bool,
-    budget_s: float,
-    longest: int | None,
-    pairs: bool,
-    retries: int,
-    no_functions: bool,
     dry_run: bool,
-    as_json: bool,
     log: Path | None,
-    **options: Any,
+    as_json: bool,
 ) -> int:
     """Dump the device at ENDPOINT: values, unreadable ranges, longest read, latency, supported functions. It sends only reads.
 
@@ -94,22 +106,22 @@ def command(
         holding:0..999 --passes 20 --every 15s
     fieldtwin dump can:socketcan/can0 --node 5 --eds drive.eds
     """
-    target = target_from(endpoint, options)
+    target = device.target(endpoint)
     if log is not None:
         raise UsageError("a dump always writes its log next to itself", got="--log")
     modbus = target.protocol == "modbus"
-    spacing_s = 1 / rate if rate else 0.0
+    spacing_s = 1 / reading.rate if reading.rate else 0.0
     job = Job(
         target,
         spans=register_spans(ranges) if modbus else (),
         objects=() if modbus else object_ranges(ranges),
-        stride=1 if thorough else 8,
-        most=longest,
-        pairs=pairs or (target.profile is not None and target.profile.form.limits.even_only),
-        passes=passes,
-        every_s=every_s,
-        functions=not no_functions,
-        budget_s=budget_s,
+        stride=1 if reading.thorough else 8,
+        most=reading.longest,
+        pairs=reading.pairs or (target.profile is not None and target.profile.form.limits.even_only),
+        passes=reading.passes,
+        every_s=reading.every_s,
+        functions=not reading.no_functions,
+        budget_s=reading.budget_s,
         spacing_s=spacing_s,
     )
     if dry_run:
@@ -117,12 +129,20 @@ def command(
             click.echo(frame)
         return 0
     out = out or Path(f"dump-{target.address}.jsonl")
-    stderr.print(estimate_text(estimate(job, spacing_s), passes, rate), soft_wrap=True)
+    stderr.print(estimate_text(estimate(job, spacing_s), reading.passes, reading.rate), soft_wrap=True)
     _tell_what_is_left_out(job)
     try:
         with _bar(out.name) as progress:
             run_precise(
-                dump(job, out, words=words(), resume=resume, retries=retries, spacing_s=spacing_s, progress=progress)
+                dump(
+                    job,
+                    out,
+                    words=words(),
+                    resume=resume,
+                    retries=reading.retries,
+                    spacing_s=spacing_s,
+                    progress=progress,
+                )
             )
     except KeyboardInterrupt:
         stderr.print(f"stopped; the values read so far are in {out}, and --resume continues", soft_wrap=True)

@@ -13,7 +13,7 @@ import click
 from rich.table import Table
 from rich.text import Text
 
-from fieldtwin.cli.device.device_options import logged
+from fieldtwin.cli.device.device_options import log_option, logged
 from fieldtwin.cli.options import Duration, json_option, profiles_option
 from fieldtwin.commissioning.identify.canopen import CanIdentity, identify_canopen
 from fieldtwin.commissioning.identify.matching import Candidate, Sureness
@@ -51,9 +51,7 @@ UNREACHABLE = 4
 @click.option("--echo", is_flag=True, help="Serial: the adapter echoes the sent bytes.")
 @click.option("--dry-run", is_flag=True, help="Print the first frames that would be sent; open nothing.")
 @click.option("--all", "show_all", is_flag=True, help="Also show the profiles that were ruled out, with the reason.")
-@click.option(
-    "--log", type=click.Path(dir_okay=False, path_type=Path), help="Append all sent and received frames to this file."
-)
+@log_option
 @profiles_option
 @json_option
 def command(

@@ -11,7 +11,7 @@ import click
 from rich.table import Table
 from rich.text import Text
 
-from fieldtwin.cli.device.device_options import logged
+from fieldtwin.cli.device.device_options import log_option, logged
 from fieldtwin.cli.device.scan_progress import ScanProgress
 from fieldtwin.cli.options import Duration, json_option
 from fieldtwin.cli.stop_key import StopKey
@@ -40,9 +40,7 @@ from fieldtwin.gateway.wallclock import run as run_precise
     help="Timeout for the probe's answer.",
 )
 @click.option("--bitrate", type=click.IntRange(10_000, 1_000_000), help="CAN: expected bit rate of the bus, in bit/s.")
-@click.option(
-    "--log", type=click.Path(dir_okay=False, path_type=Path), help="Append all sent and received frames to this file."
-)
+@log_option
 @json_option
 def command(endpoint: str, log: Path | None, as_json: bool, **options: Any) -> int:  # fmt: skip
     """Examine the serial line or bus at ENDPOINT without sending: traffic, the port's error counters, and possible faults, the

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 import click
 
-from fieldtwin.cli.device.device_options import device_options, logged, raw_form, raw_options, target_from
+from fieldtwin.cli.device.device_options import DeviceOptions, RawOptions, frames_option, log_option, logged
 from fieldtwin.cli.device.value_table import exit_code, value_table
+from fieldtwin.cli.option_groups import GroupedCommand, group
 from fieldtwin.cli.options import json_option
 from fieldtwin.commissioning.access.address import tags_of
 from fieldtwin.commissioning.access.point import Answer
@@ -20,15 +20,20 @@ from fieldtwin.gateway.core.files.profile import Tag
 from fieldtwin.gateway.wallclock import run as run_precise
 
 
-@click.command("read")
+@click.command("read", cls=GroupedCommand)
 @click.argument("endpoint")
 @click.argument("items", nargs=-1, metavar="[ITEM]...")
-@device_options
-@raw_options
-@click.option("--dry-run", is_flag=True, help="Print the frames that would be sent; send nothing.")
-@json_option
+@group("Device", device=DeviceOptions)
+@group("Raw addresses", raw=RawOptions)
+@group("Output", log_option, frames_option, json_option)
 def command(
-    endpoint: str, items: tuple[str, ...], log: Path | None, dry_run: bool, as_json: bool, **options: Any
+    endpoint: str,
+    items: tuple[str, ...],
+    device: DeviceOptions,
+    raw: RawOptions,
+    log: Path | None,
+    dry_run: bool,
+    as_json: bool,
 ) -> int:
     """Read ITEMs of the device at ENDPOINT: tags of a profile, or addresses; by default all tags of the profile.
 
@@ -43,8 +48,8 @@ def command(
         'voltage_*' frequency
     fieldtwin read can:socketcan/can0 --node 5 6041h:00 1018h:01 --count 4
     """
-    target = target_from(endpoint, options)
-    tags = tags_of(items, target.protocol, raw_form(options), target.profile, target.dictionary)
+    target = device.target(endpoint)
+    tags = tags_of(items, target.protocol, raw.form, target.profile, target.dictionary)
     readable = [t for t in tags if t.readable]
     if not readable:
         raise NotAllowed(f"cannot be read: {', '.join(t.name for t in tags)}", hint="the profile says `access: wo`")

@@ -5,14 +5,15 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import click
 
-from fieldtwin.cli.device.device_options import logged
+from fieldtwin.cli.device.device_options import log_option, logged
 from fieldtwin.cli.device.scan_progress import ScanProgress, duration
 from fieldtwin.cli.device.scan_view import can_json, modbus_json, show_can, show_modbus
+from fieldtwin.cli.option_groups import GroupedCommand, group, option
 from fieldtwin.cli.options import Duration, json_option
 from fieldtwin.cli.stop_key import StopKey
 from fieldtwin.commissioning.access.connection import frame_of
@@ -29,31 +30,54 @@ INTERRUPTED = 130
 _PART = re.compile(r"^([0-9]{1,3})(?:-([0-9]{1,3}))?$")
 
 
-@click.command("scan")
+@dataclass(frozen=True)
+class SearchOptions:
+    """The units, nodes and settings to search. None: the default for the protocol."""
+
+    units: str | None = option(
+        "--units", metavar="LIST", help="Modbus unit IDs, such as 1-20,247; default 1 to 247, on TCP also 0 and 255."
+    )
+    nodes: str | None = option("--nodes", metavar="LIST", help="CANopen node IDs; default 1 to 127.")
+    quick: bool = option("--quick", is_flag=True, help="Modbus: only the likely settings and units (30 s).")
+    every_setting: bool = option("--all", is_flag=True, help="Modbus: try all settings, even after units were found.")
+    no_lss: bool = option("--no-lss", is_flag=True, help="CAN: do not search for nodes without a node ID.")
+
+
+@dataclass(frozen=True)
+class BusOptions:
+    """How long the scan listens, and how fast it sends. None: the default for the protocol."""
+
+    listen_only: bool = option("--listen", is_flag=True, help="Only listen: send nothing.")
+    listen_for: float | None = option(
+        "--listen-for", type=Duration(), help="How long to listen first; default 3s, on CAN 5s."
+    )
+    share_bus: bool = option(
+        "--share-bus", is_flag=True, help="Send although the bus carries traffic: between its exchanges."
+    )
+    timeout_s: float | None = option(
+        "--timeout", type=Duration(), help="Timeout for each reply; default 600ms, TCP 1s, CAN 100ms."
+    )
+    per_s: float | None = option(
+        "--rate", type=click.FloatRange(0.1, 1000), help="Maximum requests per second; default 20, CAN 10."
+    )
+    bitrate: int | None = option(
+        "--bitrate", type=click.IntRange(10_000, 1_000_000), help="CAN: expected bit rate of the bus, in bit/s."
+    )
+
+
+@click.command("scan", cls=GroupedCommand)
 @click.argument("endpoint")
-@click.option(
-    "--units", metavar="LIST", help="Modbus unit IDs, such as 1-20,247; default 1 to 247, on TCP also 0 and 255."
+@group("Search", search=SearchOptions)
+@group("Bus", bus=BusOptions)
+@group(
+    "Output",
+    log_option,
+    click.option("--dry-run", is_flag=True, help="Print the requests and their duration; open nothing."),
+    json_option,
 )
-@click.option("--nodes", metavar="LIST", help="CANopen node IDs; default 1 to 127.")
-@click.option("--listen", "listen_only", is_flag=True, help="Only listen: send nothing.")
-@click.option("--listen-for", type=Duration(), help="How long to listen first; default 3s, on CAN 5s.")
-@click.option("--share-bus", is_flag=True, help="Send although the bus carries traffic: between its exchanges.")
-@click.option(
-    "--timeout", "timeout_s", type=Duration(), help="Timeout for each reply; default 600ms, TCP 1s, CAN 100ms."
-)
-@click.option(
-    "--rate", "per_s", type=click.FloatRange(0.1, 1000), help="Maximum requests per second; default 20, CAN 10."
-)
-@click.option("--quick", is_flag=True, help="Modbus: only the likely settings and units (30 s).")
-@click.option("--all", "every_setting", is_flag=True, help="Modbus: try all settings, even after units were found.")
-@click.option("--bitrate", type=click.IntRange(10_000, 1_000_000), help="CAN: expected bit rate of the bus, in bit/s.")
-@click.option("--no-lss", is_flag=True, help="CAN: do not search for nodes without a node ID.")
-@click.option(
-    "--log", type=click.Path(dir_okay=False, path_type=Path), help="Append all sent and received frames to this file."
-)
-@click.option("--dry-run", is_flag=True, help="Print the requests and their duration; open nothing.")
-@json_option
-def command(endpoint: str, log: Path | None, dry_run: bool, as_json: bool, **options: Any) -> int:
+def command(
+    endpoint: str, search: SearchOptions, bus: BusOptions, log: Path | None, dry_run: bool, as_json: bool
+) -> int:
     """Find the units or nodes at ENDPOINT: listen first, then ask at a limited rate.
 
     \b
@@ -69,16 +93,16 @@ def command(endpoint: str, log: Path | None, dry_run: bool, as_json: bool, **opt
     q or Ctrl-C stops the scan and keeps its results. Exit code 1: no device was found.
     """
     can = Endpoint.parse(endpoint).is_can
-    _refuse_foreign(can, options)
+    _refuse_foreign(can, search, bus)
     if dry_run:
-        for line in _plan_of_can(options) if can else _plan_of_modbus(endpoint, options):
+        for line in _plan_of_can(search, bus) if can else _plan_of_modbus(endpoint, search, bus):
             click.echo(line)
         return 0
-    return _can(endpoint, log, as_json, options) if can else _modbus(endpoint, log, as_json, options)
+    return (_can if can else _modbus)(endpoint, search, bus, log, as_json)
 
 
-def _modbus(endpoint: str, log: Path | None, as_json: bool, options: dict[str, Any]) -> int:
-    result = run_precise(_scan_modbus(endpoint, log, options))
+def _modbus(endpoint: str, search: SearchOptions, bus: BusOptions, log: Path | None, as_json: bool) -> int:
+    result = run_precise(_scan_modbus(endpoint, search, bus, log))
     if as_json:
         click.echo(json.dumps(modbus_json(result)))
     else:
@@ -87,8 +111,8 @@ def _modbus(endpoint: str, log: Path | None, as_json: bool, options: dict[str, A
     return _end(found, result.stopped, result.took_s)
 
 
-def _can(endpoint: str, log: Path | None, as_json: bool, options: dict[str, Any]) -> int:
-    result = run_precise(_scan_can(endpoint, log, options))
+def _can(endpoint: str, search: SearchOptions, bus: BusOptions, log: Path | None, as_json: bool) -> int:
+    result = run_precise(_scan_can(endpoint, search, bus, log))
     if as_json:
         click.echo(json.dumps(can_json(result)))
     else:
@@ -104,9 +128,9 @@ def _end(found: bool, stopped: bool, took_s: float) -> int:
     return 0 if found else 1
 
 
-def _plan_of_modbus(endpoint: str, options: dict[str, Any]) -> Iterator[str]:
+def _plan_of_modbus(endpoint: str, search: SearchOptions, bus: BusOptions) -> Iterator[str]:
     """Return the phases, settings and frames for `--dry-run`."""
-    made = _modbus_options(options)
+    made = _modbus_options(search, bus)
     if Endpoint.parse(endpoint).is_serial:
         yield f"listen for {duration(made.listen_s)}; if there is traffic, nothing is sent" + (
             ", but between its exchanges" if made.share_bus else " without --share-bus"
@@ -120,8 +144,8 @@ def _plan_of_modbus(endpoint: str, options: dict[str, Any]) -> Iterator[str]:
             yield f"  {where}{len(step.units)} units: {first} ... {last}"
 
 
-def _plan_of_can(options: dict[str, Any]) -> Iterator[str]:
-    made = _can_options(options)
+def _plan_of_can(search: SearchOptions, bus: BusOptions) -> Iterator[str]:
+    made = _can_options(search, bus)
     yield f"listen for {duration(made.listen_s)}; if there is traffic, nothing is sent" + (
         "" if made.share_bus else " without --share-bus"
     )
@@ -133,41 +157,41 @@ def _plan_of_can(options: dict[str, Any]) -> Iterator[str]:
             yield "nodes without a node ID: 7E5#4C00000000000000, then LSS fastscan, 14 s for each one found"
 
 
-async def _scan_modbus(endpoint: str, log: Path | None, options: dict[str, Any]) -> ModbusScan:
-    made = _modbus_options(options)
+async def _scan_modbus(endpoint: str, search: SearchOptions, bus: BusOptions, log: Path | None) -> ModbusScan:
+    made = _modbus_options(search, bus)
     with logged(log) as taps, StopKey() as stop, ScanProgress(stop.listens) as show:
         return await ModbusScanner(endpoint, made, on_progress=show, stop=stop.pressed, taps=taps).run()
 
 
-async def _scan_can(endpoint: str, log: Path | None, options: dict[str, Any]) -> CanScan:
-    made = _can_options(options)
+async def _scan_can(endpoint: str, search: SearchOptions, bus: BusOptions, log: Path | None) -> CanScan:
+    made = _can_options(search, bus)
     with logged(log) as taps, StopKey() as stop, ScanProgress(stop.listens) as show:
         return await CanScanner(endpoint, made, on_progress=show, stop=stop.pressed, taps=taps).run()
 
 
-def _modbus_options(options: dict[str, Any]) -> ScanOptions:
+def _modbus_options(search: SearchOptions, bus: BusOptions) -> ScanOptions:
     return ScanOptions(
-        units=numbers(options["units"], 0, 255, "--units"),
-        timeout_s=options["timeout_s"],
-        per_s=options["per_s"] or 20.0,
-        listen_s=3.0 if options["listen_for"] is None else options["listen_for"],
-        quick_only=options["quick"],
-        listen_only=options["listen_only"],
-        every_setting=options["every_setting"],
-        share_bus=options["share_bus"],
+        units=numbers(search.units, 0, 255, "--units"),
+        timeout_s=bus.timeout_s,
+        per_s=bus.per_s or 20.0,
+        listen_s=3.0 if bus.listen_for is None else bus.listen_for,
+        quick_only=search.quick,
+        listen_only=bus.listen_only,
+        every_setting=search.every_setting,
+        share_bus=bus.share_bus,
     )
 
 
-def _can_options(options: dict[str, Any]) -> CanScanOptions:
+def _can_options(search: SearchOptions, bus: BusOptions) -> CanScanOptions:
     return CanScanOptions(
-        bitrate=options["bitrate"] or 0,
-        nodes=numbers(options["nodes"], 1, 127, "--nodes") or ALL_NODES,
-        listen_s=5.0 if options["listen_for"] is None else options["listen_for"],
-        timeout_s=options["timeout_s"] or 0.1,
-        per_s=options["per_s"] or 10.0,
-        lss=not options["no_lss"],
-        listen_only=options["listen_only"],
-        share_bus=options["share_bus"],
+        bitrate=bus.bitrate or 0,
+        nodes=numbers(search.nodes, 1, 127, "--nodes") or ALL_NODES,
+        listen_s=5.0 if bus.listen_for is None else bus.listen_for,
+        timeout_s=bus.timeout_s or 0.1,
+        per_s=bus.per_s or 10.0,
+        lss=not search.no_lss,
+        listen_only=bus.listen_only,
+        share_bus=bus.share_bus,
     )
 
 
@@ -186,10 +210,10 @@ def numbers(text: str | None, low: int, high: int, name: str) -> tuple[int, ...]
     return tuple(dict.fromkeys(found))
 
 
-def _refuse_foreign(can: bool, options: dict[str, Any]) -> None:
+def _refuse_foreign(can: bool, search: SearchOptions, bus: BusOptions) -> None:
     """Raise `UsageError` for options of the other protocol."""
-    foreign = ("units", "quick", "every_setting") if can else ("nodes", "bitrate", "no_lss")
-    names = {"every_setting": "--all"}
-    given = [names.get(n, "--" + n.replace("_", "-")) for n in foreign if options[n]]
+    of_modbus = {"--units": search.units, "--quick": search.quick, "--all": search.every_setting}
+    of_can = {"--nodes": search.nodes, "--bitrate": bus.bitrate, "--no-lss": search.no_lss}
+    given = [name for name, value in (of_modbus if can else of_can).items() if value]
     if given:
         raise UsageError(f"{', '.join(given)}: not {'on a CAN bus' if can else 'of Modbus'}")

@@ -15,8 +15,9 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from fieldtwin.cli.device.device_options import device_options, logged, raw_form, raw_options, target_from
+from fieldtwin.cli.device.device_options import DeviceOptions, RawOptions, log_option, logged
 from fieldtwin.cli.device.value_table import COLOUR, exit_code
+from fieldtwin.cli.option_groups import GroupedCommand, group
 from fieldtwin.cli.options import Duration, json_option
 from fieldtwin.commissioning.access.address import tags_of
 from fieldtwin.commissioning.access.plotting import check_plot, plot
@@ -33,30 +34,41 @@ from fieldtwin.gateway.wallclock import run as run_precise
 LEAST_EVERY_S = 0.02
 
 
-@click.command("watch")
+@click.command("watch", cls=GroupedCommand)
 @click.argument("endpoint")
 @click.argument("items", nargs=-1, metavar="[ITEM]...")
-@device_options
-@raw_options
-@click.option("--every", "every_s", type=Duration(), default="1s", show_default=True, help="Sample interval.")
-@click.option("--samples", "most", type=click.IntRange(1), help="Number of samples; default: until Ctrl-C.")
-@click.option("--for", "for_s", type=Duration(), help="Stop after this time.")
-@click.option(
-    "--plot", "plot_path", type=click.Path(dir_okay=False, path_type=Path), help="Write a plot to this file at the end."
+@group("Device", device=DeviceOptions)
+@group("Raw addresses", raw=RawOptions)
+@group(
+    "Samples",
+    click.option("--every", "every_s", type=Duration(), default="1s", show_default=True, help="Sample interval."),
+    click.option("--samples", "most", type=click.IntRange(1), help="Number of samples; default: until Ctrl-C."),
+    click.option("--for", "for_s", type=Duration(), help="Stop after this time."),
 )
-@click.option("--dry-run", is_flag=True, help="Print the frames of one sample; send nothing.")
-@json_option
+@group(
+    "Output",
+    click.option(
+        "--plot",
+        "plot_path",
+        type=click.Path(dir_okay=False, path_type=Path),
+        help="Write a plot to this file at the end.",
+    ),
+    log_option,
+    click.option("--dry-run", is_flag=True, help="Print the frames of one sample; send nothing."),
+    json_option,
+)
 def command(
     endpoint: str,
     items: tuple[str, ...],
-    log: Path | None,
+    device: DeviceOptions,
+    raw: RawOptions,
     every_s: float,
     most: int | None,
     for_s: float | None,
     plot_path: Path | None,
+    log: Path | None,
     dry_run: bool,
     as_json: bool,
-    **options: Any,
 ) -> int:
     """Read ITEMs of the device at ENDPOINT periodically, and show a table with sparklines; with --json, one line per sample.
 
@@ -68,8 +80,8 @@ def command(
     fieldtwin watch can:socketcan/can0 --node 5 --profile drive-cia402 \\
         statusword position --json
     """
-    target = target_from(endpoint, options)
-    tags = tags_of(items, target.protocol, raw_form(options), target.profile, target.dictionary)
+    target = device.target(endpoint)
+    tags = tags_of(items, target.protocol, raw.form, target.profile, target.dictionary)
     unreadable = [t.name for t in tags if not t.readable]
     if unreadable:
         raise NotAllowed(f"cannot be read: {', '.join(unreadable)}", hint="the profile says `access: wo`")

@@ -6,13 +6,15 @@ import asyncio
 import json
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import click
 from rich.text import Text
 
-from fieldtwin.cli.device.device_options import device_options, logged, raw_form, raw_options, target_from
+from fieldtwin.cli.device.device_options import DeviceOptions, RawOptions, log_option, logged
+from fieldtwin.cli.option_groups import GroupedCommand, group, option
 from fieldtwin.cli.options import Duration, json_option
 from fieldtwin.commissioning.access import writing
 from fieldtwin.commissioning.access.address import of_behaviour, tags_of, with_care
@@ -29,47 +31,43 @@ from fieldtwin.gateway.wallclock import run as run_precise
 RESTART_COMMUNICATIONS = 1
 
 
-@click.command("write")
+@dataclass(frozen=True)
+class WriteOptions:
+    """Additional writes, the confirmation, and the restoring of old values after `hold_s` seconds."""
+
+    behaviours: tuple[str, ...] = option(
+        "--behaviour", multiple=True, metavar="NAME", help="Make the named writes of the profile (`behaviours`)."
+    )
+    restart: bool = option(
+        "--restart-communications", is_flag=True, help="Modbus: send function 08h/01h (restart) instead of a value."
+    )
+    restore: bool = option("--restore", is_flag=True, help="Restore the old values afterwards.")
+    hold_s: float = option(
+        "--hold", type=Duration(), default="0s", help="With --restore: time before the old values are restored."
+    )
+    blind: bool = option("--blind", is_flag=True, help="Write even if the old value cannot be read.")
+    yes: bool = option("--yes", is_flag=True, help="Do not ask.")
+    i_know: bool = option(
+        "--i-know", is_flag=True, help="Permit writes with wider effects: unit 0, `danger` tags, restarts."
+    )
+    dry_run: bool = option("--dry-run", is_flag=True, help="Print the frames that would be sent; send nothing.")
+
+
+@click.command("write", cls=GroupedCommand)
 @click.argument("endpoint")
 @click.argument("items", nargs=-1, metavar="ITEM=VALUE...")
-@device_options
-@raw_options
-@click.option(
-    "--behaviour",
-    "behaviours",
-    multiple=True,
-    metavar="NAME",
-    help="Make the named writes of the profile (`behaviours`).",
-)
-@click.option("--yes", is_flag=True, help="Do not ask.")
-@click.option("--restore", is_flag=True, help="Restore the old values afterwards.")
-@click.option(
-    "--hold", "hold_s", type=Duration(), default="0s", help="With --restore: time before the old values are restored."
-)
-@click.option("--blind", is_flag=True, help="Write even if the old value cannot be read.")
-@click.option("--i-know", is_flag=True, help="Permit writes with wider effects: unit 0, `danger` tags, restarts.")
-@click.option(
-    "--restart-communications",
-    "restart",
-    is_flag=True,
-    help="Modbus: send function 08h/01h (restart) instead of a value.",
-)
-@click.option("--dry-run", is_flag=True, help="Print the frames that would be sent; send nothing.")
-@json_option
+@group("Device", device=DeviceOptions)
+@group("Raw addresses", raw=RawOptions)
+@group("Write", how=WriteOptions)
+@group("Output", log_option, json_option)
 def command(
     endpoint: str,
     items: tuple[str, ...],
-    behaviours: tuple[str, ...],
+    device: DeviceOptions,
+    raw: RawOptions,
+    how: WriteOptions,
     log: Path | None,
-    yes: bool,
-    restore: bool,
-    hold_s: float,
-    blind: bool,
-    i_know: bool,
-    restart: bool,
-    dry_run: bool,
     as_json: bool,
-    **options: Any,
 ) -> int:
     """Write ITEMs of the device at ENDPOINT: read, ask for confirmation, write once, read back, compare.
 
@@ -85,21 +83,22 @@ def command(
     fieldtwin write can:socketcan/can0 --node 5 --profile drive-cia402 \\
         --behaviour quick_stop
     """
-    target = target_from(endpoint, options)
-    items = (*(item for name in behaviours for item in of_behaviour(name, target.profile)), *items)
-    if restart:
-        return _restart(target, items, log, i_know=i_know, yes=yes, dry_run=dry_run)
-    writes = writing.plan_writes(_pairs(items, target, options), i_know=i_know, restore=restore)
+    target = device.target(endpoint)
+    items = (*(item for name in how.behaviours for item in of_behaviour(name, target.profile)), *items)
+    if how.restart:
+        return _restart(target, items, log, i_know=how.i_know, yes=how.yes, dry_run=how.dry_run)
+    writes = writing.plan_writes(_pairs(items, target, raw), i_know=how.i_know, restore=how.restore)
     dry = dry_point(target)
-    writing.check_broadcast(dry, i_know=i_know)
-    if dry_run:
+    writing.check_broadcast(dry, i_know=how.i_know)
+    if how.dry_run:
         for write in writes:
             for frame in dry.write_frames(write.tag, write.data):
                 click.echo(frame)
         return 0
-    if not yes and not sys.stdin.isatty():
+    if not how.yes and not sys.stdin.isatty():
         raise NotAllowed("there is no terminal to confirm the write", expected="--yes")
-    done = run_precise(_write(target, writes, log, yes=yes, hold_s=hold_s if restore else None, blind=blind))
+    hold_s = how.hold_s if how.restore else None
+    done = run_precise(_write(target, writes, log, yes=how.yes, hold_s=hold_s, blind=how.blind))
     if as_json:
         click.echo(json.dumps([_row(w) for w in done]))
     else:
@@ -108,7 +107,7 @@ def command(
     return 0
 
 
-def _pairs(items: tuple[str, ...], target: Target, options: dict[str, Any]) -> list[tuple[Tag, str]]:
+def _pairs(items: tuple[str, ...], target: Target, raw: RawOptions) -> list[tuple[Tag, str]]:
     if not items:
         raise UsageError("nothing to write", expected="ITEM=VALUE, such as holding:100=42")
     pairs: list[tuple[Tag, str]] = []
@@ -116,7 +115,7 @@ def _pairs(items: tuple[str, ...], target: Target, options: dict[str, Any]) -> l
         name, equals, value = item.partition("=")
         if not equals or not value:
             raise UsageError(f"cannot read {item!r}", expected="ITEM=VALUE, such as holding:100=42")
-        tags = tags_of([name], target.protocol, raw_form(options), target.profile, target.dictionary)
+        tags = tags_of([name], target.protocol, raw.form, target.profile, target.dictionary)
         if len(tags) != 1:
             raise UsageError(f"{name!r} means {len(tags)} values", expected="one tag, or a separate value for each")
         pairs.append((with_care(tags[0], target.profile), value))

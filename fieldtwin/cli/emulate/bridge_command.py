@@ -7,6 +7,7 @@ import sys
 
 import click
 
+from fieldtwin.cli.option_groups import GroupedCommand, group
 from fieldtwin.cli.options import Duration, json_option, pairs
 from fieldtwin.console import stderr
 from fieldtwin.gateway.core.endpoint import Endpoint
@@ -18,53 +19,68 @@ from fieldtwin.run.live.bridge import BridgeOptions, run_bridge
 ANYWHERE = ("127.0.0.1", "::1", "localhost", "")
 
 
-@click.command("bridge")
+@click.command("bridge", cls=GroupedCommand)
 @click.argument("listen")
 @click.argument("target")
-@click.option(
-    "--allow",
-    "networks",
-    multiple=True,
-    metavar="NETWORK",
-    help="Network that may connect; default: this host. Repeatable.",
+@group(
+    "Clients",
+    click.option(
+        "--allow",
+        "networks",
+        multiple=True,
+        metavar="NETWORK",
+        help="Network that may connect; default: this host. Repeatable.",
+    ),
+    click.option(
+        "--role",
+        "roles",
+        multiple=True,
+        metavar="ROLE",
+        help="tls: only clients whose certificate has this role. Repeatable.",
+    ),
+    click.option("--allow-writes", is_flag=True, help="Forward every function; default: only functions that read."),
+    click.option(
+        "--clients", type=click.IntRange(1, 1000), default=16, show_default=True, help="Maximum number of connections."
+    ),
+    click.option(
+        "--queue", type=click.IntRange(1, 64), default=32, show_default=True, help="Maximum number of queued requests."
+    ),
+    click.option(
+        "--idle", "idle_s", type=Duration(), default="0", help="Disconnect clients that are silent for this time."
+    ),
 )
-@click.option("--allow-writes", is_flag=True, help="Forward every function; default: only functions that read.")
-@click.option(
-    "--unit", "units", multiple=True, metavar="UNIT=UNIT", help="Map a client's unit ID to the target's. Repeatable."
+@group(
+    "Requests",
+    click.option(
+        "--unit",
+        "units",
+        multiple=True,
+        metavar="UNIT=UNIT",
+        help="Map a client's unit ID to the target's. Repeatable.",
+    ),
+    click.option(
+        "--timeout", "timeout_s", type=Duration(), default="1s", show_default=True, help="Reply timeout of a unit."
+    ),
+    click.option(
+        "--retries", type=click.IntRange(0, 10), default=1, show_default=True, help="Repetitions of unanswered reads."
+    ),
+    click.option(
+        "--cache", "cache_s", type=Duration(), default="0", help="Answer reads from cached replies of at most this age."
+    ),
+    click.option(
+        "--broadcast", is_flag=True, help="Forward broadcasts (unit 0) to the line; the client gets no answer."
+    ),
+    click.option(
+        "--answer-broadcast", is_flag=True, help="Forward broadcasts, and confirm their transmission to the client."
+    ),
+    click.option("--pause", "pause_s", type=Duration(), default="0", help="Pause between two exchanges on TARGET."),
+    click.option("--echo", is_flag=True, help="Serial TARGET: the adapter echoes the sent bytes (RS-485)."),
 )
-@click.option(
-    "--timeout", "timeout_s", type=Duration(), default="1s", show_default=True, help="Reply timeout of a unit."
+@group(
+    "Output",
+    click.option("--instance", default="", help="Name of the run directory, which contains the audit log."),
+    json_option,
 )
-@click.option(
-    "--retries", type=click.IntRange(0, 10), default=1, show_default=True, help="Repetitions of unanswered reads."
-)
-@click.option(
-    "--cache", "cache_s", type=Duration(), default="0", help="Answer reads from cached replies of at most this age."
-)
-@click.option(
-    "--clients", type=click.IntRange(1, 1000), default=16, show_default=True, help="Maximum number of connections."
-)
-@click.option(
-    "--queue", type=click.IntRange(1, 64), default=32, show_default=True, help="Maximum number of queued requests."
-)
-@click.option("--broadcast", is_flag=True, help="Forward broadcasts (unit 0) to the line; the client gets no answer.")
-@click.option(
-    "--answer-broadcast", is_flag=True, help="Forward broadcasts, and confirm their transmission to the client."
-)
-@click.option("--pause", "pause_s", type=Duration(), default="0", help="Pause between two exchanges on TARGET.")
-@click.option("--echo", is_flag=True, help="Serial TARGET: the adapter echoes the sent bytes (RS-485).")
-@click.option(
-    "--idle", "idle_s", type=Duration(), default="0", help="Disconnect clients that are silent for this time."
-)
-@click.option(
-    "--role",
-    "roles",
-    multiple=True,
-    metavar="ROLE",
-    help="tls: only clients whose certificate has this role. Repeatable.",
-)
-@click.option("--instance", default="", help="Name of the run directory, which contains the audit log.")
-@json_option
 def command(
     listen: str,
     target: str,

@@ -20,94 +20,107 @@ if TYPE_CHECKING:
 
 @click.command("emulate", cls=GroupedCommand)
 @click.argument("what")
-@click.option(
-    "--on", "endpoints", multiple=True, metavar="ENDPOINT", help="For a device or recording: the endpoint to listen on."
+@group(
+    "One device",
+    click.option(
+        "--on",
+        "endpoints",
+        multiple=True,
+        metavar="ENDPOINT",
+        help="For a device or recording: the endpoint to listen on.",
+    ),
+    click.option(
+        "--unit", type=click.IntRange(1, 247), default=None, help="For a device: its unit ID; default: the profile's."
+    ),
+    click.option(
+        "--node",
+        type=click.IntRange(1, 255),
+        default=None,
+        help="For a CANopen device or data sheet: its node ID; 255: none yet, an LSS master assigns it.",
+    ),
+    click.option(
+        "--bitrate",
+        type=click.IntRange(10_000, 1_000_000),
+        default=None,
+        help="For a CANopen device: bit/s of the software bus; default 125000 for a new bus.",
+    ),
+    click.option(
+        "--values",
+        multiple=True,
+        metavar="TAG=VALUE|FILE",
+        help="For a Modbus profile: initial register values, 0 by default; no recording is replayed. FILE: a YAML mapping.",
+    ),
+    click.option(
+        "--faults",
+        "faults_file",
+        type=click.Path(exists=True, dir_okay=False),
+        help="For a Modbus device or recording: inject these faults (see fieldtwin faults).",
+    ),
+    click.option("--seed", type=int, default=1, help="With --faults: seed of random choices; default: 1."),
+    click.option(
+        "--any-unit",
+        is_flag=True,
+        help="For one Modbus device on TCP, TLS or UDP: answer to every unit ID, as some devices do.",
+    ),
+    click.option(
+        "--model",
+        type=click.Choice(["401", "402", "404", "406", "410", "none"]),
+        default=None,
+        help="For a CANopen device: the CiA profile whose model computes its objects. Default: from object 1000h.",
+    ),
+    click.option(
+        "--defaults", is_flag=True, help="For a CANopen device: start with the DefaultValues, not with ParameterValues."
+    ),
 )
-@click.option(
-    "--unit", type=click.IntRange(1, 247), default=None, help="For a device: its unit ID; default: the profile's."
+@group(
+    "Recording",
+    click.option(
+        "--recording",
+        "recordings",
+        multiple=True,
+        metavar="[DEVICE=]FILE",
+        help="Replay this recording; for a data sheet: a log of candump -L.",
+    ),
+    click.option("--speed", type=float, default=0.0, help="Speed factor for recordings."),
+    click.option(
+        "--unknown",
+        type=click.Choice(["exception", "silence", "interpolate"]),
+        default=None,
+        help="For a recording: the answer to a request that was not recorded. Default: exception.",
+    ),
+    click.option(
+        "--at-end",
+        type=click.Choice(["hold", "loop", "error"]),
+        default=None,
+        help="For a recording: at the end of its values, hold the last one (default), begin again, or answer with exception 04.",
+    ),
 )
-@click.option(
-    "--node",
-    type=click.IntRange(1, 255),
-    default=None,
-    help="For a CANopen device or data sheet: its node ID; 255: none yet, an LSS master assigns it.",
+@group(
+    "System",
+    click.option(
+        "--prototype-file",
+        type=click.Path(exists=True, dir_okay=False, path_type=Path),
+        help="For a system: use this prototype file.",
+    ),
+    click.option(
+        "--listen", multiple=True, metavar="BUS=ENDPOINT", help="For a system: endpoint for the emulators of a bus."
+    ),
+    click.option(
+        "--control",
+        default=f"127.0.0.1:{DEFAULT_CONTROL_PORT}",
+        show_default=True,
+        metavar="HOST:PORT",
+        help="For a system: control address, for `fieldtwin run --field`.",
+    ),
+    click.option(
+        "--token",
+        type=Secret(),
+        default="",
+        metavar="@FILE",
+        help="Token that --control requires from its clients; needed if not on loopback. Or FIELDTWIN_EMULATE_TOKEN.",
+    ),
+    click.option("--instance", default="", help="Name of the run directory; default: the system's name and -field."),
 )
-@click.option(
-    "--bitrate",
-    type=click.IntRange(10_000, 1_000_000),
-    default=None,
-    help="For a CANopen device: bit/s of the software bus; default 125000 for a new bus.",
-)
-@click.option(
-    "--model",
-    type=click.Choice(["401", "402", "404", "406", "410", "none"]),
-    default=None,
-    help="For a CANopen device: the CiA profile whose model computes its objects. Default: from object 1000h.",
-)
-@click.option(
-    "--defaults", is_flag=True, help="For a CANopen device: start with the DefaultValues, not with ParameterValues."
-)
-@click.option(
-    "--recording",
-    "recordings",
-    multiple=True,
-    metavar="[DEVICE=]FILE",
-    help="Replay this recording; for a data sheet: a log of candump -L.",
-)
-@click.option("--speed", type=float, default=0.0, help="Speed factor for recordings.")
-@click.option(
-    "--unknown",
-    type=click.Choice(["exception", "silence", "interpolate"]),
-    default=None,
-    help="For a recording: the answer to a request that was not recorded. Default: exception.",
-)
-@click.option(
-    "--at-end",
-    type=click.Choice(["hold", "loop", "error"]),
-    default=None,
-    help="For a recording: at the end of its values, hold the last one (default), begin again, or answer with exception 04.",
-)
-@click.option(
-    "--values",
-    multiple=True,
-    metavar="TAG=VALUE|FILE",
-    help="For a Modbus profile: initial register values, 0 by default; no recording is replayed. FILE: a YAML mapping.",
-)
-@click.option(
-    "--faults",
-    "faults_file",
-    type=click.Path(exists=True, dir_okay=False),
-    help="For a Modbus device or recording: inject these faults (see fieldtwin faults).",
-)
-@click.option("--seed", type=int, default=1, help="With --faults: seed of random choices; default: 1.")
-@click.option(
-    "--any-unit",
-    is_flag=True,
-    help="For one Modbus device on TCP, TLS or UDP: answer to every unit ID, as some devices do.",
-)
-@click.option(
-    "--prototype-file",
-    type=click.Path(exists=True, dir_okay=False, path_type=Path),
-    help="For a system: use this prototype file.",
-)
-@click.option(
-    "--listen", multiple=True, metavar="BUS=ENDPOINT", help="For a system: endpoint for the emulators of a bus."
-)
-@click.option(
-    "--control",
-    default=f"127.0.0.1:{DEFAULT_CONTROL_PORT}",
-    show_default=True,
-    metavar="HOST:PORT",
-    help="For a system: control address, for `fieldtwin run --field`.",
-)
-@click.option(
-    "--token",
-    type=Secret(),
-    default="",
-    metavar="@FILE",
-    help="Token that --control requires from its clients; needed if not on loopback. Or FIELDTWIN_EMULATE_TOKEN.",
-)
-@click.option("--instance", default="", help="Name of the run directory; default: the system's name and -field.")
 @group("Profiles and templates", sources=SourceOptions)
 def command(
     what: str,

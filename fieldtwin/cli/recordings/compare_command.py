@@ -6,7 +6,7 @@ import asyncio
 import json
 import sys
 from collections.abc import Callable, Coroutine
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,8 @@ from fieldtwin.capture.formats.candump import read_log
 from fieldtwin.capture.recordings.comparing import Comparer, Comparison, Rules, Tolerance, pairs_of, request_of
 from fieldtwin.capture.recordings.comparing_can import Frames, compare_logs
 from fieldtwin.capture.recordings.rotating_file import exchanges_of, header_of, parts_of
-from fieldtwin.cli.device.device_options import device_options, logged, target_from
+from fieldtwin.cli.device.device_options import DeviceOptions, log_option, logged
+from fieldtwin.cli.option_groups import GroupedCommand, group, option
 from fieldtwin.cli.options import Duration, json_option, pairs
 from fieldtwin.commissioning.record.asking import asker_at, changes, frame_for
 from fieldtwin.commissioning.record.comparing import compare_device, compare_node, uploads_of
@@ -37,52 +38,88 @@ INCONCLUSIVE = 4
 """Exit code: all compared values agree, but some could not be compared."""
 
 
-@click.command("compare")
+@dataclass(frozen=True)
+class RuleOptions:
+    """How much the two may differ, as texts."""
+
+    tolerances: tuple[str, ...] = option(
+        "--tolerance",
+        multiple=True,
+        metavar="[TAG=]AMOUNT",
+        help="Tolerance of values, such as 2 or 1% or frequency=0.05; repeatable. Default: 0.",
+    )
+    latency: str = option(
+        "--latency",
+        default="20ms/50%",
+        show_default=True,
+        metavar="AMOUNT",
+        help="What median and 90 % of the latencies may differ by, whichever of the two is more; `any`: not judged.",
+    )
+    least: float = option(
+        "--least",
+        type=click.FloatRange(0, 100),
+        default=100.0,
+        show_default=True,
+        metavar="PERCENT",
+        help="Required share of equal exchanges.",
+    )
+
+    @property
+    def rules(self) -> Rules:
+        """Return the parsed rules. Raises `UsageError`."""
+        return Rules(*_tolerances(self.tolerances), _latency(self.latency), self.least / 100)
+
+
+@dataclass(frozen=True)
+class LiveOptions:
+    """The requests to a live device, and the confirmation of writes. `most` None: every request of the recording."""
+
+    most: int | None = option(
+        "--most", type=click.IntRange(1), default=None, help="With a live device: send only this many requests."
+    )
+    listen_s: float = option(
+        "--listen",
+        type=Duration(),
+        default="0s",
+        help="With a live bus: listen for this time, and compare messages too.",
+    )
+    spacing_s: float = option(
+        "--spacing", type=Duration(), default="0s", help="With a live device: pause after every exchange."
+    )
+    writes: bool = option(
+        "--writes", is_flag=True, help="With a live device: repeat the recorded writes as well, after a confirmation."
+    )
+    yes: bool = option("--yes", is_flag=True, help="With --writes: do not ask for confirmation.")
+    i_know: bool = option(
+        "--i-know", is_flag=True, help="With --writes: repeat broadcasts and restarts (FC08) as well."
+    )
+    dry_run: bool = option(
+        "--dry-run", is_flag=True, help="With a live device: print the frames that would be sent; send nothing."
+    )
+
+
+@click.command("compare", cls=GroupedCommand)
 @click.argument("recording", type=click.Path(dir_okay=False, path_type=Path))
 @click.argument("other")
-@click.option(
-    "--tolerance",
-    "tolerances",
-    multiple=True,
-    metavar="[TAG=]AMOUNT",
-    help="Tolerance of values, such as 2 or 1% or frequency=0.05; repeatable. Default: 0.",
+@group("Comparison", allowed=RuleOptions)
+@group("Live device", sending=LiveOptions)
+@group("Device", device=DeviceOptions)
+@group(
+    "Output",
+    click.option("--all", "everything", is_flag=True, help=f"Show all differences, not only the first {SHOWN}."),
+    log_option,
+    json_option,
 )
-@click.option(
-    "--latency",
-    default="20ms/50%",
-    show_default=True,
-    metavar="AMOUNT",
-    help="What median and 90 % of the latencies may differ by, whichever of the two is more; `any`: not judged.",
-)
-@click.option(
-    "--least",
-    type=click.FloatRange(0, 100),
-    default=100.0,
-    show_default=True,
-    metavar="PERCENT",
-    help="Required share of equal exchanges.",
-)
-@click.option("--most", type=click.IntRange(1), default=None, help="With a live device: send only this many requests.")
-@click.option(
-    "--listen",
-    "listen_s",
-    type=Duration(),
-    default="0s",
-    help="With a live bus: listen for this time, and compare messages too.",
-)
-@click.option(
-    "--spacing", "spacing_s", type=Duration(), default="0s", help="With a live device: pause after every exchange."
-)
-@click.option(
-    "--writes", is_flag=True, help="With a live device: repeat the recorded writes as well, after a confirmation."
-)
-@click.option("--yes", is_flag=True, help="With --writes: do not ask for confirmation.")
-@click.option("--i-know", is_flag=True, help="With --writes: repeat broadcasts and restarts (FC08) as well.")
-@click.option("--dry-run", is_flag=True, help="With a live device: print the frames that would be sent; send nothing.")
-@click.option("--all", "everything", is_flag=True, help=f"Show all differences, not only the first {SHOWN}.")
-@device_options
-@json_option
-def command(recording: Path, other: str, as_json: bool, everything: bool, **options: Any) -> int:
+def command(
+    recording: Path,
+    other: str,
+    allowed: RuleOptions,
+    sending: LiveOptions,
+    device: DeviceOptions,
+    everything: bool,
+    log: Path | None,
+    as_json: bool,
+) -> int:
     """Compare OTHER, a device at an endpoint or another recording, with RECORDING: the same requests, and their answers.
 
     \b
@@ -94,19 +131,25 @@ def command(recording: Path, other: str, as_json: bool, everything: bool, **opti
     It prints the fidelity: the share of equal exchanges (values), and the agreement of the latencies (timing). Exit code 1 if
     the fidelity is too low, 4 if too much could not be compared. A device is only read, except with --writes.
     """
-    rules = Rules(*_tolerances(options["tolerances"]), _latency(options["latency"]), options["least"] / 100)
+    rules = allowed.rules
     live = other.partition(":")[0].lower() in SCHEMES and not Path(other).is_file()
-    if not live and (options["writes"] or options["dry_run"]):
+    if not live and (sending.writes or sending.dry_run):
         raise UsageError("--writes and --dry-run need a live device")
-    if options["dry_run"]:
-        return _dry(recording, other, options)
+    if sending.dry_run:
+        return _dry(recording, other, device, sending)
     if recording.suffix == ".log":
-        result = _live_can(recording, other, rules, options) if live else _logs(recording, Path(other), rules, options)
+        result = (
+            _live_can(recording, other, rules, device, sending, log)
+            if live
+            else _logs(recording, Path(other), rules, device)
+        )
+    elif live:
+        result = _live(recording, other, rules, device, sending, log)
     else:
-        result = _live(recording, other, rules, options) if live else _files(recording, Path(other), rules, options)
+        result = _files(recording, Path(other), rules, device)
     if as_json:
         json.dump(
-            _headed(recording, other, live, options)
+            _headed(recording, other, live, device)
             | asdict(result)
             | {
                 "values": result.values if result.compared else None,
@@ -121,31 +164,31 @@ def command(recording: Path, other: str, as_json: bool, everything: bool, **opti
     return 0 if result.met else INCONCLUSIVE if result.inconclusive else 1
 
 
-def _headed(recording: Path, other: str, live: bool, options: dict[str, Any]) -> dict[str, Any]:
+def _headed(recording: Path, other: str, live: bool, device: DeviceOptions) -> dict[str, Any]:
     """Add the header that names the device and the reference: `fieldtwin report` reads it."""
     can = recording.suffix == ".log"
-    address = options["node"] if can else options["unit"]
+    address = device.node if can else device.unit
     if address is None and not can:
         address = next((exchange.unit for exchange in exchanges_of(recording)), 0)
-    endpoint, device = (other, "") if live else ("", Path(other).name)
-    return headed("compare", "canopen" if can else "modbus", endpoint, address or 0, recording.name, device=device)
+    endpoint, name = (other, "") if live else ("", Path(other).name)
+    return headed("compare", "canopen" if can else "modbus", endpoint, address or 0, recording.name, device=name)
 
 
-def _dry(recording: Path, url: str, options: dict[str, Any]) -> int:
+def _dry(recording: Path, url: str, device: DeviceOptions, sending: LiveOptions) -> int:
     """Print the frames that would be sent, with their repetitions."""
-    target = target_from(url, options)
+    target = device.target(url)
     asked = 0
     if recording.suffix == ".log":
-        for exchange in uploads_of(_frames(recording), options["node"]):
-            if not options["most"] or asked < options["most"]:
+        for exchange in uploads_of(_frames(recording), device.node):
+            if not sending.most or asked < sending.most:
                 asked += 1
                 span = exchange.spans[0]
                 click.echo(str(SdoUpload(exchange.unit, span.address, span.subindex, 0).start(0)))
         return 0
     for e in exchanges_of(recording):
-        if (changes(e.request) and not options["writes"]) or (options["most"] and asked >= options["most"]):
+        if (changes(e.request) and not sending.writes) or (sending.most and asked >= sending.most):
             continue
-        frame = frame_for(target.url, e.unit if options["unit"] is None else options["unit"], e.request)
+        frame = frame_for(target.url, e.unit if device.unit is None else device.unit, e.request)
         if frame is not None:
             asked += 1
             click.echo(frame.hex(" "))
@@ -194,67 +237,70 @@ def _latency(text: str) -> Tolerance | None:
 # -- the four cases -----------------------------------------------------------------------------------------------------
 
 
-def _profile(options: dict[str, Any]) -> DeviceProfile | None:
-    name = options["profile_name"]
-    return load_profile(find("devices", name, extra=options["profiles"])) if name else None
+def _profile(device: DeviceOptions) -> DeviceProfile | None:
+    return load_profile(find("devices", device.profile_name, extra=device.profiles)) if device.profile_name else None
 
 
-def _files(recording: Path, other: Path, rules: Rules, options: dict[str, Any]) -> Comparison:
+def _files(recording: Path, other: Path, rules: Rules, device: DeviceOptions) -> Comparison:
     for path in (recording, other):
         _expect_exchanges(path)
-    comparer, unit = Comparer(rules, _profile(options)), options["unit"]
+    comparer, unit = Comparer(rules, _profile(device)), device.unit
     mine, theirs = ((e for e in exchanges_of(p) if unit in (None, e.unit)) for p in (recording, other))
     for one, two in pairs_of(mine, theirs, request_of):
         comparer.add(one, two)
     return comparer.result()
 
 
-def _live(recording: Path, url: str, rules: Rules, options: dict[str, Any]) -> Comparison:
+def _live(
+    recording: Path, url: str, rules: Rules, device: DeviceOptions, sending: LiveOptions, log: Path | None
+) -> Comparison:
     _expect_exchanges(recording)
-    target = target_from(url, options)
+    target = device.target(url)
     if target.protocol != "modbus":
         raise UsageError(f"{recording.name} is of a Modbus device", got=url)
-    if options["writes"]:
-        _allow_writes(recording, url, options)
+    if sending.writes:
+        _allow_writes(recording, url, sending)
     comparer = Comparer(rules, target.profile)
 
     async def work(stop: asyncio.Event, progress: Callable[[int], None]) -> None:
-        with logged(options["log"]) as taps:
+        with logged(log) as taps:
             async with asker_at(
                 target.url,
                 timeout_s=target.timeout_s,
-                spacing_s=options["spacing_s"],
+                spacing_s=sending.spacing_s,
                 echo=target.echo,
                 taps=tuple(taps),
             ) as asker:
                 await compare_device(
-                    exchanges_of(recording), asker, comparer, unit=options["unit"], writes=options["writes"],
+                    exchanges_of(recording), asker, comparer, unit=device.unit, writes=sending.writes,
                     wearing=_wearing(target.profile),
-                    most=options["most"] or 0, stop=stop, progress=progress,
+                    most=sending.most or 0, stop=stop, progress=progress,
                 )  # fmt: skip
 
     _run(work)
     return comparer.result()
 
 
-def _logs(recording: Path, other: Path, rules: Rules, options: dict[str, Any]) -> Comparison:
-    nodes = () if options["node"] is None else (options["node"],)
-    return compare_logs(_frames(recording), _frames(other), rules, profile=_profile(options), nodes=nodes)
+def _logs(recording: Path, other: Path, rules: Rules, device: DeviceOptions) -> Comparison:
+    nodes = () if device.node is None else (device.node,)
+    return compare_logs(_frames(recording), _frames(other), rules, profile=_profile(device), nodes=nodes)
 
 
-def _live_can(recording: Path, url: str, rules: Rules, options: dict[str, Any]) -> Comparison:
-    target = target_from(url, options)
+def _live_can(
+    recording: Path, url: str, rules: Rules, device: DeviceOptions, sending: LiveOptions, log: Path | None
+) -> Comparison:
+    target = device.target(url)
     if target.protocol != "canopen":
         raise UsageError(f"{recording.name} is of a CAN bus", got=url)
-    if options["writes"]:
+    if sending.writes:
         raise UsageError("--writes needs a Modbus device")
     found: list[Comparison] = []
 
     async def work(stop: asyncio.Event, progress: Callable[[int], None]) -> None:
-        with logged(options["log"]) as taps:
+        with logged(log) as taps:
             result = await compare_node(
-                lambda: _frames(recording), target, rules, node=options["node"], most=options["most"] or 0,
-                listen_s=options["listen_s"], taps=taps, stop=stop, progress=progress,
+                lambda: _frames(recording), target, rules, node=device.node, most=sending.most or 0,
+                listen_s=sending.listen_s, taps=taps, stop=stop, progress=progress,
             )  # fmt: skip
         found.append(result)
 
@@ -272,13 +318,13 @@ def _expect_exchanges(path: Path) -> None:
         raise FileInvalid("a recording of signals contains no requests", path=str(path), expected="one of exchanges")
 
 
-def _allow_writes(recording: Path, url: str, options: dict[str, Any]) -> None:
+def _allow_writes(recording: Path, url: str, sending: LiveOptions) -> None:
     """Ask once before writing to a plant, and show what would be written."""
     writes = [e for e in exchanges_of(recording) if changes(e.request)]
     dangerous = [e for e in writes if e.unit == 0 or e.request[0] == 8]
-    if dangerous and not options["i_know"]:
+    if dangerous and not sending.i_know:
         raise NotAllowed(f"{len(dangerous)} of the recorded writes are broadcasts or diagnostics", hint="--i-know")
-    if not writes or options["yes"]:
+    if not writes or sending.yes:
         return
     for exchange in writes[:SHOWN]:
         stderr.print(f"  unit {exchange.unit}: {exchange.request.hex(' ')}", soft_wrap=True, markup=False)

@@ -17,8 +17,10 @@ from rich.status import Status
 from fieldtwin.capture.recordings.importing import TextSummary, import_capture
 from fieldtwin.capture.recordings.rotating_file import MB, RotatingFile, exchanges_of, header_of
 from fieldtwin.capture.recordings.sinks import CanLogSink, ExchangeSink, LineSink
-from fieldtwin.cli.device.device_options import device_options, logged, target_from, words
-from fieldtwin.cli.options import Duration, json_option
+from fieldtwin.cli.device.device_options import DeviceOptions, log_option, logged, words
+from fieldtwin.cli.option_groups import GroupedCommand, group
+from fieldtwin.cli.options import json_option
+from fieldtwin.cli.recordings.record_options import FileOptions, PollOptions, SourceOptions
 from fieldtwin.commissioning.access.address import tags_of
 from fieldtwin.commissioning.access.reading import Target, dry_point
 from fieldtwin.commissioning.record.asking import frame_for
@@ -46,65 +48,21 @@ from fieldtwin.gateway.wallclock import run as run_precise
 REFRESH_S = 0.5
 
 
-@click.command("record")
+@click.command("record", cls=GroupedCommand)
 @click.argument("endpoint", required=False)
-@click.option(
-    "-o",
-    "--out",
-    type=click.Path(dir_okay=False, path_type=Path),
-    required=True,
-    help="The recording: NAME.jsonl, for a CAN bus NAME.log. An existing file is never changed.",
-)
-@click.option(
-    "--tap", "taps", nargs=2, metavar="A B", help="Connect a client (A) with its devices (B), and record all traffic."
-)
-@click.option(
-    "--sniff", metavar="PORT", help="Listen with one adapter to a serial line between other devices; nothing is sent."
-)
-@click.option(
-    "--like",
-    type=click.Path(exists=True, dir_okay=False, path_type=Path),
-    help="Repeat the reads of this recording, instead of reading the tags of a profile.",
-)
-@click.option("--group", "groups", multiple=True, help="With a Modbus profile: only this poll group.")
-@click.option(
-    "--every", "every_s", type=Duration(), default="1s", show_default=True, help="Period of the polling rounds."
-)
-@click.option("--rounds", type=click.IntRange(1), default=None, help="Stop after this number of rounds.")
-@click.option("--for", "for_s", type=Duration(), default=None, help="Stop after this time; default: at Ctrl-C.")
-@click.option("--spacing", "spacing_s", type=Duration(), default="0s", help="Pause after every exchange.")
-@click.option(
-    "--part-size",
-    "part_mb",
-    type=click.IntRange(1),
-    default=256,
-    show_default=True,
-    help="Maximum size of a part of the file, in MB.",
-)
-@click.option(
-    "--part-time", "part_s", type=Duration(), default=None, help="Begin a new part after this time, such as 1h."
-)
-@click.option("--keep", type=click.IntRange(1), default=None, help="Keep this number of parts; the oldest are removed.")
-@click.option(
-    "--as-scenario",
-    default="",
-    metavar="SYSTEM",
-    help="ENDPOINT is a run of SYSTEM (--trace, --capture): make a scenario of it, with tolerances.",
-)
-@click.option("--emulated", is_flag=True, help="Mark the recording as one of an emulator.")
-@click.option("--dry-run", is_flag=True, help="Print the frames that a round would send; send nothing.")
-@device_options
-@json_option
+@group("Source", source=SourceOptions)
+@group("Polling", polling=PollOptions)
+@group("Device", device=DeviceOptions)
+@group("Output", files=FileOptions)
+@group("Output", log_option, json_option)
 def command(
     endpoint: str | None,
-    out: Path,
-    taps: tuple[str, str] | None,
-    sniff: str | None,
-    like: Path | None,
-    for_s: float | None,
-    as_scenario: str,
+    source: SourceOptions,
+    polling: PollOptions,
+    device: DeviceOptions,
+    files: FileOptions,
+    log: Path | None,
     as_json: bool,
-    **options: Any,
 ) -> int:
     """Record a device at ENDPOINT by polling it (nothing is written), a line between two ports, or a CAN bus.
 
@@ -120,27 +78,27 @@ def command(
 
     Replay the recording with `fieldtwin emulate`, or compare a device with it: `fieldtwin compare`.
     """
-    if as_scenario:
-        return _scenario_of(endpoint, as_scenario, out, options["profiles"])
-    job = _Job(out, for_s, as_json, options)
-    if taps is not None:
-        if endpoint or like or options["profile_name"]:
+    like = source.like
+    if source.as_scenario:
+        return _scenario_of(endpoint, source.as_scenario, files.out, device.profiles)
+    job = _Job(files, polling, log, as_json)
+    if source.taps is not None:
+        if endpoint or like or device.profile_name:
             raise UsageError("--tap takes two endpoints and no device to poll")
-        return job.tap(*(_end(text) for text in taps))
-    if sniff is not None:
-        if endpoint or like or options["profile_name"]:
+        return job.tap(*(_end(text) for text in source.taps))
+    if source.sniff is not None:
+        if endpoint or like or device.profile_name:
             raise UsageError("--sniff takes one port and no device to poll")
-        return job.sniff(_end(sniff))
+        return job.sniff(_end(source.sniff))
     if endpoint is None:
         raise UsageError("the source of the recording is missing", expected="ENDPOINT, --tap A B, or --sniff PORT")
-    target = target_from(endpoint, options)
+    target = device.target(endpoint)
     if target.protocol == "canopen":
         if like is not None:
             raise UsageError("--like is for Modbus")
-        return job.bus(target)
+        return job.bus(target, device.node)
     if like is not None:
-        unit = options["unit"]
-        same = SameRequests(exchanges_of(like), unit)
+        same = SameRequests(exchanges_of(like), device.unit)
         if not same.requests:
             raise UsageError(f"{like.name} has no requests that may be repeated", hint="only reads may be repeated")
         if same.left_out:
@@ -159,7 +117,7 @@ def command(
             f"{target.profile.name} measures only on command, and no command is sent: nothing is written",
             soft_wrap=True,
         )
-    return job.polls(target, ProfileRound(target.profile, target.address, options["groups"]), target.profile.name)
+    return job.polls(target, ProfileRound(target.profile, target.address, polling.groups), target.profile.name)
 
 
 def _scenario_of(run: str | None, system: str, out: Path, profiles: tuple[Path, ...]) -> int:
@@ -182,31 +140,36 @@ def _end(text: str) -> Endpoint:
 class _Job:
     """One recording: its file, its end condition, and its output on the terminal."""
 
-    def __init__(self, out: Path, for_s: float | None, as_json: bool, options: dict[str, Any]) -> None:
-        self._out, self._for_s, self._json, self._options = out, for_s, as_json, options
+    def __init__(self, files: FileOptions, polling: PollOptions, log: Path | None, as_json: bool) -> None:
+        self._out, self._emulated, self._polling, self._log, self._json = (
+            files.out,
+            files.emulated,
+            polling,
+            log,
+            as_json,
+        )
         self._clock = WallClock()
         self._parts: dict[str, Any] = {
-            "max_bytes": options["part_mb"] * MB, "max_s": options["part_s"] or 0.0, "keep": options["keep"] or 0
+            "max_bytes": files.part_mb * MB, "max_s": files.part_s or 0.0, "keep": files.keep or 0
         }  # fmt: skip
 
     # -- kinds --------------------------------------------------------------------------------------------------------
 
     def polls(self, target: Target, one_round: Round, device: str) -> int:
-        if self._options["dry_run"]:
+        if self._polling.dry_run:
             return self._dry(frame_for(target.url, unit, pdu) for unit, pdu in one_round.asks)
         counters = PollCounters()
         header = RecordingHeader(
             version=1, device=device, kind="exchanges", source="measured", endpoint=target.url, made_by=words(),
             profile_hash=target.profile.hash if target.profile else "", start_utc=self._now(),
-            prototype=self._options["emulated"],
+            prototype=self._emulated,
         )  # fmt: skip
-        log: Path | None = self._options["log"]
-        with logged(log) as taps, RotatingFile(self._out, encode_header(header), **self._parts) as file:
+        with logged(self._log) as taps, RotatingFile(self._out, encode_header(header), **self._parts) as file:
 
             async def work(stop: asyncio.Event) -> None:
                 await record_polls(
-                    target, one_round, ExchangeSink(file), every_s=self._options["every_s"], counters=counters, stop=stop,
-                    rounds=self._options["rounds"] or 0, spacing_s=self._options["spacing_s"], taps=taps, clock=self._clock,
+                    target, one_round, ExchangeSink(file), every_s=self._polling.every_s, counters=counters, stop=stop,
+                    rounds=self._polling.rounds or 0, spacing_s=self._polling.spacing_s, taps=taps, clock=self._clock,
                 )  # fmt: skip
 
             self._run(work, lambda: f"{counters.rounds} rounds, {counters.exchanges} exchanges")
@@ -218,19 +181,19 @@ class _Job:
                 click.echo(frame if isinstance(frame, str) else frame.hex(" "))
         return 0
 
-    def bus(self, target: Target) -> int:
+    def bus(self, target: Target, node: int | None) -> int:
         polled = target.profile is not None or target.dictionary is not None
-        if not polled and self._options["node"] is not None:
+        if not polled and node is not None:
             raise UsageError(
                 "nothing to read from the node",
                 expected="--profile NAME or --eds FILE",
                 hint="without --node: only listen",
             )
-        if self._options["dry_run"]:
+        if self._polling.dry_run:
             tags = tags_of((), "canopen", None, target.profile, target.dictionary) if polled else []
             return self._dry(dry_point(target).read_frames(tags))
         counters, lost = PollCounters(), 0
-        if self._options["log"]:
+        if self._log:
             raise UsageError("--log: what is recorded of a bus is all of it already")
         with RotatingFile(self._out, **self._parts) as file:
             sink = CanLogSink(file, self._clock, Endpoint.parse(target.url).path.rpartition("/")[2].replace(":", "_"))
@@ -241,8 +204,8 @@ class _Job:
                     lost = await follow_bus(target, sink, stop=stop, clock=self._clock)
                     return
                 await record_node(
-                    target, sink, every_s=self._options["every_s"], counters=counters, stop=stop,
-                    rounds=self._options["rounds"] or 0, clock=self._clock,
+                    target, sink, every_s=self._polling.every_s, counters=counters, stop=stop,
+                    rounds=self._polling.rounds or 0, clock=self._clock,
                 )  # fmt: skip
 
             self._run(work, lambda: f"{file.lines} frames")
@@ -297,7 +260,7 @@ class _Job:
             return self._summary(file, None, said)
         header = RecordingHeader(
             version=1, device=f"{how}/{self._out.stem}", kind="exchanges", source="measured", endpoint=str(far),
-            made_by=words(), start_utc=started, prototype=self._options["emulated"],
+            made_by=words(), start_utc=started, prototype=self._emulated,
         )  # fmt: skip
         found: TextSummary = import_capture(raw, self._out, url=str(far), header=header)
         said |= {
@@ -314,9 +277,11 @@ class _Job:
     def _run(self, work: Callable[[asyncio.Event], Coroutine[Any, Any, None]], status: Callable[[], str]) -> None:
         """Run until the recording ends, a signal arrives, or --for has passed."""
 
+        for_s = self._polling.for_s
+
         async def main() -> None:
             stop = stop_signal()
-            timer = asyncio.get_running_loop().call_later(self._for_s, stop.set) if self._for_s is not None else None
+            timer = asyncio.get_running_loop().call_later(for_s, stop.set) if for_s is not None else None
             showing = asyncio.ensure_future(_shown(shown, status)) if shown is not None else None
             try:
                 await work(stop)

@@ -1,4 +1,4 @@
-"""Comparisons of two runs, as text and as JSON: `fieldtwin trace --against`, `fieldtwin run --compare`."""
+"""Comparisons of two runs, as text and as JSON: `fieldtwin trace --against`, `fieldtwin simulate --compare`."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import click
 from rich.markup import escape
 
 from fieldtwin.capture.decoding.trace_file import read_events
+from fieldtwin.cli.recordings.regression_options import ToleranceOptions
 from fieldtwin.console import stderr, stdout
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.scenarios.regression.as_scenario import Wanted, as_scenario
@@ -24,10 +25,10 @@ LENGTHS_S = 1.0
 SUFFIX = ".scenario.yaml"
 
 
-def allowed_of(tolerances: tuple[str, ...], window_s: float, ignored: tuple[str, ...]) -> Allowed:
+def allowed_of(options: ToleranceOptions) -> Allowed:
     """Parse ``2%`` for all fields or ``ctd.pressure=0.5`` for one. Raises `UsageError`."""
     share, amounts = Allowed().share, {}
-    for text in tolerances:
+    for text in options.tolerances:
         name, equals, amount = text.rpartition("=")
         try:
             number = float(amount.removesuffix("%"))
@@ -39,7 +40,7 @@ def allowed_of(tolerances: tuple[str, ...], window_s: float, ignored: tuple[str,
             amounts[name] = number
         else:
             share = number / 100
-    return Allowed(window_s, share, amounts, ignored=frozenset(ignored))
+    return Allowed(options.window_s, share, amounts, ignored=frozenset(options.ignored))
 
 
 def judged(system: System, old: Path, new: Path, allowed: Allowed) -> RunComparison:

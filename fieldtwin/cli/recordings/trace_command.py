@@ -13,7 +13,7 @@ from fieldtwin.capture.decoding.exchange import Decoded, DecodedExchange
 from fieldtwin.capture.decoding.trace_file import read_events
 from fieldtwin.cli.option_groups import GroupedCommand, group
 from fieldtwin.cli.options import Duration, json_option
-from fieldtwin.cli.recordings.regression_options import tolerance_options
+from fieldtwin.cli.recordings.regression_options import ToleranceOptions
 from fieldtwin.cli.template_question import SourceOptions
 from fieldtwin.console import stderr
 from fieldtwin.gateway.core.clock import NS_PER_S
@@ -24,28 +24,37 @@ from fieldtwin.results.trace import Event, Kind
 @click.command("trace", cls=GroupedCommand)
 @click.argument("file", type=click.Path(path_type=Path))
 @click.argument("system")
-@click.option(
-    "--only", multiple=True, help="Show only the events of this bus, device, tag, program or fault. Repeatable."
+@group(
+    "Selection",
+    click.option(
+        "--only", multiple=True, help="Show only the events of this bus, device, tag, program or fault. Repeatable."
+    ),
+    click.option("--from", "start_s", type=Duration(), default="0s", help="Start of the shown time."),
+    click.option("--to", "end_s", type=Duration(), help="End of the shown time."),
+    click.option("--problems", is_flag=True, help="Only requests without a good answer, and refused outputs."),
 )
-@click.option("--from", "start_s", type=Duration(), default="0s", help="Start of the shown time.")
-@click.option("--to", "end_s", type=Duration(), help="End of the shown time.")
-@click.option("--problems", is_flag=True, help="Only requests without a good answer, and refused outputs.")
-@click.option(
-    "--against",
-    type=click.Path(path_type=Path),
-    help="Compare with an older run. Exit code 1 if a value differs or an answer is slower.",
+@group(
+    "Comparison and scenario",
+    click.option(
+        "--against",
+        type=click.Path(path_type=Path),
+        help="Compare with an older run. Exit code 1 if a value differs or an answer is slower.",
+    ),
+    click.option("--as-scenario", type=click.Path(path_type=Path), help="Make a scenario of the run, with tolerances."),
+    click.option("--seed", type=int, help="With --as-scenario: the seed of the run."),
+    click.option(
+        "--set-values",
+        is_flag=True,
+        help="With --as-scenario: set the devices' values as well, for a different prototype from the run's.",
+    ),
+    tolerance=ToleranceOptions,
 )
-@click.option("--as-scenario", type=click.Path(path_type=Path), help="Make a scenario of the run, with tolerances.")
-@click.option("--seed", type=int, help="With --as-scenario: the seed of the run.")
-@click.option(
-    "--set-values",
-    is_flag=True,
-    help="With --as-scenario: set the devices' values as well, for a different prototype from the run's.",
-)
-@tolerance_options
-@click.option("--vcd", type=click.Path(path_type=Path), help="Write waveforms (IEEE 1364) for GTKWave instead.")
 @group("Profiles and templates", sources=SourceOptions)
-@json_option
+@group(
+    "Output",
+    click.option("--vcd", type=click.Path(path_type=Path), help="Write waveforms (IEEE 1364) for GTKWave instead."),
+    json_option,
+)
 def command(
     file: Path,
     system: str,
@@ -58,9 +67,7 @@ def command(
     as_scenario: Path | None,
     seed: int | None,
     set_values: bool,
-    tolerances: tuple[str, ...],
-    window_s: float,
-    ignored: tuple[str, ...],
+    tolerance: ToleranceOptions,
     sources: SourceOptions,
     as_json: bool,
 ) -> int:
@@ -85,7 +92,7 @@ def command(
 
         if vcd is not None or only or problems or (against is not None and as_scenario is not None):
             raise UsageError("--against and --as-scenario use the whole run, without other options")
-        allowed = regression_view.allowed_of(tolerances, window_s, ignored)
+        allowed = regression_view.allowed_of(tolerance)
         if against is not None:
             return regression_view.show(regression_view.judged(plant, against, file, allowed), against, as_json=as_json)
         assert as_scenario is not None

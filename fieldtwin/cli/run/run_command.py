@@ -126,7 +126,8 @@ class ThreadOptions:
 @click.command("run", cls=GroupedCommand)
 @click.argument("system")
 @group("Plant or prototype", place=PlaceOptions)
-@group("Simulated devices", commands_option, listen_option, replay=ReplayOptions, field=FieldOptions)
+@group("Simulated devices", replay=ReplayOptions)
+@group("Simulated devices", listen_option, commands_option, field=FieldOptions)
 @group("Digital thread", thread=ThreadOptions)
 @group("Profiles and templates", sources=SourceOptions)
 @group(

@@ -45,7 +45,8 @@ class ManyRuns(SeedOptions):
     click.option("--seed", type=int, default=None, help="Use this seed instead of the prototype file's."),
     runs=ManyRuns,
 )
-@group("Simulated devices", commands_option, replay=ReplayOptions)
+@group("Simulated devices", replay=ReplayOptions)
+@group("Simulated devices", commands_option)
 @group(
     "Faults",
     click.option(

@@ -49,74 +49,85 @@ class _WithCommand(GroupedCommand):
 
 @click.command("test", cls=_WithCommand)
 @click.argument("files", nargs=-1, type=click.Path(exists=True))
-@click.option(
-    "--target",
-    type=click.Choice(["virtual", "local", "compose", "real"]),
-    default="virtual",
-    show_default=True,
-    help="Where to run: virtual time, processes on this host, containers, a plant.",
+@group(
+    "Target",
+    click.option(
+        "--target",
+        type=click.Choice(["virtual", "local", "compose", "real"]),
+        default="virtual",
+        show_default=True,
+        help="Where to run: virtual time, processes on this host, containers, a plant.",
+    ),
+    click.option(
+        "--can",
+        default="",
+        metavar="INTERFACE/CHANNEL",
+        help="With local: emulate CAN buses on this interface, such as socketcan/vcan0.",
+    ),
+    click.option(
+        "--with",
+        "with_command",
+        is_flag=True,
+        help="With local: CMD after -- controls instead of our gateway and PLC, in the environment of `fieldtwin with`.",
+    ),
+    click.option("--instance", default="", help="With compose, real: name of the running instance on this host."),
+    click.option(
+        "--field", "field_host", default="", metavar="HOST[:PORT]", help="With compose: address of the field simulator."
+    ),
+    click.option(
+        "--token",
+        type=Secret(),
+        default="",
+        metavar="@FILE",
+        help="Token of that simulator's control channel; or FIELDTWIN_TEST_TOKEN.",
+    ),
+    click.option("--far", default="", metavar="ENDPOINT", help="With real: endpoint of the topside modem, for `send`."),
+    click.option(
+        "--capture",
+        type=click.Path(exists=True, dir_okay=False),
+        help="With --instance: the file with its captured traffic.",
+    ),
+    click.option(
+        "--allow",
+        type=click.Choice([danger.value for danger in Impact]),
+        default=Impact.READ.value,
+        show_default=True,
+        help="With --target real: highest impact level of steps.",
+    ),
 )
-@click.option(
-    "--allow",
-    type=click.Choice([danger.value for danger in Impact]),
-    default=Impact.READ.value,
-    show_default=True,
-    help="With --target real: highest impact level of steps.",
-)
-@click.option("--instance", default="", help="With compose, real: name of the running instance on this host.")
-@click.option(
-    "--field", "field_host", default="", metavar="HOST[:PORT]", help="With compose: address of the field simulator."
-)
-@click.option(
-    "--with",
-    "with_command",
-    is_flag=True,
-    help="With local: CMD after -- controls instead of our gateway and PLC, in the environment of `fieldtwin with`.",
-)
-@click.option(
-    "--token",
-    type=Secret(),
-    default="",
-    metavar="@FILE",
-    help="Token of that simulator's control channel; or FIELDTWIN_TEST_TOKEN.",
-)
-@click.option("--far", default="", metavar="ENDPOINT", help="With real: endpoint of the topside modem, for `send`.")
-@click.option(
-    "--capture",
-    type=click.Path(exists=True, dir_okay=False),
-    help="With --instance: the file with its captured traffic.",
-)
-@click.option(
-    "--can",
-    default="",
-    metavar="INTERFACE/CHANNEL",
-    help="With local: emulate CAN buses on this interface, such as socketcan/vcan0.",
-)
-@click.option(
-    "--waivers",
-    type=click.Path(exists=True, dir_okay=False),
-    help="YAML file of accepted failures: name, reason, expires.",
-)
-@click.option(
-    "--retry-inconclusive",
-    "retries",
-    type=click.IntRange(0, 100),
-    default=0,
-    metavar="N",
-    help="Not in virtual time: repeat an inconclusive scenario at most N times.",
-)
-@click.option("--seed", type=int, default=None, help="Use this seed instead of the scenario's.")
-@click.option("--junit", type=click.Path(dir_okay=False), help="Write JUnit XML to this file.")
-@junit_flavour_option
-@click.option(
-    "--html", type=click.Path(dir_okay=False), help="Write an HTML page with verdicts and diagrams to this file."
-)
-@click.option(
-    "--trace", type=click.Path(dir_okay=False), help="Write every event of a single scenario to this file (JSON lines)."
+@group(
+    "Runs",
+    click.option("--seed", type=int, default=None, help="Use this seed instead of the scenario's."),
+    click.option(
+        "--retry-inconclusive",
+        "retries",
+        type=click.IntRange(0, 100),
+        default=0,
+        metavar="N",
+        help="Not in virtual time: repeat an inconclusive scenario at most N times.",
+    ),
+    click.option(
+        "--waivers",
+        type=click.Path(exists=True, dir_okay=False),
+        help="YAML file of accepted failures: name, reason, expires.",
+    ),
 )
 @group("Campaign of seeds, in virtual time", campaign=CampaignOptions)
 @group("Profiles and templates", sources=SourceOptions)
-@json_option
+@group(
+    "Output",
+    click.option("--junit", type=click.Path(dir_okay=False), help="Write JUnit XML to this file."),
+    junit_flavour_option,
+    click.option(
+        "--html", type=click.Path(dir_okay=False), help="Write an HTML page with verdicts and diagrams to this file."
+    ),
+    click.option(
+        "--trace",
+        type=click.Path(dir_okay=False),
+        help="Write every event of a single scenario to this file (JSON lines).",
+    ),
+    json_option,
+)
 def command(
     files: tuple[str, ...],
     target: str,

@@ -33,53 +33,73 @@ from fieldtwin.twin.site.system import System, load_system
 
 @click.command("twin", cls=GroupedCommand)
 @click.argument("system")
-@click.option(
-    "--from", "place", required=True, metavar="URL", help="Address of the plant's thread, as for `fieldtwin shadow`."
+@group(
+    "Plant and knowledge",
+    click.option(
+        "--from",
+        "place",
+        required=True,
+        metavar="URL",
+        help="Address of the plant's thread, as for `fieldtwin shadow`.",
+    ),
+    click.option(
+        "--store", default="", metavar="FILE|URL", help="Store of the knowledge; default: in the run directory."
+    ),
+    click.option(
+        "--for",
+        "duration_s",
+        type=Duration(),
+        default=0.0,
+        help="Stop after a time such as 20s; default: run until Ctrl-C.",
+    ),
+    click.option("--instance", default="", help="Name of the run directory; default: the system's name and -twin."),
 )
-@click.option("--plan", "planner", default="", metavar="FILE", help='Rules (YAML), or "python: module:Class".')
-@click.option("--command", "periods", multiple=True, type=int, metavar="SECONDS", help="A period to plan at the start.")
-@click.option(
-    "--what-if",
-    "horizon_s",
-    type=Duration(),
-    default=0.0,
-    metavar="TIME",
-    help="Simulate each command for this time, such as 30min, before it is sent.",
+@group(
+    "Commands",
+    click.option("--plan", "planner", default="", metavar="FILE", help='Rules (YAML), or "python: module:Class".'),
+    click.option(
+        "--command", "periods", multiple=True, type=int, metavar="SECONDS", help="A period to plan at the start."
+    ),
 )
-@click.option(
-    "--require", multiple=True, metavar="EXPRESSION", help="With --what-if: an expression that must always hold."
+@group(
+    "Simulation before a command",
+    click.option(
+        "--what-if",
+        "horizon_s",
+        type=Duration(),
+        default=0.0,
+        metavar="TIME",
+        help="Simulate each command for this time, such as 30min, before it is sent.",
+    ),
+    click.option(
+        "--require", multiple=True, metavar="EXPRESSION", help="With --what-if: an expression that must always hold."
+    ),
+    click.option(
+        "--finally",
+        "finally_",
+        multiple=True,
+        metavar="EXPRESSION",
+        help="With --what-if: an expression that must hold at the end.",
+    ),
+    click.option(
+        "--what-if-timeout",
+        "timeout_s",
+        type=Duration(),
+        default="60s",
+        show_default=True,
+        help="Time for the simulation; without a result the command is refused.",
+    ),
+    click.option(
+        "--prototype-file",
+        type=click.Path(exists=True, dir_okay=False, path_type=Path),
+        help="Prototype file of the simulation; default: next to the system file.",
+    ),
 )
-@click.option(
-    "--finally",
-    "finally_",
-    multiple=True,
-    metavar="EXPRESSION",
-    help="With --what-if: an expression that must hold at the end.",
-)
-@click.option(
-    "--what-if-timeout",
-    "timeout_s",
-    type=Duration(),
-    default="60s",
-    show_default=True,
-    help="Time for the simulation; without a result the command is refused.",
-)
-@click.option(
-    "--prototype-file",
-    type=click.Path(exists=True, dir_okay=False, path_type=Path),
-    help="Prototype file of the simulation; default: next to the system file.",
-)
-@click.option("--store", default="", metavar="FILE|URL", help="Store of the knowledge; default: in the run directory.")
-@click.option(
-    "--for",
-    "duration_s",
-    type=Duration(),
-    default=0.0,
-    help="Stop after a time such as 20s; default: run until Ctrl-C.",
-)
-@click.option("--instance", default="", help="Name of the run directory; default: the system's name and -twin.")
 @group("Profiles and templates", sources=SourceOptions)
-@json_option
+@group(
+    "Output",
+    json_option,
+)
 def command(
     system: str,
     place: str,

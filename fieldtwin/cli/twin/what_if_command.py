@@ -23,39 +23,51 @@ from fieldtwin.run.what_if.state import KnownState
 
 @click.command("what-if", cls=GroupedCommand)
 @click.argument("system", required=False)
-@click.option(
-    "--from", "source", default="", help="The present state: a state file, a knowledge store, or instance:NAME."
+@group(
+    "Present state",
+    click.option(
+        "--from", "source", default="", help="The present state: a state file, a knowledge store, or instance:NAME."
+    ),
+    click.option("--origin", default="", help="Origin of the knowledge, if the store has several."),
+    click.option("--save-state", type=click.Path(path_type=Path), help="Write the present state to a file, and exit."),
 )
-@click.option("--origin", default="", help="Origin of the knowledge, if the store has several.")
-@click.option(
-    "--command",
-    "commands",
-    multiple=True,
-    help="A period that the topside controller commands: PERIOD_S or PERIOD_S@TIME.",
+@group(
+    "Plans",
+    click.option(
+        "--command",
+        "commands",
+        multiple=True,
+        help="A period that the topside controller commands: PERIOD_S or PERIOD_S@TIME.",
+    ),
+    click.option("--faults", "fault_file", type=click.Path(path_type=Path), help="Fault file, as for `run --faults`."),
+    click.option("--plans", "plan_file", type=click.Path(path_type=Path), help="A file with several plans."),
+    click.option("--require", multiple=True, help="An expression that must always hold."),
+    click.option("--finally", "finally_", multiple=True, help="An expression that must hold at the end."),
 )
-@click.option("--faults", "fault_file", type=click.Path(path_type=Path), help="Fault file, as for `run --faults`.")
-@click.option("--require", multiple=True, help="An expression that must always hold.")
-@click.option("--finally", "finally_", multiple=True, help="An expression that must hold at the end.")
-@click.option("--plans", "plan_file", type=click.Path(path_type=Path), help="A file with several plans.")
-@click.option(
-    "--horizon", "horizon_s", type=Duration(), default="1h", show_default=True, help="Length of the simulated time."
+@group(
+    "Simulation",
+    click.option(
+        "--horizon", "horizon_s", type=Duration(), default="1h", show_default=True, help="Length of the simulated time."
+    ),
+    click.option(
+        "--settle",
+        "settle_s",
+        type=Duration(),
+        default="5s",
+        show_default=True,
+        help="Time from which on the requirements are checked.",
+    ),
+    click.option("--jobs", type=click.IntRange(1, 64), default=2, show_default=True, help="Number of processes."),
+    click.option("--seed", type=int, help="Seed; default: the prototype file's."),
+    click.option(
+        "--prototype-file", type=click.Path(path_type=Path), help="Prototype file; default: next to the system file."
+    ),
 )
-@click.option(
-    "--settle",
-    "settle_s",
-    type=Duration(),
-    default="5s",
-    show_default=True,
-    help="Time from which on the requirements are checked.",
-)
-@click.option("--jobs", type=click.IntRange(1, 64), default=2, show_default=True, help="Number of processes.")
-@click.option("--seed", type=int, help="Seed; default: the prototype file's.")
-@click.option(
-    "--prototype-file", type=click.Path(path_type=Path), help="Prototype file; default: next to the system file."
-)
-@click.option("--save-state", type=click.Path(path_type=Path), help="Write the present state to a file, and exit.")
 @group("Profiles and templates", sources=SourceOptions)
-@json_option
+@group(
+    "Output",
+    json_option,
+)
 def command(
     system: str | None,
     source: str,

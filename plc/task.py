@@ -24,7 +24,7 @@ from typing import Any, Protocol
 
 from fieldtwin.gateway.core.clock import NS_PER_MS, Clock
 from fieldtwin.gateway.core.errors import Bug, CheckFailed, FieldtwinError
-from fieldtwin.plc.histogram import Histogram
+from fieldtwin.gateway.core.histogram import Histogram
 from fieldtwin.plc.program import InputTripped, ProgramStuck, ScanStuck
 
 

@@ -15,8 +15,7 @@ from hypothesis import strategies as st
 from fieldtwin.commissioning.access.reading import Target
 from fieldtwin.commissioning.dump.coverage import NOT_ASKED, READABLE, REFUSED
 from fieldtwin.commissioning.dump.dump import Job
-from fieldtwin.commissioning.dump.file import load_dump
-from fieldtwin.commissioning.dump.latency import Histogram
+from fieldtwin.commissioning.dump.file import LATENCY_LIMITS_NS, describe_latency, load_dump
 from fieldtwin.commissioning.dump.objects import ListedObjects
 from fieldtwin.commissioning.dump.session import dump, estimate, frames, log_path, object_ranges, register_spans
 from fieldtwin.commissioning.dump.sweep import Refused, Silent, Sweep, Taken
@@ -25,6 +24,7 @@ from fieldtwin.emulators.canopen.node import CanopenNode, NodeContext
 from fieldtwin.emulators.modbus.bank import Span
 from fieldtwin.gateway.core.errors import FileInvalid, Unreachable, UsageError
 from fieldtwin.gateway.core.files.profile import RegisterRange, load_profile
+from fieldtwin.gateway.core.histogram import Histogram
 from fieldtwin.gateway.protocols.canopen.dictionary import parse_dictionary
 
 ROOT = Path(__file__).parents[2]
@@ -300,11 +300,15 @@ def test_a_damaged_dump_is_invalid_or_a_dump(tmp_path_factory: pytest.TempPathFa
 
 
 @given(st.lists(st.integers(0, 10**9), min_size=1, max_size=40))
-def test_percentiles_are_bounds_of_the_observed_values(us: list[int]) -> None:
-    histogram = Histogram()
+def test_response_times_in_the_file_are_in_microseconds_and_complete(us: list[int]) -> None:
+    times = Histogram(LATENCY_LIMITS_NS)
     for value in us:
-        histogram.add(value)
-    half = histogram.percentile_us(0.5)
-    assert sum(value <= half for value in us) >= len(us) / 2
-    assert half <= max(us)
-    assert sum(n for _, n in histogram.describe()["buckets"]) == len(us)  # type: ignore[union-attr,misc,attr-defined]
+        times.record(value * 1000)
+    line = describe_latency(times)
+    assert sum(value <= line["p50_us"] for value in us) >= len(us) / 2
+    assert line["p50_us"] <= line["p95_us"] <= line["most_us"] == max(us)
+    assert (line["count"], line["least_us"]) == (len(us), min(us))
+    assert sum(n for _, n in line["buckets"]) == len(us)
+    assert [limit for limit, _ in line["buckets"]] == sorted(
+        {next((b // 1000 for b in LATENCY_LIMITS_NS if v * 1000 <= b), None) for v in us}, key=lambda b: b or 10**9
+    )

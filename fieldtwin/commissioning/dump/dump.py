@@ -17,23 +17,25 @@ from fieldtwin.commissioning.access.reading import Target
 from fieldtwin.commissioning.dump.asking import PROBES, Asker, AskResult
 from fieldtwin.commissioning.dump.beyond import beyond_silence, other_lengths
 from fieldtwin.commissioning.dump.file import (
+    LATENCY_LIMITS_NS,
     TABLES,
     VERSION,
     Dump,
     DumpWriter,
     Pass,
+    describe_latency,
     key_of,
     map_line,
     outcome_of,
     take_read,
 )
-from fieldtwin.commissioning.dump.latency import Histogram
 from fieldtwin.commissioning.dump.objects import EVERYTHING, ListedObjects, ObjectKey, ObjectSweep, of_dictionary
 from fieldtwin.commissioning.dump.profile import ProfileSweep, dumped_tags
 from fieldtwin.commissioning.dump.sweep import Invalid, Outcome, Refused, Silent, Sweep, TableMap, Taken
-from fieldtwin.gateway.core.clock import NS_PER_S, Clock
+from fieldtwin.gateway.core.clock import NS_PER_S, NS_PER_US, Clock
 from fieldtwin.gateway.core.errors import FileInvalid, Unreachable
 from fieldtwin.gateway.core.files.profile import RegisterRange, gap_text
+from fieldtwin.gateway.core.histogram import Histogram
 from fieldtwin.results.subject import who
 
 DEFAULT_BUDGET_S = 600.0
@@ -167,7 +169,7 @@ class Dumper:
             self._map(sweep)
         for number in range(1, self._job.passes):
             await self._again(number, sweeps)
-        self._writer.write({"latency": {name: h.describe() for name, h in sorted(result.latency.items())}})
+        self._writer.write({"latency": {name: describe_latency(h) for name, h in sorted(result.latency.items())}})
         self._writer.write({"ended": _iso(self._clock.utc_ns()), "requests": result.requests})
         return result
 
@@ -271,7 +273,7 @@ class Dumper:
         self.result.answered += "silent" not in line and "invalid" not in line
         if "hex" in line:  # a refusal costs a device less
             name = f"{function:02X}" if function else "SDO"
-            self.result.latency.setdefault(name, Histogram()).add(int(line["us"]))
+            self.result.latency.setdefault(name, Histogram(LATENCY_LIMITS_NS)).record(int(line["us"]) * NS_PER_US)
 
     # -- the file -------------------------------------------------------------------------------------------------
 

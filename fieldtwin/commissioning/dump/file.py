@@ -43,9 +43,10 @@ from fieldtwin.commissioning.dump.coverage import (
 )
 from fieldtwin.commissioning.dump.objects import ObjectKey
 from fieldtwin.commissioning.dump.sweep import Invalid, Outcome, Refused, Silent, Taken
-from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.clock import NS_PER_S, NS_PER_US
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.core.files.profile import RegisterRange, Table, gap_text, resolve_gap
+from fieldtwin.gateway.core.histogram import Histogram
 
 VERSION = 2
 READABLE_VERSIONS = (1, 2)
@@ -53,6 +54,9 @@ TABLES: tuple[Table, ...] = ("holding", "input", "coil", "discrete")
 MOST_LINE_BYTES = 1 << 20
 MOST_CELLS = 50_000_000
 """Maximum number of cells in all passes together, limited by memory. A larger file is refused."""
+
+LATENCY_LIMITS_NS = tuple(round(10 * 10 ** (step / 10)) * NS_PER_US for step in range(71))
+"""The limits of a dump's histograms of response times: ten per decade, from 10 us to 100 s."""
 
 Cell = tuple[str, int] | tuple[int, int]
 """A register (table, address) or an object (index, subindex)."""
@@ -191,6 +195,21 @@ def map_line(dump: Dump, table: Table, found: dict[str, Any]) -> dict[str, Any]:
     defaults = {"borders": [], "max_read": 0, "limit_proved": False, "pairs": False, "codes": {}, "lengths": []}
     kept = {key: value for key, value in found.items() if key not in ("holes", "voids", "given_up")}
     return defaults | {"stopped": found.get("given_up", "")} | kept | states
+
+
+def describe_latency(times: Histogram) -> dict[str, Any]:
+    """Return the response times of one function; `buckets` are pairs of upper limit in us (None: longer) and count, without
+    empty ones.
+    """
+    limits_us = [*(ns // NS_PER_US for ns in times.limits_ns), None]
+    return {
+        "count": times.count,
+        "least_us": times.min_ns // NS_PER_US,
+        "p50_us": times.percentile_ns(50) // NS_PER_US,
+        "p95_us": times.percentile_ns(95) // NS_PER_US,
+        "most_us": times.max_ns // NS_PER_US,
+        "buckets": [(limit, count) for limit, count in zip(limits_us, times.counts, strict=True) if count],
+    }
 
 
 def _lines(path: Path) -> Iterator[tuple[int, int, dict[str, Any]]]:

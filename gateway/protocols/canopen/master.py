@@ -21,7 +21,7 @@ from fieldtwin.gateway.core.errors import (
     SdoAborted,
     UsageError,
 )
-from fieldtwin.gateway.core.latency import Latencies
+from fieldtwin.gateway.core.histogram import response_times
 from fieldtwin.gateway.protocols.canopen import abort_codes, cob_id, nmt
 from fieldtwin.gateway.protocols.canopen.heartbeat import HeartbeatConsumer
 from fieldtwin.gateway.protocols.canopen.nmt import NmtCommand, NmtState, NodeEvent, conflict_text
@@ -68,7 +68,7 @@ class CanopenMaster:
         on_event: EventCallback | None = None,
     ) -> None:
         self.counters = Counters()
-        self.latency = Latencies()  # of completed SDO transfers
+        self.latency = response_times()  # of completed SDO transfers
         self.on_event: EventCallback = on_event or _nobody
         self.on_sync: PdoCallback = _no_one
         """Called with each SYNC that this master did not send. Like `on_event`, it may be set at any time."""

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.clock import NS_PER_S, Clock
 from fieldtwin.gateway.core.errors import ConnectionLost, ReplyTimeout, SdoAborted
-from fieldtwin.gateway.core.latency import Latencies
+from fieldtwin.gateway.core.histogram import Histogram, response_times
 from fieldtwin.gateway.protocols.canopen import abort_codes
 from fieldtwin.gateway.protocols.canopen.late_replies import LateReplies, Multiplexor
 from fieldtwin.gateway.protocols.canopen.sdo import ABORT, Done, Failed, SdoTransfer, SdoUpload, Send, Step, Stray, Wait
@@ -86,13 +86,13 @@ class SdoChannel:
         send: Callable[[CanFrame], Awaitable[None]],
         clock: Clock,
         counters: Counters,
-        latency: Latencies | None = None,
+        latency: Histogram | None = None,
     ) -> None:
         self._node = node
         self._send = send
         self._clock = clock
         self._counters = counters
-        self._latency = latency if latency is not None else Latencies()
+        self._latency = latency if latency is not None else response_times()
         self._turn = asyncio.Lock()
         self._late = LateReplies()
         self._active: SdoTransfer | None = None
@@ -190,7 +190,7 @@ class SdoChannel:
             await self._tell_owed(transfer)
             began_ns = self._clock.monotonic_ns()
             data = await self._drive(transfer)
-            self._latency.note(self._clock.monotonic_ns() - began_ns)
+            self._latency.record(self._clock.monotonic_ns() - began_ns)
             complete = True
             self._answered(request)
             return data

@@ -25,7 +25,7 @@ from fieldtwin.gateway.core.errors import (
     UsageError,
     VerifyFailed,
 )
-from fieldtwin.gateway.core.latency import Latencies
+from fieldtwin.gateway.core.histogram import response_times
 from fieldtwin.gateway.protocols.modbus.framings import Framing, framing_of, make_framer
 from fieldtwin.gateway.protocols.modbus.identity import ReadDeviceIdentification
 from fieldtwin.gateway.protocols.modbus.line import TURNAROUND_S, LineSilence
@@ -167,7 +167,9 @@ class ModbusClient:
         self._turn = FairLock()
         self._closed = False
         self.counters = ClientCounters()
-        self.latency = Latencies()  # of replies and exceptions; a caller that keeps it across connections sets its own
+        self.latency = (
+            response_times()
+        )  # of replies and exceptions; a caller that keeps it across connections sets its own
 
     @classmethod
     def at(
@@ -379,7 +381,7 @@ class ModbusClient:
             counters.replies += 1
             settled = True
             line.answered(reply.t_ns, transaction.sent_ns)
-            self.latency.note(reply.t_ns - transaction.sent_ns)
+            self.latency.record(reply.t_ns - transaction.sent_ns)
             if self._hurried_ns:
                 self.relax(unit)
             return reply
@@ -388,7 +390,7 @@ class ModbusClient:
             settled = True
             now_ns = self._clock.monotonic_ns()
             line.answered(now_ns, transaction.sent_ns)
-            self.latency.note(now_ns - transaction.sent_ns)
+            self.latency.record(now_ns - transaction.sent_ns)
             if not isinstance(e, GatewayRefusal):
                 self.relax(unit)
             self._place(e)

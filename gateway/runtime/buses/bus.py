@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from fieldtwin.gateway.core.errors import FieldtwinError, NotAllowed
-from fieldtwin.gateway.core.latency import Latencies
+from fieldtwin.gateway.core.histogram import Histogram
 from fieldtwin.gateway.core.values import COMMAND
 from fieldtwin.gateway.devices.config import BusConfig
 from fieldtwin.gateway.runtime.buses.pending_config import PendingConfig
@@ -40,7 +40,7 @@ class Bus(Protocol):
     """The local addresses of the connections so far, latest last; an empty text for a medium without addresses."""
     error: str
     """Why the bus is not connected; empty while it is."""
-    latency: Latencies
+    latency: Histogram
 
     def takes(self, device: str, tag: str) -> bool:
         """Return whether a write of this tag can be sent now: the device answers and is the expected one."""

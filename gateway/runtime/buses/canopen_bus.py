@@ -26,7 +26,7 @@ from fieldtwin.gateway.core.errors import (
     Unreachable,
     UsageError,
 )
-from fieldtwin.gateway.core.latency import Latencies
+from fieldtwin.gateway.core.histogram import response_times
 from fieldtwin.gateway.core.values import COMMAND, Reason
 from fieldtwin.gateway.devices.canopen_config import cycle_period_ns
 from fieldtwin.gateway.devices.canopen_device import CanopenDriver
@@ -139,7 +139,7 @@ class CanopenBus:
         self._on_offline = on_offline
         self._master: CanopenMaster | None = None
         self._lss: LssMaster | None = None
-        self.latency = Latencies()
+        self.latency = response_times()
         self._past: Counter[str] = Counter()
 
     def _status(self, driver: CanopenDriver, drivers: list[CanopenDriver], clock: Clock) -> NodeStatus:

@@ -31,7 +31,7 @@ from fieldtwin.gateway.core.errors import (
     WireError,
     WrongDevice,
 )
-from fieldtwin.gateway.core.latency import Latencies
+from fieldtwin.gateway.core.histogram import response_times
 from fieldtwin.gateway.core.values import COMMAND, Reason
 from fieldtwin.gateway.devices.config import BusConfig
 from fieldtwin.gateway.devices.register_device import Progress, RegisterDriver
@@ -132,7 +132,7 @@ class ModbusBus:
         self._alarm_until_ns = 0
         """Until this time, devices that answer are polled with shortened timeouts, because one of them stopped
         answering."""
-        self.latency = Latencies()
+        self.latency = response_times()
         self._past: Counter[str] = Counter()
         self._client: ModbusClient | None = None
 

@@ -1,0 +1,96 @@
+"""A histogram of durations, whose memory does not grow with their number. This module does not know what is measured."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections import deque
+from collections.abc import Sequence
+from typing import Any
+
+from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
+
+RESPONSE_MS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
+"""The limits of `response_times` in ms: from TCP on a switch to a slow serial line with a slow device."""
+
+_PER_DOUBLING = 32
+_FINE_NS = (
+    *range(2 * _PER_DOUBLING),
+    *(
+        ((_PER_DOUBLING + part + 1) << shift) - 1
+        for shift in range(1, 37)  # to 2**42 ns, 4,398 s
+        for part in range(_PER_DOUBLING)
+    ),
+)
+"""32 buckets per power of two: a percentile is at most 1/32 above the true value."""
+
+
+class Histogram:
+    """Counts durations in nanoseconds, each in the first bucket whose upper limit it does not exceed.
+
+    `limits_ns` are the upper limits of the buckets, ascending and inclusive; one further bucket counts longer
+    durations. `counts` has the counts of the buckets, each for its bucket alone, and `count` is their sum. `min_ns`,
+    `max_ns` and `total_ns` are exact, and 0 before the first duration. A negative duration counts as 0.
+    """
+
+    def __init__(self, limits_ns: Sequence[int] = _FINE_NS, recent: int = 0) -> None:
+        """`recent` is the number of latest durations that `recent_longest_ns` covers."""
+        self.limits_ns = limits_ns
+        self.counts = [0] * (len(limits_ns) + 1)
+        self.count = self.min_ns = self.max_ns = self.total_ns = 0
+        self._recent: deque[int] = deque(maxlen=recent)
+
+    def record(self, duration_ns: int) -> None:
+        """Count one duration."""
+        ns = duration_ns if duration_ns > 0 else 0
+        if not self.count or ns < self.min_ns:
+            self.min_ns = ns
+        if ns > self.max_ns:
+            self.max_ns = ns
+        self.count += 1
+        self.total_ns += ns
+        self.counts[bisect_left(self.limits_ns, ns)] += 1
+        self._recent.append(ns)
+
+    @property
+    def recent_longest_ns(self) -> int:
+        """Return the longest of the latest durations, or 0 before the first."""
+        return max(self._recent, default=0)
+
+    def percentile_ns(self, percent: float) -> int:
+        """Return a percentile: the smallest limit with at least `percent` (0 to 100) of the durations at or below it.
+
+        The result is at most the longest duration. Without durations it is 0.
+        """
+        need = self.count * percent / 100
+        seen = 0
+        for limit_ns, count in zip(self.limits_ns, self.counts, strict=False):
+            seen += count
+            if count and seen >= need:
+                return min(limit_ns, self.max_ns)
+        return self.max_ns
+
+    def share_above(self, ns: int) -> float:
+        """Return the share of all durations, 0 to 1, that are longer than the limit of the bucket of `ns`."""
+        return sum(self.counts[bisect_left(self.limits_ns, ns) + 1 :]) / self.count if self.count else 0.0
+
+    def summary_us(self) -> dict[str, Any]:
+        """Return count, and min, p50, p99, p99.9, max in microseconds, and the share above 1 ms, as data for JSON."""
+        return {
+            "count": self.count,
+            "min": self.min_ns / 1e3,
+            "p50": self.percentile_ns(50) / 1e3,
+            "p99": self.percentile_ns(99) / 1e3,
+            "p999": self.percentile_ns(99.9) / 1e3,
+            "above_1ms": self.share_above(NS_PER_MS),
+            "max": self.max_ns / 1e3,
+        }
+
+    def describe(self) -> dict[str, Any]:
+        """Return data for JSON: `bounds_ms` (the limits), `counts` (one more than limits) and `total_s`."""
+        bounds_ms = [ns // NS_PER_MS for ns in self.limits_ns]
+        return {"bounds_ms": bounds_ms, "counts": list(self.counts), "total_s": self.total_ns / NS_PER_S}
+
+
+def response_times() -> Histogram:
+    """Return an empty histogram for the response times on a bus: few buckets, and the longest of the last 64 durations."""
+    return Histogram([ms * NS_PER_MS for ms in RESPONSE_MS], recent=64)

@@ -39,6 +39,7 @@ from fieldtwin.twin.plant.physical import EmbeddedControlSystem, attached, gatew
 from fieldtwin.twin.plant.refusal_places import RefusalPlaces
 from fieldtwin.twin.plant.reloading import compare, limits_changed
 from fieldtwin.twin.plant.watching import TagWatch
+from fieldtwin.twin.site.resolved import read_resolved
 from fieldtwin.twin.site.system import System, load_system
 
 FLUSH_EVERY_NS = NS_PER_S // 2
@@ -67,6 +68,8 @@ class ControllerConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     capture: str = ""
     delegated: tuple[str, ...] = ()
     """Transmitters whose mailboxes are used by the digital thread."""
+    resolved: str = ""
+    """The system as the run has read it (`fieldtwin.twin.site.resolved`); empty: this process reads `system` itself."""
 
 
 class GatewayProcess:
@@ -84,9 +87,14 @@ class GatewayProcess:
     def _load(self) -> System:
         return load_system(self._config.system, [Path(p) for p in self._config.profiles])
 
+    def _handed_over(self) -> System:
+        [system] = read_resolved(self._config.resolved)
+        assert isinstance(system, System)
+        return system
+
     async def run(self) -> int:
         run_dir = Path(self._config.run_dir)
-        system = self._system = self._load()
+        system = self._system = self._handed_over() if self._config.resolved else self._load()
         connector: Connector = OsConnector()
         if self._config.mapping is not None:
             connector = MappedConnector(connector, mapping_from_json(self._config.mapping))

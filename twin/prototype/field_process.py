@@ -40,6 +40,7 @@ from fieldtwin.twin.prototype.field_leases import LEASE_S, FieldLeases
 from fieldtwin.twin.prototype.field_status import FieldStatus
 from fieldtwin.twin.prototype.file import Prototype, load_prototype
 from fieldtwin.twin.prototype.prototype import DigitalTwinPrototype
+from fieldtwin.twin.site.resolved import read_resolved
 from fieldtwin.twin.site.system import System, load_system
 
 HELD_AT_ONCE = 5_000
@@ -63,20 +64,33 @@ class FieldConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     control: str = ""
     token: str = ""
     seed: int | None = None
+    resolved: str = ""
+    """System and prototype as the run has read them (`fieldtwin.twin.site.resolved`); empty: they are read from the files
+    above.
+    """
     water: dict[str, tuple[str, str]] = {}
     """Transmitters that are in a network's acoustic channel: the Unix socket that serves the channel, and their names
     there.
     """
 
 
-def resolve(config: FieldConfig) -> DigitalTwinPrototype:
-    """Read system and prototype file, apply the command line's options, and return the checked prototype of both sides."""
-    return DigitalTwinPrototype(*resolve_files(config), WallClock())
+def resolve(config: FieldConfig, system: System | None = None) -> DigitalTwinPrototype:
+    """Read system and prototype file, apply the command line's options, and return the checked prototype of both sides.
+
+    With `system` its file is not read again.
+    """
+    return DigitalTwinPrototype(*resolve_files(config, system), WallClock())
 
 
-def resolve_files(config: FieldConfig) -> tuple[System, Prototype]:
-    """Read system and prototype file for the field devices only, without gateway, PLC and programs."""
-    system = load_system(config.system, [Path(p) for p in config.profiles])
+def resolve_files(config: FieldConfig, system: System | None = None) -> tuple[System, Prototype]:
+    """Return system and prototype for the field devices only, without gateway, PLC and programs, as `config` says."""
+    if config.resolved:
+        handed_over, prototype = read_resolved(config.resolved)
+        assert isinstance(handed_over, System)
+        assert isinstance(prototype, Prototype)
+        return handed_over, prototype
+    if system is None:
+        system = load_system(config.system, [Path(p) for p in config.profiles])
     prototype = load_prototype(system, Path(config.prototype) if config.prototype else None)
     for device, path in config.recordings.items():
         if device not in prototype.devices:
@@ -96,8 +110,10 @@ def resolve_files(config: FieldConfig) -> tuple[System, Prototype]:
 class FieldProcess:
     """The simulated field devices with their control channel, which run until they are stopped."""
 
-    def __init__(self, config: FieldConfig) -> None:
+    def __init__(self, config: FieldConfig, twin: DigitalTwinPrototype | None = None) -> None:
+        """Serve `twin`; without it, the prototype that `config` names."""
         self._config = config
+        self._twin = twin or resolve(config)
         self._clock = WallClock()
         self._stop = asyncio.Event()
         self._failure: FileInvalid | None = None
@@ -113,13 +129,12 @@ class FieldProcess:
     async def run(self, on_ready: Callable[[FieldSide], None] | None = None) -> int:
         """Open, call `on_ready`, and serve until stopped."""
         run_dir = Path(self._config.run_dir)
-        twin = resolve(self._config)
         async with AsyncExitStack() as stack:
             water = {}
             for device, (path, name) in self._config.water.items():
                 water[device] = end = await AcousticEnd.open(Path(path), name)
                 stack.push_async_callback(end.aclose)
-            self._field = twin.field(run_dir, water=water)
+            self._field = self._twin.field(run_dir, water=water)
             self._leases = FieldLeases(self._field.faults)
             return await self._run(run_dir, on_ready)
 
@@ -206,10 +221,9 @@ class FieldProcess:
                 self._leases.expire(self._clock.monotonic_ns())
 
     async def _make_anew(self) -> None:
-        """Make the devices again from the same files, on the same endpoints. A failure ends the process."""
+        """Make the devices again from the same prototype, on the same endpoints. A failure ends the process."""
         old, done = self._field, self._fresh_done
-        twin = resolve(self._config)
-        prototype = _listening_as(twin.prototype, old)
+        prototype = _listening_as(self._twin.prototype, old)
         self._field = FieldSide(old.system, prototype, Path(self._config.run_dir), self._clock)
         try:
             await self._field.open()

@@ -43,7 +43,8 @@ from fieldtwin.twin.plant.child_main import child_main
 from fieldtwin.twin.plant.command_gate import CommandGate
 from fieldtwin.twin.plant.mapping import MappedConnector, mapping_from_json
 from fieldtwin.twin.plant.physical import attached, gateway_lost_ms, image_layout, plc_lost_ms
-from fieldtwin.twin.site.system import System, load_system
+from fieldtwin.twin.site.resolved import read_resolved
+from fieldtwin.twin.site.system import System
 from fieldtwin.twin.thread.end import ThreadEnd
 from fieldtwin.twin.thread.place import lent_transmitter, plant_carrier
 from fieldtwin.twin.thread.thread import PTtoDTConnection, schema_of
@@ -57,16 +58,16 @@ NAMES = list(STATES)
 class PlantThreadConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The configuration of the process.
 
-    `place` is the address of the thread (`fieldtwin.twin.thread.place`), `store` a file or a database. `mapping` is
+    `resolved` is the system as the run has read it (`fieldtwin.twin.site.resolved`). `place` is the address of the thread
+    (`fieldtwin.twin.thread.place`), `store` a file or a database. `mapping` is
     None on a plant. `every_ms` is the shortest interval between two shared values of a tag.
     """
 
-    system: str
+    resolved: str
     run_dir: str
     place: str
     store: str
     prototype: bool
-    profiles: tuple[str, ...] = ()
     mapping: dict[str, str] | None = None
     every_ms: int = 0
 
@@ -181,7 +182,8 @@ class PlantThread:
 
     async def run(self) -> int:
         c, clock = self._config, self._clock
-        system = load_system(c.system, [Path(p) for p in c.profiles])
+        [system] = read_resolved(c.resolved)
+        assert isinstance(system, System)
         layout = image_layout(system)
         async with AsyncExitStack() as stack:
             store = await open_knowledge(c.store)

@@ -14,7 +14,7 @@ import click
 
 from fieldtwin.cli.option_groups import GroupedCommand, group, moved_options, option
 from fieldtwin.cli.options import Duration, Secret, json_option
-from fieldtwin.cli.run.run_options import ReplayOptions, commands_option, faults_of, listen_option, systems_of
+from fieldtwin.cli.run.run_options import ReplayOptions, commands_option, listen_option, systems_of
 from fieldtwin.cli.template_question import SourceOptions
 from fieldtwin.gateway.core.errors import FieldtwinError, UsageError
 from fieldtwin.run.live.options import RunOptions
@@ -186,12 +186,13 @@ def command(
     }  # fmt: skip
     systems = systems_of(system, sources, others, OF_A_GROUP, plant=place.plant, virtual=False)
     if systems is not None:
+        from fieldtwin.emulators.faults.schema import load_faults  # here: a plant has no emulators installed
         from fieldtwin.run.virtual.group_kinds import LiveRequest, kind_named
 
         return kind_named(systems.kind).run_live(
             LiveRequest(
                 systems, place.duration_s, place.instance, sources.profiles, commands,
-                faults_of(field.faults, system, sources.profiles, systems), thread.thread, place.cold,
+                load_faults(Path(field.faults), systems.check_fault) if field.faults else (), thread.thread, place.cold,
             ),
             as_json=as_json,
         )  # fmt: skip
@@ -228,7 +229,7 @@ def command(
         thread=thread.thread,
         thread_store=thread.thread_store,
         thread_every_s=thread.thread_every_s,
-        faults=faults_of(field.faults, system, sources.profiles),
+        fault_file=Path(field.faults) if field.faults else None,
     )
     return asyncio.run(_run(options, ServiceOptions(metrics=metrics, log=log), as_json))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -94,19 +94,3 @@ def systems_of(
     members = [(member.system, member.prototype.path) for member in group.members.values()]
     agree(sources.ask(), group.path, members, beside=group.path, virtual=virtual)
     return group
-
-
-def faults_of(
-    path: str, system: str, profiles: tuple[Path, ...], group: SystemGroup | None = None
-) -> tuple[dict[str, Any], ...]:
-    """Return the faults of the file `path`, each checked against the systems; none if `path` is empty. Raises `FileInvalid`."""
-    if not path:
-        return ()
-    from fieldtwin.emulators.faults.schema import load_faults
-    from fieldtwin.twin.prototype.fault_aims import target
-    from fieldtwin.twin.site.system import load_system
-
-    if group is not None:
-        return load_faults(Path(path), group.check_fault)
-    aimed_at = load_system(system, profiles)
-    return load_faults(Path(path), lambda spec: target(aimed_at, spec))

@@ -12,7 +12,7 @@ import click
 from fieldtwin.cli.campaign_options import FaultChoice, SeedOptions
 from fieldtwin.cli.option_groups import GroupedCommand, group, option
 from fieldtwin.cli.options import Duration, json_option
-from fieldtwin.cli.run.run_options import ReplayOptions, commands_option, faults_of, systems_of
+from fieldtwin.cli.run.run_options import ReplayOptions, commands_option, systems_of
 from fieldtwin.cli.run.virtual_view import parse_seeds, run_many, run_one
 from fieldtwin.cli.template_question import SourceOptions
 from fieldtwin.gateway.core.errors import UsageError
@@ -117,7 +117,7 @@ def command(
         recordings=replay.recordings,
         speed=replay.speed,
         commands=commands,
-        faults=faults_of(faults if random_faults is None else "", system, sources.profiles, systems),
+        fault_file=Path(faults) if faults and random_faults is None else None,
         random_faults=random_faults,
         trace=trace,
     )

@@ -130,7 +130,7 @@ def run_many(
         for error in result.errors:
             stdout.print(f"  {error}", soft_wrap=True, markup=False)
         stdout.print(f"  {again(result.seed)}", soft_wrap=True, markup=False)
-    if failed and (options.random_faults is not None or options.faults):
+    if failed and (options.random_faults is not None or options.faults or options.fault_file):
         _shrink(options, failed[0])
     table = Table(box=None, show_header=False, pad_edge=False)
     table.add_row("seeds", f"{len(results)}, {len(failed)} failed")

@@ -41,8 +41,11 @@ def fingerprint(*parts: str) -> str:
 
 def what_runs(options: VirtualOptions) -> str:
     """Return a fingerprint of these options without the seed, from the contents of the files and the command-line options."""
-    anyhow = replace(options, seed=None, trace=None, profiles=(), prototype_file=None)
-    return fingerprint(*VirtualRun(options).files, repr(anyhow))
+    run = VirtualRun(options)
+    anyhow = replace(
+        options, seed=None, trace=None, profiles=(), prototype_file=None, fault_file=None, faults=run.given_faults
+    )
+    return fingerprint(*run.files, repr(anyhow))
 
 
 def run_seed(options: VirtualOptions) -> SeedResult:
@@ -90,7 +93,7 @@ def shrunk(options: VirtualOptions, found: SeedResult) -> Shrunk:
     """Return the fewest faults with which the run of `found`'s seed still fails in the same way."""
     options = replace(options, seed=found.seed)
     run = VirtualRun(options)
-    base = replace(options, random_faults=None, faults=())
+    base = replace(options, random_faults=None, faults=(), fault_file=None)
 
     def ended(part: Sequence[dict[str, Any]]) -> SeedResult:
         return run_seed(replace(base, faults=tuple(part)))

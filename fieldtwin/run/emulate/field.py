@@ -9,7 +9,7 @@ from fieldtwin.console import stderr
 from fieldtwin.twin.plant.child import allow_open_files
 from fieldtwin.twin.plant.instance import Instance
 from fieldtwin.twin.prototype.field import FieldSide
-from fieldtwin.twin.prototype.field_process import FieldConfig, FieldProcess
+from fieldtwin.twin.prototype.field_process import FieldConfig, FieldProcess, resolve
 from fieldtwin.twin.site.system import load_system
 
 
@@ -31,8 +31,8 @@ class FieldOptions:
 async def run_field(options: FieldOptions) -> int:
     """Serve until SIGINT or SIGTERM. Prints the endpoints once they listen."""
     allow_open_files()
-    name = load_system(str(options.system), options.profiles).name
-    with Instance(options.instance or f"{name}-field") as instance:
+    system = load_system(str(options.system), options.profiles)
+    with Instance(options.instance or f"{system.name}-field") as instance:
         config = FieldConfig(
             system=str(options.system.resolve()),
             run_dir=str(instance.dir),
@@ -44,7 +44,7 @@ async def run_field(options: FieldOptions) -> int:
             control=options.control,
             token=options.token,
         )
-        process = FieldProcess(config)
+        process = FieldProcess(config, resolve(config, system))
         return await process.run(lambda side: _say(side, process, options))
 
 

@@ -44,6 +44,8 @@ class RunOptions:
     """The seed of the emulators; None: the prototype file's."""
     faults: tuple[dict[str, Any], ...] = ()
     """Faults as `fieldtwin.emulators.faults.schema.load_faults` returns them."""
+    fault_file: Path | None = None
+    """A file of further faults; the run checks it against its system."""
     water: dict[str, tuple[str, str]] = field(default_factory=dict)
     """Transmitters that are in a network's water (`fieldtwin.twin.prototype.field_process.FieldConfig`)."""
 

@@ -41,6 +41,7 @@ from fieldtwin.twin.plant.instance import Instance
 from fieldtwin.twin.plant.mapping import mapping_to_json
 from fieldtwin.twin.plant.physical import PhysicalTwin
 from fieldtwin.twin.prototype.field_status import FieldStatus
+from fieldtwin.twin.site.resolved import write_resolved
 from fieldtwin.twin.site.schema import NONE_STATED
 from fieldtwin.twin.site.system import System, load_system
 from fieldtwin.twin.thread.place import MODEM, lent_transmitter
@@ -50,6 +51,7 @@ if TYPE_CHECKING:
     from fieldtwin.run.benches.invariant_watch import InvariantWatch
     from fieldtwin.run.live.bridge_cable import BridgeCable
     from fieldtwin.twin.prototype.field_process import FieldConfig
+    from fieldtwin.twin.prototype.file import Prototype
 
 MODEM_EVERY_S = 1.0
 """Minimum seconds between two values of a tag over a modem, which carries some thirty events a second."""
@@ -82,12 +84,20 @@ class RunSession(AsyncResource):
         self.system: System = load_system(options.system, options.profiles)
         self.twin = PhysicalTwin(self.system)
         self.delegated = self._lent_to_the_thread()
+        self._prototype: Prototype | None = None
         if options.prototype and not options.field_host:
             from fieldtwin.twin.prototype.field_process import (
                 resolve,  # here and below: a plant has no emulators installed
             )
 
-            resolve(self._field_config(Path()))  # report errors in the files before anything starts
+            # errors in the files are reported before anything starts
+            self._prototype = resolve(self._field_config(Path()), self.system).prototype
+        self.faults = options.faults
+        if options.fault_file is not None:
+            from fieldtwin.emulators.faults.schema import load_faults
+            from fieldtwin.twin.prototype.fault_aims import target
+
+            self.faults += load_faults(options.fault_file, lambda spec: target(self.system, spec))
         self.instance = Instance(options.instance or self.system.name)
         self.mapping: dict[Endpoint, Endpoint] = {}
         self.far: dict[str, Endpoint] = {}
@@ -149,12 +159,12 @@ class RunSession(AsyncResource):
     def disturbed(self) -> bool:
         """Return whether faults were injected, or the field simulator was away: then the counts of both sides may differ."""
         lost = self.field_return is not None and self.field_return.losses > 0
-        return bool(self.options.faults) or lost or self.made_anew > 0
+        return bool(self.faults) or lost or self.made_anew > 0
 
     @property
     def calm(self) -> bool:
         """Return whether the run had no faults. How long recovery takes is for a scenario to check."""
-        return not self.options.faults and not self.made_anew
+        return not self.faults and not self.made_anew
 
     def summary(self) -> dict[str, Any]:
         """Return the verdict on the run, for `--json` and for printing. Call it after the run."""
@@ -208,6 +218,7 @@ class RunSession(AsyncResource):
             profiles=tuple(str(p.resolve()) for p in self.options.profiles),
             capture=str(self.options.capture.resolve()) if self.options.capture else "",
             delegated=(self.delegated,) if self.delegated else (),
+            resolved=self._hand_over(self.system),
         )
         await self._start_child("gateway", "fieldtwin.twin.plant.controller", self._write("gateway.json", gateway))
         self._stack.enter_context(self.states.attached(ecs.layout, run_dir / "image"))
@@ -219,19 +230,18 @@ class RunSession(AsyncResource):
 
     async def _put_faults_in(self) -> None:
         if self._field is not None:
-            for fault in self.options.faults:  # each has its own start time
+            for fault in self.faults:  # each has its own start time
                 await self._field.client.call("fault", fault=fault, start_ns=self.started_ns)
 
     async def _start_thread(self, run_dir: Path) -> None:
         """Start the plant's side of the digital thread, which observes the process image."""
         o = self.options
         config = PlantThreadConfig(
-            system=str(self.system.path.resolve()),
+            resolved=self._hand_over(self.system),
             run_dir=str(run_dir),
             place=o.thread,
             store=o.thread_store or str(run_dir / "knowledge.sqlite"),
             prototype=o.prototype,
-            profiles=tuple(str(p.resolve()) for p in o.profiles),
             mapping=mapping_to_json(self.mapping) if o.prototype else None,
             every_ms=round(
                 1000 * (o.thread_every_s if o.thread_every_s is not None else MODEM_EVERY_S if self.delegated else 0)
@@ -281,6 +291,11 @@ class RunSession(AsyncResource):
             water=o.water,
         )
 
+    def _hand_over(self, *files: object) -> str:
+        """Write what this run has read from files, for its own processes: all use the same version of the files."""
+        name = "system.pickle" if len(files) == 1 else "prototype.pickle"  # a gateway cannot read a prototype's
+        return write_resolved(self.instance.path(name), *files)
+
     def _write(self, name: str, config: msgspec.Struct) -> Path:
         path = self.instance.path(name)
         path.write_bytes(msgspec.json.format(msgspec.json.encode(config), indent=2))
@@ -302,7 +317,12 @@ class RunSession(AsyncResource):
             self._field = await contact_elsewhere(at, token, self.system, run_dir)
             self.field_return = FieldReturn(self._field, self.system, at, token, self._field_returned)
         else:
-            config = self._write("field.json", self._field_config(run_dir))
+            config = self._write(
+                "field.json",
+                msgspec.structs.replace(
+                    self._field_config(run_dir), resolved=self._hand_over(self.system, self._prototype)
+                ),
+            )
             client = await self._start_child("field", "fieldtwin.twin.prototype.field_process", config, FIELD_LINGER_S)
             self._field = await contact_here(client, self.system, run_dir)
         self._stack.push_async_callback(self._field.aclose)

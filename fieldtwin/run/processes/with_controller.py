@@ -26,7 +26,8 @@ from fieldtwin.run.processes.field_contact import contact_here
 from fieldtwin.run.processes.with_program import END_WITHIN_S, FIELD_LINGER_S, environment
 from fieldtwin.twin.plant.child import end_with_parent
 from fieldtwin.twin.plant.instance import Instance
-from fieldtwin.twin.prototype.field_process import FieldConfig
+from fieldtwin.twin.prototype.field_process import FieldConfig, resolve_files
+from fieldtwin.twin.site.resolved import write_resolved
 from fieldtwin.twin.site.system import System
 
 POLL_S = 0.02
@@ -64,8 +65,11 @@ class WithController(AsyncResource):
         self._stack.enter_context(self.instance)
         home = self.instance.dir
         self._stack.push(partial(_remove, home))
+        resolved = write_resolved(self.instance.path("prototype.pickle"), *resolve_files(self._config, self._system))
         path = self.instance.path("field.json")
-        path.write_bytes(msgspec.json.encode(msgspec.structs.replace(self._config, run_dir=str(home))))
+        path.write_bytes(
+            msgspec.json.encode(msgspec.structs.replace(self._config, run_dir=str(home), resolved=resolved))
+        )
         path.chmod(0o600)
         child = self._child = Child("field", "fieldtwin.twin.prototype.field_process", path, home, FIELD_LINGER_S)
         self._stack.push_async_callback(child.end)

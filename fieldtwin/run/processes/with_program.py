@@ -28,7 +28,9 @@ from fieldtwin.twin.plant.instance import Instance
 from fieldtwin.twin.plant.mapping import mapped_endpoint
 from fieldtwin.twin.prototype.field_process import FieldConfig, resolve
 from fieldtwin.twin.prototype.field_status import FieldStatus
-from fieldtwin.twin.site.system import System, load_system
+from fieldtwin.twin.prototype.prototype import DigitalTwinPrototype
+from fieldtwin.twin.site.resolved import write_resolved
+from fieldtwin.twin.site.system import System
 
 FIELD_LINGER_S = 0.5
 END_WITHIN_S = 5.0
@@ -115,15 +117,14 @@ async def run_with(
         raise UsageError(
             f"cannot start {argv[0]!r}: no such program", hint="check that it is on the PATH and executable"
         )
-    resolve(config)  # report errors in the files before anything starts
-    system = load_system(config.system, [Path(p) for p in config.profiles])
+    twin = resolve(config)  # errors in the files are reported before anything starts
     name = instance or f"with-{os.getpid()}"
     with Instance(name) as home:
         try:
             return await _inside(
                 home,
                 structs.replace(config, run_dir=str(home.dir)),
-                system,
+                twin,
                 [program, *argv[1:]],
                 faults,
                 tell,
@@ -137,14 +138,16 @@ async def run_with(
 async def _inside(
     home: Instance,
     config: FieldConfig,
-    system: System,
+    twin: DigitalTwinPrototype,
     argv: list[str],
     faults: Sequence[dict[str, Any]],
     tell: Tell,
     tell_struck: Callable[[list[dict[str, Any]]], None],
 ) -> int:
+    system = twin.ecs.system
+    resolved = write_resolved(home.path("prototype.pickle"), system, twin.prototype)
     path = home.path("field.json")
-    path.write_bytes(msgspec.json.encode(config))
+    path.write_bytes(msgspec.json.encode(structs.replace(config, resolved=resolved)))
     path.chmod(0o600)
     child = Child("field", "fieldtwin.twin.prototype.field_process", path, home.dir, FIELD_LINGER_S)
     try:

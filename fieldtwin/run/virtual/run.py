@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from fieldtwin.emulators.faults.schema import load_faults
 from fieldtwin.emulators.virtual.chance import seeded
 from fieldtwin.emulators.virtual.loop import VirtualLoop
 from fieldtwin.emulators.virtual.seal import sealed
@@ -39,7 +40,8 @@ MAX_ERRORS = 100
 class VirtualOptions:
     """The systems of a run, and its duration in virtual seconds. `system` names the file of one system or of several.
 
-    `faults` are injected in addition to those of `random_faults`, which the seed chooses; `trace` is a file for every
+    `faults`, and those of the file `fault_file`, are injected in addition to those of `random_faults`, which the seed
+    chooses; `trace` is a file for every
     event. `commands`: the sample periods in seconds that are commanded; None: the usual script. `prototype_file`,
     `recordings` and `speed` are for one system.
     """
@@ -53,6 +55,7 @@ class VirtualOptions:
     speed: float = 0.0
     commands: tuple[int, ...] | None = ()
     faults: tuple[dict[str, Any], ...] = ()
+    fault_file: Path | None = None
     random_faults: RandomFaults | None = None
     trace: Path | None = None
 
@@ -83,8 +86,11 @@ class VirtualRun:
         self.group = load_group(options.system, options.profiles) or load_one(options)
         self._kind = virtual_kind(self.group)
         self.seed = self.group.seed if options.seed is None else options.seed
-        self.faults = options.faults
-        """The injected faults, including those that the seed chose."""
+        self.given_faults = options.faults
+        """The injected faults without those that the seed chose."""
+        if options.fault_file is not None:
+            self.given_faults += load_faults(options.fault_file, self.group.check_fault)
+        self.faults = self.given_faults
         if options.random_faults is not None:
             options.random_faults.check(self.group)
             self.faults += random_schedule(self.group, self.seed, options.duration_s, options.random_faults)

@@ -23,6 +23,7 @@ from fieldtwin.twin.plant.controller import ControllerConfig
 from fieldtwin.twin.plant.mapping import mapped_endpoint, mapping_to_json
 from fieldtwin.twin.plant.physical import PhysicalTwin
 from fieldtwin.twin.prototype.field import FieldSide
+from fieldtwin.twin.site.resolved import write_resolved
 from fieldtwin.twin.site.system import System
 
 BY = "test"
@@ -69,6 +70,7 @@ class RunningPlc:
             allow_writes=True,
             mapping=mapping_to_json(mapping),  # only these: endpoints that are not emulated are not opened
             profiles=profiles,
+            resolved=write_resolved(folder / "system.pickle", system),
         )
         config = folder / "gateway.json"
         config.write_bytes(msgspec.json.encode(told))

@@ -76,9 +76,9 @@ def violation_frame(kind: str, tec: int, rec: int, t_ns: int = 0) -> CanFrame:
 
 
 def told_state(frame: CanFrame) -> CanErrorState | None:
-    """Return the state that an error frame reports, or None if it reports none.
+    """Return the controller state that an error frame reports.
 
-    An overrun, a violation and a frame that is not an error frame report no state.
+    Return None for an overrun, for a violation, and for a frame that is not an error frame.
     """
     if not frame.error:
         return None

@@ -45,7 +45,7 @@ class CanFrame(msgspec.Struct, frozen=True, gc=False):
     the sender was error-passive.
 
     A remote frame (`remote`) has no data and requests `dlc` bytes. `t_ns` is the time of reception (monotonic, 0 if
-    unknown). It does not count when the contents of two frames are compared: compare `key()`.
+    unknown). To compare the contents of two frames without their times, compare `key()`.
     """
 
     can_id: int
@@ -93,7 +93,7 @@ class CanFrame(msgspec.Struct, frozen=True, gc=False):
         return frame
 
     def key(self) -> tuple[int, bytes, bool, bool, bool, int, bool, bool, bool]:
-        """Return everything that is sent on the bus: equal for frames that a bus analyser cannot tell apart."""
+        """Return everything that is sent on the bus. Two frames that look the same to a bus analyser have equal keys."""
         return self.can_id, self.data, self.extended, self.remote, self.error, self.dlc, self.fd, self.brs, self.esi
 
     def __str__(self) -> str:
@@ -110,7 +110,7 @@ class CanFrame(msgspec.Struct, frozen=True, gc=False):
 def pack_record(frame: CanFrame, *, confirmed: bool = False, fd: bool = False) -> bytes:
     """Return the record of a frame: 24 bytes, or 80 on a connection that carries CAN FD (`fd`).
 
-    Raises `UsageError` for a CAN FD frame on a connection that carries none.
+    Raises `UsageError` for a CAN FD frame if the connection carries only classic frames.
     """
     flags = (
         (FLAG_EXTENDED if frame.extended else 0)

@@ -18,15 +18,15 @@ class Clock(Protocol):
     """Monotonic nanoseconds for intervals, UTC nanoseconds for display, and waiting."""
 
     def monotonic_ns(self) -> int:
-        """Return nanoseconds since an arbitrary start. They never go back, and all processes of a host see the same
+        """Return the nanoseconds since an arbitrary start. The value never decreases, and all processes of a host see the same
         time.
         """
         ...
 
     def utc_ns(self) -> int:
-        """Return nanoseconds since 1970-01-01T00:00:00Z. They may jump when the host's clock is set."""
+        """Return the nanoseconds since 1970-01-01T00:00:00Z. The value may jump when the host's clock is set."""
         ...
 
     async def sleep_until_ns(self, deadline_ns: int) -> None:
-        """Return at or after `deadline_ns` of `monotonic_ns`, or immediately if it has passed."""
+        """Wait until `monotonic_ns` has reached `deadline_ns`; do not wait if it already has."""
         ...

@@ -81,8 +81,8 @@ class CANConnection(Connection[CanFrame]):
 class _End(Generic[T]):
     """The inbound half of an asynchronous end: the receiver calls `feed`, the consumer awaits `_next`.
 
-    At most `max_pending` items wait. `feed` returns False when that limit is reached, and the receiver then stops
-    reading from the operating system. `on_room` is called when there is room again.
+    At most `max_pending` items wait. `feed` returns False when that limit is reached, and the receiver then stops reading from
+    the operating system. `on_room` is called when another item fits.
     """
 
     def __init__(self, inbound: Connection[T], endpoint: Endpoint, max_pending: int) -> None:
@@ -131,11 +131,11 @@ class _End(Generic[T]):
             self._wake()
 
     def on_room(self) -> None:
-        """Called after a consumer took an item; an end that paused its medium resumes here."""
+        """Resume reading from the medium if it was paused. Called after a consumer took an item."""
 
     def _loss(self) -> FieldtwinError:
-        """Return a new error with the reason for each `raise`: an error that is raised again collects tracebacks and
-        `at`s.
+        """Return a new error with the reason. Each `raise` needs its own, because a reused error collects tracebacks and
+        locations.
         """
         kept = self._lost or closed_locally(self.endpoint)
         fresh = type(kept).__new__(type(kept))
@@ -192,7 +192,7 @@ class _End(Generic[T]):
 class ByteConnection(_End[bytes], ABC):
     """One end of a byte stream (serial line or socket). One reader at a time.
 
-    The chunks given to `feed` are as the medium delivered them: their boundaries mean nothing to a protocol.
+    `feed` gets chunks as the medium delivered them. Their boundaries have no meaning for a protocol.
     """
 
     def __init__(self, inbound: Connection[bytes], endpoint: Endpoint, max_pending: int = 1024) -> None:
@@ -231,13 +231,13 @@ class ByteConnection(_End[bytes], ABC):
 
     @abstractmethod
     async def aclose(self) -> None:
-        """Close; afterwards `read` raises. Closing twice does nothing."""
+        """Close the connection; afterwards `read` raises. Closing twice does nothing."""
 
 
 class Client(ByteConnection):
     """The connection of a client that connected to a local listener.
 
-    `peer` is its address; `role` is the role that its certificate names (MBTLS 8.4), empty without one.
+    `peer` is the client's address. `role` is the role that its certificate names (MBTLS 8.4), or empty.
     """
 
     peer: str

@@ -47,9 +47,9 @@ Verb = Callable[[dict[str, Any]], Awaitable[Any]]
 class ControlServer:
     """A server for the registered commands on a Unix socket and, if configured, on TCP.
 
-    `verbs` maps a name to ``async (args) -> result``: data for JSON, or a `msgspec.Struct` of such. A `FieldtwinError`
-    from a command becomes an error answer. Any other exception also does, reported as a bug of fieldtwin, and the
-    connection stays open.
+    `verbs` maps a name to ``async (args) -> result``: data for JSON, or a `msgspec.Struct` of such. A `FieldtwinError` from a
+    command becomes an error answer. Any other exception becomes one too, reported as a bug of fieldtwin. The connection stays
+    open.
     """
 
     def __init__(self, verbs: dict[str, Verb], token: str = "") -> None:
@@ -91,7 +91,7 @@ class ControlServer:
         return int(server.sockets[0].getsockname()[1])
 
     async def aclose(self) -> None:
-        """Stop listening, drop every client and cancel the command that it waits for, and remove the sockets."""
+        """Stop listening, disconnect every client, cancel their pending commands, and remove the sockets."""
         for server in self._servers:
             server.close()
         serving = [task for task in self._clients.values() if task is not None and task is not asyncio.current_task()]
@@ -105,8 +105,8 @@ class ControlServer:
             self._sockets.pop().unlink(missing_ok=True)
 
     async def serve_pipe(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Serve the parent process over stdin and stdout. It is trusted, and no socket is opened. Return when it is
-        gone.
+        """Serve the parent process over stdin and stdout. Return when the parent is gone. The parent is trusted; no socket is
+        opened.
         """
         await self._serve(reader, writer, trusted=True)
 
@@ -154,8 +154,10 @@ class ControlServer:
 
 
 async def _read_line(reader: asyncio.StreamReader, until_s: float | None) -> bytes:
-    """Read a request; empty at the end. Raises `TimeoutError` if it is not complete `LINE_WITHIN_S` after its first byte, or at
-    the loop's time `until_s`, and `ValueError` if it is too long.
+    """Read one request line, or return b"" at the end of the stream.
+
+    Raises `TimeoutError` if the line is incomplete `LINE_WITHIN_S` seconds after its first byte or at the loop's time `until_s`,
+    and `ValueError` if it is too long.
     """
     async with asyncio.timeout_at(until_s):
         first = await reader.read(1)
@@ -205,7 +207,7 @@ def _describe(e: FieldtwinError) -> dict[str, Any]:
 
 
 class RemoteError(FieldtwinError):
-    """The other process answered with an error; `kind` is the class of that error in the other process."""
+    """An error that the other process answered with. `kind` is the name of its class in that process."""
 
     def __init__(self, kind: str, message: str, exit_code: int) -> None:
         super().__init__(message)
@@ -214,7 +216,7 @@ class RemoteError(FieldtwinError):
 
 
 class OtherVersion(FieldtwinError):
-    """The other process answered with data of a different form."""
+    """The other process answered with data of an unexpected form: it runs a different version of fieldtwin."""
 
 
 class ControlClient:
@@ -270,8 +272,10 @@ class ControlClient:
         raise RemoteError(error.get("kind", "?"), error.get("message", "?"), error.get("exit_code", 70))
 
     async def ask(self, verb: str, kind: type[S], timeout_s: float = 5.0, **args: Any) -> S:
-        """Send the command `verb` and return its result as a `kind`. Raises as `call`, and `OtherVersion` for a result
-        that is not one."""
+        """Send the command `verb` and return its result as a `kind`.
+
+        Raises as `call`, and `OtherVersion` if the result does not fit `kind`.
+        """
         answer = await self.call(verb, timeout_s, **args)
         try:
             return msgspec.convert(answer, kind)

@@ -41,7 +41,7 @@ def wire(kind: type[Connection[T]]) -> tuple[End[T], End[T]]:
 class Device(ABC):
     """SPEC row Device. Concrete classes list in `wire_types` the kinds of link to which they may be connected.
 
-    `command_list` holds names and is never empty. A message is recognised as one command of the list, or as none.
+    `command_list` holds the names of the device's commands and is never empty.
     """
 
     wire_types: ClassVar[frozenset[PROTOCOL]]
@@ -66,7 +66,10 @@ class Device(ABC):
         """Carry out a command of the list."""
 
     def execute_command(self, command: COMMAND, now_ns: int) -> RESPONSE:
-        """ExecuteCommand. Raises `UnknownCommand`, having done nothing, unless `command` is in the command list."""
+        """Execute `command` and return the response (ExecuteCommand).
+
+        Raises `UnknownCommand` and does nothing if the list lacks it.
+        """
         if command.name not in self.command_list:
             raise UnknownCommand(
                 f"no command {command.name!r}" if command.name else "a message that is not a command",
@@ -76,12 +79,11 @@ class Device(ABC):
         return self._execute(command, now_ns)
 
     def send(self, response: RESPONSE) -> None:
-        """Send: write the response."""
+        """Write the response to the connection (Send)."""
         self.connection.write(response.data)
 
     def receive(self, now_ns: int) -> RESPONSE:
-        """Receive: read, execute, send. Each command gets one response; a message that is not a command is read and not
-        answered.
+        """Read a message, execute it and send the response (Receive). A message that is not a command is not answered.
 
         The connection must not be empty. Raises `UnknownCommand`; the protocol decides what follows (SPEC ruling 11).
         """
@@ -105,14 +107,14 @@ class Transmitter(Device):
 
 @dataclass(frozen=True)
 class Communication:
-    """SPEC row Communication: a driver and its device accept the same commands, inclusion both ways (ruling 12)."""
+    """SPEC row Communication: a driver and a device whose command lists are equal (ruling 12)."""
 
     name: str
     driver_commands: frozenset[str]
     device_commands: frozenset[str]
 
     def check(self) -> None:
-        """Raise `CommandListMismatch` with the names that are missing on either side."""
+        """Raise `CommandListMismatch` with the names that only one side has, unless the lists are equal."""
         if self.driver_commands == self.device_commands:
             return
         only_driver = ", ".join(sorted(self.driver_commands - self.device_commands)) or "nothing"

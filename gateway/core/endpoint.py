@@ -45,7 +45,10 @@ _HOST = re.compile(r"^(\[[^\s\[\]/?#@]+\]|[^\s\[\]/?#@:]+)$")
 
 @dataclass(frozen=True, slots=True)
 class SerialSettings:
-    """What both ends of a serial line must agree on. `frame` as in manuals: data bits, parity N/E/O, stop bits."""
+    """The settings that both ends of a serial line must share.
+
+    `frame` is written as in manuals: data bits, parity N/E/O, stop bits.
+    """
 
     baudrate: int = 19200
     frame: str = "8E1"
@@ -145,7 +148,7 @@ class Endpoint:
 
     @property
     def rs485(self) -> bool:
-        """Return whether the driver of a serial port is to switch the direction of an RS485 transceiver."""
+        """Return whether the serial port's driver has to switch the direction of an RS485 transceiver."""
         text = self.param("rs485", "0")
         if text not in ("0", "1"):
             raise UsageError(f"endpoint {self}: rs485", expected="0 or 1", got=repr(text))
@@ -156,8 +159,8 @@ class Endpoint:
         """Return the silence in seconds that a Modbus RTU client keeps before a request, or None for the recommended
         one.
 
-        Above 19200 baud the standard recommends 1.75 ms (SL 2.5.1.1). A shorter one, of at least 3.5 characters, is for
-        devices that accept it.
+        Above 19200 baud the standard recommends 1.75 ms (SL 2.5.1.1). Some devices accept a shorter silence; it must be at least
+        3.5 characters.
         """
         text = self.param("silence_us")
         if not text:

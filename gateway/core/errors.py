@@ -59,7 +59,7 @@ class FieldtwinError(Exception):
         return escape_controls(f"{text} ({self.hint})" if self.hint else text)
 
     def at(self, where: str) -> FieldtwinError:
-        """Put `where` in front of the location that is already known. Return the error itself, for ``raise e.at(...)``."""
+        """Put `where` in front of the known location and return this error, for ``raise e.at(...)``."""
         self.where = f"{where}: {self.where}" if self.where else where
         return self
 
@@ -119,7 +119,7 @@ class FileInvalid(FieldtwinError):
 
 
 class CommandListMismatch(FileInvalid):
-    """Driver and device do not accept the same commands (SPEC row Communication, ruling 12)."""
+    """The command lists of a driver and its device differ (SPEC row Communication, ruling 12)."""
 
 
 class Bug(FieldtwinError):
@@ -166,9 +166,7 @@ class Desync(WireError):
 
 
 class WrongSize(Desync):
-    """A complete reply to this function arrived, but it carries `got_bytes` bytes of values, which is not the number
-    requested.
-    """
+    """A complete reply to this function arrived, but it carries `got_bytes` bytes of values instead of the number requested."""
 
     def __init__(self, message: str, *, expected: str = "", got: str = "", hint: str = "", got_bytes: int = 0) -> None:
         self.got_bytes = got_bytes
@@ -238,10 +236,10 @@ _SAYS_LITTLE = (errno.EADDRNOTAVAIL, errno.EAFNOSUPPORT)
 
 
 def os_reason(error: OSError) -> str:
-    """Return why the operating system refused, in its own words and in one phrase, without addresses and numbers.
+    """Return the operating system's reason as one phrase, without addresses and numbers.
 
-    asyncio tries each address of a name and lists all failures in one text. The failure that counts is that of an
-    address to which a connection was actually attempted.
+    asyncio tries each address of a name and lists all failures in one text. This function picks the failure of an address to
+    which a connection was actually attempted.
     """
     numbers = [error.errno] if error.errno is not None else [int(n) for n in _NUMBER.findall(str(error))]
     if not numbers or numbers[0] < 0:  # getaddrinfo has negative error numbers and its own texts

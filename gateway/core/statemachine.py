@@ -30,7 +30,7 @@ class STATE(ABC):
 
     @abstractmethod
     def execute(self, period_s: int) -> int:
-        """Return the sampling period in seconds that this state imposes, 0 if nothing is sampled."""
+        """Return the sampling period of this state in seconds, or 0 if nothing is sampled."""
 
 
 class ACTIVE(STATE):
@@ -62,7 +62,7 @@ ACCEPTING = frozenset({"OFF"})
 
 
 def delta(period_s: int) -> STATE:
-    """The transition function: total, by the sign of the period alone."""
+    """Return the state that follows a period command. Only the sign of the period counts, and every period is valid."""
     if period_s > 0:
         return STATES["ACTIVE"]
     return STATES["STANDBY"] if period_s == 0 else STATES["OFF"]

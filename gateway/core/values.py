@@ -92,8 +92,8 @@ Scalar = bool | int | float | str | bytes
 class TagValue(msgspec.Struct, frozen=True, gc=False):
     """A tag's value at an instant.
 
-    It is a `msgspec` struct because one is made with every reply: a frozen dataclass costs ten times as much.
-    `msgspec.structs.replace` makes one from another.
+    Every reply creates such values, and creating a frozen dataclass costs ten times as much as a `msgspec` struct.
+    `msgspec.structs.replace` returns a changed copy.
 
     `value` is in engineering units, or None if there has been no value yet. `t_ns` is the source's monotonic time at
     which the reply that carried the value was complete. `raw` holds the bytes that the device sent, empty if it sent
@@ -111,7 +111,7 @@ class TagValue(msgspec.Struct, frozen=True, gc=False):
         return self.quality is Quality.GOOD
 
     def age_s(self, now_ns: int) -> float:
-        """Return the seconds since the source had this value; infinite if it never had one."""
+        """Return the seconds since the source had this value; infinite if there never was a value."""
         return (now_ns - self.t_ns) / 1e9 if self.t_ns else float("inf")
 
     def describe(self, now_ns: int) -> dict[str, Scalar | None]:

@@ -8,7 +8,7 @@ from typing import Self
 
 
 class AsyncResource(ABC):
-    """An asynchronous context manager whose parts are started in `_start`, which puts each on `_stack`.
+    """An asynchronous context manager that consists of parts. `_start` starts them and puts each on `_stack`.
 
     If `_start` fails, the parts that were started are ended, and the error is raised. On leaving, `_stop` runs first,
     while all parts still run; then the stack is unwound even if `_stop` failed.
@@ -22,7 +22,7 @@ class AsyncResource(ABC):
         """Start the parts, in order."""
 
     async def _stop(self) -> None:  # noqa: B027  # most have nothing to do then
-        """Do what is needed before any part is ended; by default nothing."""
+        """Do what has to happen before the first part is ended. The default does nothing."""
 
     async def __aenter__(self) -> Self:
         try:

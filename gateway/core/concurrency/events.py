@@ -18,7 +18,7 @@ D = TypeVar("D", bound=DATA)
 
 
 class EventHandler(ABC):  # noqa: B024  the schema has state and no operations; Producer and Consumer are the concrete ones
-    """Registered for exactly one event, by name. Abstract: make a Producer or a Consumer."""
+    """The common base of Producer and Consumer: a handler registered for exactly one event, by name. Abstract."""
 
     def __init__(self, event: str) -> None:
         if type(self) is EventHandler:
@@ -27,9 +27,9 @@ class EventHandler(ABC):  # noqa: B024  the schema has state and no operations; 
 
 
 class Consumer(EventHandler, Generic[D]):
-    """Observes one event and handles the occurrences in order.
+    """A handler that observes one event and handles its occurrences in order.
 
-    `dropped` counts the items that a full queue lost; it is always reported.
+    `dropped` counts the items that were lost because the queue was full.
     """
 
     def __init__(self, event: str, capacity: int = 256) -> None:
@@ -38,7 +38,7 @@ class Consumer(EventHandler, Generic[D]):
         self.dropped = 0
 
     def observe(self, item: D) -> None:
-        """Append `item`; a full queue drops its oldest and counts it."""
+        """Append `item`. A full queue drops its oldest item and counts it."""
         if len(self.queue) == self.queue.maxlen:
             self.dropped += 1
         self.queue.append(item)
@@ -50,7 +50,7 @@ class Consumer(EventHandler, Generic[D]):
         return self.queue.popleft()
 
     def put_back(self, item: D) -> None:
-        """Make `item`, consumed but not handled, the first again. A full queue drops its newest item and counts it."""
+        """Put `item`, which was consumed but not handled, back at the head. A full queue drops its newest item and counts it."""
         if len(self.queue) == self.queue.maxlen:
             self.dropped += 1
         self.queue.appendleft(item)
@@ -62,16 +62,14 @@ class Consumer(EventHandler, Generic[D]):
 
 
 class Producer(EventHandler, Generic[D]):
-    """Emits one event to every Consumer that subscribed to it."""
+    """A handler that emits one event to every Consumer that subscribed to it."""
 
     def __init__(self, event: str) -> None:
         super().__init__(event)
         self._consumers: list[Consumer[D]] = []
 
     def subscribe(self, consumer: Consumer[D]) -> None:
-        """Let `consumer` observe from now on. It must be registered for the same event; subscribing twice has no
-        further effect.
-        """
+        """Pass events to `consumer` from now on. It must be registered for the same event. Subscribing it twice has no effect."""
         if consumer.event != self.event:
             raise Bug("a consumer of another event", expected=self.event, got=consumer.event)
         if consumer not in self._consumers:
@@ -79,10 +77,10 @@ class Producer(EventHandler, Generic[D]):
 
     @property
     def observed(self) -> bool:
-        """Return whether any Consumer is subscribed; without one, the event need not be created."""
+        """Return whether any Consumer is subscribed. If not, the caller need not create the event."""
         return bool(self._consumers)
 
     def emit(self, occurred: D) -> None:
-        """Pass on exactly what occurred, in the order of subscription. Never waits."""
+        """Pass `occurred` unchanged to every Consumer, in the order of subscription. Never waits."""
         for consumer in self._consumers:
             consumer.observe(occurred)

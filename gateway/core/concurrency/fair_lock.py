@@ -7,8 +7,7 @@
     finally:
         turn.pass_on()
 
-It does the same as `asyncio.Lock`, which needs five calls and two coroutines. It is for code that runs with every
-exchange.
+`asyncio.Lock` does the same with five calls and two coroutines, which is too slow for code that runs with every exchange.
 """
 
 from __future__ import annotations

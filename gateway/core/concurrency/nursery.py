@@ -13,9 +13,9 @@ from typing import Any
 
 
 class Nursery:
-    """``async with Nursery() as nursery: nursery.start(coro, "name")``. On leaving, every child is cancelled and awaited.
+    """A group of tasks: ``async with Nursery() as nursery: nursery.start(coro, "name")``.
 
-    `wait` returns when the first child ends: normally, or by raising what the child raised.
+    On leaving, every child is cancelled and awaited. `wait` returns when all children have ended, and raises the first failure.
     """
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM as an event of the loop."""
+"""Turn Ctrl-C and SIGTERM into an event of the asyncio loop."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from collections.abc import Callable
 def on_stop_signal(call: Callable[[], object]) -> None:
     """Call `call` in the running loop on each SIGINT and SIGTERM.
 
-    Where the loop has no signal handlers (Windows), SIGINT raises KeyboardInterrupt as usual.
+    If the loop supports no signal handlers (Windows), SIGINT raises KeyboardInterrupt as usual.
     """
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -23,7 +23,7 @@ def on_stop_signal(call: Callable[[], object]) -> None:
 def stop_signal() -> asyncio.Event:
     """Return an event that SIGINT and SIGTERM set from now on.
 
-    Call this before the program announces where it serves: a caller that reads the announcement may send the signal at once.
+    Call this before the program prints its endpoint: a parent process that reads it may send the signal immediately.
     """
     stop = asyncio.Event()
     on_stop_signal(stop.set)

@@ -1,8 +1,7 @@
 """Wait for an event with a time limit: the future that is awaited, and the timer that ends the wait.
 
 An event loop for simulated time may offer `alarm(delay_s)`, which returns a future that is done after the delay, or
-earlier if the caller sets its result. That takes half the steps of a future and a timer; any other loop gets a future
-and a timer.
+earlier if the caller sets its result. This takes half the steps of a future and a timer, which all other loops use.
 """
 
 from __future__ import annotations

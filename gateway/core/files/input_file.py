@@ -1,7 +1,7 @@
 """Open a file that a user named: a regular file of a limited size, so that reading it always ends.
 
-Opening a pipe without a writer would block, a device such as /dev/zero has no end, and a file of zeros that takes no
-room on the disk would fill the memory. A symbolic link is followed; its target must be a regular file.
+Opening a pipe without a writer would block, a device such as /dev/zero has no end, and a sparse file of zeros would fill the
+memory. A symbolic link is followed; its target must be a regular file.
 """
 
 from __future__ import annotations

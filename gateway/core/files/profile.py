@@ -89,7 +89,7 @@ class Tag:
         return self.at
 
     def number_of(self, value: int | float | str) -> int | float | str:
-        """Return the number of a value that the profile names (`values: {0: OFF}`), and every other value unchanged."""
+        """Return the number for a name of a value (`values: {0: OFF}`), and every other value unchanged."""
         return next((number for number, name in self.values if name == value), value)
 
     @property
@@ -131,7 +131,7 @@ class Tag:
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """A block of registers passed on unaltered when the tag `when` changes."""
+    """A block of registers that is passed on unaltered when the tag `when` changes."""
 
     name: str
     at: RegisterRange
@@ -215,7 +215,7 @@ class DeviceProfile:
         return Path(self.path).parent / self.form.eds if self.form.eds else None
 
     def group(self, poll: str) -> list[Tag]:
-        """Return the readable tags of a poll group, in the file's order."""
+        """Return the readable tags of a poll group, in the order of the profile."""
         return [t for t in self.tags.values() if t.poll == poll and t.readable]
 
     @property
@@ -227,8 +227,8 @@ class DeviceProfile:
     def command_list(self) -> frozenset[str]:
         """Return the commands that a device of this profile accepts (SPEC ruling 12).
 
-        They are ``read_<group>`` for each poll group, the names in `commands`, and ``set_<tag>`` for a writable tag
-        without one. A transmitter accepts ``send`` and ``acknowledge``, a CANopen node the NMT commands.
+        They are ``read_<group>`` for each poll group, the names in `commands`, and ``set_<tag>`` for each writable tag that
+        `commands` does not name. A transmitter accepts ``send`` and ``acknowledge``, a CANopen node the NMT commands.
         """
         named = set(self.form.commands.values())
         commands = {f"read_{g}" for g in self.groups} | set(self.form.commands)
@@ -349,7 +349,7 @@ def resolve(file: YamlFile) -> DeviceProfile:
 
 
 def _tags_of(file: YamlFile, form: ProfileForm, name: str, t: TagForm) -> Iterable[Tag]:
-    """Return one tag, or several for a name such as ``voltage_l1..3``, whose registers directly follow each other."""
+    """Return the tag of a name, or several adjacent tags for a name such as ``voltage_l1..3``."""
     loc: tuple[Key, ...] = ("tags", name)
     kind = t.type or form.defaults.type
     if form.protocol == "canopen":
@@ -497,7 +497,7 @@ def _check_sets(file: YamlFile, p: DeviceProfile, loc: tuple[Key, ...], sets: It
 
 
 def _check_stated(file: YamlFile, p: DeviceProfile) -> None:
-    """Check that the device has what is needed by its effects and by its functions that carry no registers."""
+    """Check that the device has the access and the function codes that its effects, identification, files and FIFOs need."""
     for i, effect in enumerate(p.effects):
         if not (effect.tag.readable if effect.on_read else effect.tag.writable):
             verb = "read" if effect.on_read else "written"

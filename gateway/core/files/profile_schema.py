@@ -1,4 +1,4 @@
-"""The form of a device profile: the pydantic models of the YAML file (see docs and `fieldtwin schema profile`).
+"""The pydantic models of a device profile's YAML file (see docs and `fieldtwin schema profile`).
 
 fieldtwin.gateway.core.files.profile turns the form into frozen objects with resolved addresses.
 """
@@ -36,7 +36,7 @@ FileNumber = Annotated[int, Field(ge=1, le=0xFFFF)]
 
 
 class Strict(BaseModel):
-    """A form that refuses unknown keys and does not convert values."""
+    """The base of all models: it refuses unknown keys and does not convert values."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
@@ -115,7 +115,9 @@ class MessageForm(Strict):
 
 
 class SampledForm(Strict):
-    """The values of group `poll` are samples: new when tag `count` changes, taken every tag `period` seconds."""
+    """A group of samples: the values of group `poll` are new when tag `count` changes; tag `period` holds the seconds between two
+    samples.
+    """
 
     count: str
     period: str
@@ -124,7 +126,7 @@ class SampledForm(Strict):
 
 
 class BoxForm(Strict):
-    """One direction of a mailbox: sequence, length and payload from `at`, the acknowledged sequence at `ack`."""
+    """One direction of a mailbox. Sequence, length and payload begin at `at`; the acknowledged sequence is at `ack`."""
 
     at: Address
     bytes: int = Field(ge=2, le=240)

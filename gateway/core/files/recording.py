@@ -154,9 +154,8 @@ def shown(path: Path) -> str:
 class RecordingReader:
     """Reads a recording: `header` is available immediately, then `exchanges()` or `rows()` once, in the file's order.
 
-    After the last record, `truncated` says whether a cut-off line followed it, and `lines` how many lines were
-    complete. Use it as a context manager. Raises `FileInvalid` for a file that does not exist, is not a recording, or
-    is damaged.
+    At the end, `truncated` says whether the last line was cut off, and `lines` holds the number of complete lines. Use the reader
+    as a context manager. Raises `FileInvalid` for a file that does not exist, is not a recording, or is damaged.
     """
 
     def __init__(self, path: Path) -> None:
@@ -189,8 +188,8 @@ class RecordingReader:
         return self._exchanges()
 
     def _exchanges(self) -> Iterator[RecordedExchange]:
-        """Decode whole blocks of lines while they are valid; from an invalid block on, line by line, to report the line
-        number.
+        """Decode whole blocks of lines while they are valid. From the first invalid block on, decode line by line to report the
+        line number.
         """
         while self._file.seekable():
             start = self._file.tell()

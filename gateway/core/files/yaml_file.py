@@ -53,7 +53,10 @@ for _tag, _pattern, _first in (
 
 
 def _integer(loader: _Loader, node: yaml.ScalarNode) -> int:
-    """Read an integer of at most 64 bits. More digits would cost time, and registers, objects and times are not longer."""
+    """Read an integer of at most 64 bits.
+
+    No register, object or time needs more, and a very long number would take long to parse.
+    """
     text = str(node.value)
     value = (
         int(text, 0) if len(text) <= MAX_DIGITS and "x" in text else int(text) if len(text) <= MAX_DIGITS else 1 << 64
@@ -90,7 +93,7 @@ class YamlFile:
     positions: dict[tuple[Key, ...], Position]
 
     def line(self, loc: tuple[Key, ...]) -> int:
-        """Return the line of `loc`, or of its nearest parent that is in the file."""
+        """Return the line of the key path `loc`, or of its nearest parent that is in the file."""
         return self._place(loc)[0]
 
     def _place(self, loc: tuple[Key, ...]) -> Position:
@@ -101,7 +104,7 @@ class YamlFile:
     def error(
         self, loc: tuple[Key, ...], message: str, *, expected: str = "", got: str = "", hint: str = ""
     ) -> FileInvalid:
-        """Return a `FileInvalid` at the position of `loc`, or of its nearest parent that is in the file."""
+        """Return a `FileInvalid` at the position of the key path `loc`, or of its nearest parent that is in the file."""
         line, column = self._place(loc)
         return FileInvalid(message, path=self.path, line=line, column=column, expected=expected, got=got, hint=hint)
 
@@ -199,7 +202,7 @@ def _translate(file: YamlFile, model: type[BaseModel], e: ValidationError) -> Fi
 
 
 def _translate_place(file: YamlFile, model: type[BaseModel], errors: list[ErrorDetails]) -> FileInvalid:
-    """Return one error for a value that fits no branch of a union, with what every branch expects."""
+    """Return one error for a value that fits no type of a union. It lists what each of these types expects."""
     expected = [expected_value(error, _keys_at(model, error["loc"])) for error in errors]
     if not all(expected):
         return _translate_one(file, model, errors[0])
@@ -281,7 +284,7 @@ def _in_file(file: YamlFile, loc: tuple[Key, ...]) -> tuple[Key, ...]:
 
 
 def _known_keys(model: type[BaseModel], loc: tuple[Key, ...]) -> list[str]:
-    """Return the keys that the model at `loc` knows, found by walking annotations; the keys of the top level if that fails."""
+    """Return the keys of the model at `loc`, found from the annotations, or those of the top level if there is no model."""
     current: Any = model
     for part in loc:
         fields = getattr(current, "model_fields", None)

@@ -91,7 +91,7 @@ class ImageLayout:
 
     @classmethod
     def from_description(cls, text: Mapping[str, Any]) -> ImageLayout:
-        """Return the layout of a description. Raises `FileInvalid` if the description is invalid."""
+        """Return the layout that `describe` described. Raises `FileInvalid` if the description is invalid."""
         try:
             return cls(tuple(RegionLayout.from_description(region) for region in text["regions"]))
         except (KeyError, TypeError) as e:
@@ -161,7 +161,7 @@ class Image:
         return self._regions[name]
 
     def release(self) -> None:
-        """Let go of the memory, including all writers and readers. A second call does nothing."""
+        """Release the memory, including that of all writers and readers. A second call does nothing."""
         for part in self._given:
             part.release()
         self._given.clear()
@@ -177,8 +177,9 @@ class Image:
 
 
 def process_image(inputs: Sequence[TagSpec], outputs: Sequence[TagSpec]) -> ImageLayout:
-    """Return the layout that gateway and PLC share: both regions, each with the other's `taken` and `consumed` tags
-    added.
+    """Return the layout that gateway and PLC share.
+
+    INPUTS gets a `taken` tag for each message of OUTPUTS, and OUTPUTS a `consumed` tag for each message of INPUTS.
     """
     taken = [TagSpec(taken_name(t.name), TagKind.INT) for t in outputs if t.kind is TagKind.MESSAGE]
     consumed = [TagSpec(consumed_name(t.name), TagKind.INT) for t in inputs if t.kind is TagKind.MESSAGE]

@@ -1,6 +1,6 @@
 """The contents of a process image: tags, regions, and the positions in bytes that follow from them.
 
-Description only. This module must not know the memory itself, who maps it, or what a tag means in a plant.
+This module only describes. It must not know the memory itself, who maps it, or what a tag means in a plant.
 
 A region (one writer, any number of readers) lies in memory as
 
@@ -49,9 +49,9 @@ class TagKind(Enum):
 class TagSpec:
     """One tag: name (``device.tag`` or ``program.variable``), kind, unit, limits, and names for its values.
 
-    The limits are the smallest and largest value that the tag is meant to have (None: whatever its kind can hold).
-    Values have names if they are, for example, states. A MESSAGE has payloads of at most `max_bytes` and keeps the last
-    `depth` of them. Raises `FileInvalid` for a size that makes no sense.
+    The limits are the smallest and largest value that the tag is meant to have; None stands for the limit of its kind. The names
+    are for values that are, for example, states. A MESSAGE has payloads of at most `max_bytes` and keeps the last `depth` of
+    them. Raises `FileInvalid` for a size that makes no sense.
     """
 
     name: str

@@ -52,12 +52,14 @@ class _Region:
         self._slot_bytes = CHECK.size + shape.body.size
 
     def release(self) -> None:
-        """Let go of the memory, so that a map can be closed. The object cannot be used afterwards."""
+        """Release the memory, so that its map can be closed. The object cannot be used afterwards."""
         self._words.release()
         self._memory.release()
 
     def _slot(self, counter: int) -> bytes | None:
-        """Return publication `counter`, verified, without its check sum; None if it is not, or no longer, in the memory."""
+        """Return the slot of publication `counter` without its check sum, or None if the memory does not hold that publication
+        intact.
+        """
         at = self._slots[counter % SLOTS]
         (check,) = CHECK.unpack_from(
             self._memory, at
@@ -131,8 +133,8 @@ class RegionWriter(_Region):
     ) -> int:
         """Publish from columns that have one entry per tag in the layout's order.
 
-        `same` says that the caller has not changed values, qualities and reasons since it published them last; times
-        may have changed. Most cycles change nothing, and then those columns are not examined.
+        `same` says that values, qualities and reasons are unchanged since the caller last published them, as in most cycles.
+        Those columns are then not examined. Times may have changed.
         """
         stamps = self._stamps(times_ns)
         if same and not messages and self._packed:
@@ -154,9 +156,9 @@ class RegionWriter(_Region):
     ) -> int:
         """Publish values that all have one quality and time (a scan), without creating an object per tag.
 
-        `but` has the quality of the few tags, by index, that differ. A None has no value and is BAD with reason
-        NEVER_READ, or with the reason that `missing` has for its index. `same` says that `values`, `quality`, `reason`
-        and `but` are those that the caller published last; then they are not examined.
+        `but` holds the quality of the few tags that differ, by index. A value of None is published as BAD, with the reason that
+        `missing` holds for its index, else NEVER_READ. `same` says that `values`, `quality`, `reason` and `but` are unchanged
+        since the last publication; they are then not examined.
         """
         count = len(values)
         if same and not messages and self._packed:
@@ -276,7 +278,7 @@ class RegionWriter(_Region):
                 self._memory[at : at + len(record)] = record
 
     def _not_encodable(self, values: Sequence[Scalar | None]) -> Bug:
-        """Find the tag that did not fit. Called only after packing failed."""
+        """Return an error that names the tag whose value did not fit. Called only after packing failed."""
         for spec, value in zip(self.shape.layout.tags, values, strict=True):
             try:
                 struct.pack("<d" if spec.kind is TagKind.REAL else "<q", 0 if value is None else value)
@@ -324,7 +326,7 @@ class RegionReader(_Region):
         self._qualities = b""
 
     def resume(self, tag: str, seq: int) -> None:
-        """Continue after message `seq` of `tag`, which was handled before the reader was restarted: the next one is `seq` + 1."""
+        """Continue with message `seq` + 1 of `tag`. Message `seq` was handled before the reader was restarted."""
         self._seen[tag] = seq
         self._columns = b""  # the same columns may now stand for other new messages
 

@@ -58,7 +58,7 @@ class Snapshot(msgspec.Struct, frozen=True, gc=False):
     messages: Mapping[str, tuple[Message, ...]]
 
     def value(self, tag: str | int) -> TagValue:
-        """Return the value of a tag by name or index. `raw` is not carried. Raises KeyError or IndexError."""
+        """Return the value of a tag by name or index; its `raw` is empty. Raises KeyError or IndexError."""
         i = self.shape.index[tag] if isinstance(tag, str) else tag
         return TagValue(self.values[i], _QUALITIES[self.qualities[i]], _REASONS[self.reasons[i]], self.time_ns(i))
 

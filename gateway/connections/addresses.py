@@ -1,4 +1,4 @@
-"""The local address of a socket, which is also the address that the peer sees unless it is translated in between."""
+"""The local address of a socket. Without address translation (NAT) in between, the peer sees the same address."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ RATELESS = frozenset({"virtual", "udp_multicast"})
 
 
 class AdapterConnection(CanConnection):
-    """One handle on an adapter. Make it with `open`. `bitrate` is the adapter's setting, 0 if it has none."""
+    """One handle on an adapter; create it with `open`. `bitrate` is the adapter's setting in bit/s, or 0 if it has none."""
 
     def __init__(self, endpoint: Endpoint, bus: can.BusABC, bitrate: int = 0, max_pending: int = 4096) -> None:
         super().__init__(CANConnection(), endpoint, max_pending)
@@ -57,9 +57,11 @@ class AdapterConnection(CanConnection):
     async def open(cls, endpoint: Endpoint, bitrate: int, *, max_pending: int = 4096) -> AdapterConnection:
         """Open the adapter at `bitrate` bit/s, or at ``?bitrate=`` of the endpoint.
 
-        With ``?listen=1`` it does not even acknowledge. Raises `UsageError` for an interface that python-can does not
-        have, a driver that is not installed, and an adapter that would have to guess its bit rate (a node at a wrong
-        one destroys the frames of all nodes); `EndpointBusy` or `Unreachable` if the adapter is in use or missing.
+        With ``?listen=1`` the adapter does not even acknowledge frames.
+
+        Raises `UsageError` for an interface that python-can does not have, for a driver that is not installed, and if no bit rate
+        is given to an adapter that needs one (a node with a wrong bit rate destroys the frames of all nodes). Raises
+        `EndpointBusy` or `Unreachable` if the adapter is in use or missing.
         """
         rate = _bitrate(endpoint, bitrate)
         words = _words(endpoint, rate)
@@ -193,7 +195,7 @@ def _typed(text: str) -> Any:
 
 
 def _listen_only(endpoint: Endpoint) -> dict[str, Any]:
-    """Return the arguments that make this driver listen only, as far as python-can supports it."""
+    """Return the arguments that put this driver into listen-only mode, as far as python-can supports it."""
     match endpoint.interface:
         case "slcan":
             return {"listen_only": True}

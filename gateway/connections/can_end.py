@@ -33,7 +33,7 @@ SEND_TIMEOUT_S = 2.0
 
 
 class SocketCanConnection(CanConnection):
-    """One socket on a kernel CAN interface. Make it with `open`.
+    """One socket on a kernel CAN interface; create it with `open`.
 
     Error frames are received as frames with `error` set. `t_ns` is the kernel's time of reception, monotonic.
     """

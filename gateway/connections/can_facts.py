@@ -12,9 +12,9 @@ from fieldtwin.gateway.core.errors import Unreachable
 class CanFacts:
     """Properties of a CAN endpoint.
 
-    `bitrate` is that of the medium in bit/s, 0 if unknown. `needs_bitrate` says that the endpoint has to name one (an
-    adapter). `listen_only` says that it is set so that nothing can be sent, `can_listen_only` that ``?listen=1`` is
-    possible. `state`, `tx_errors` and `rx_errors` are those of the controller, if the driver reports them.
+    `bitrate` is that of the medium in bit/s, 0 if unknown. `needs_bitrate` says that the endpoint has to name a bit rate (an
+    adapter). `listen_only` says that the interface is in listen-only mode, `can_listen_only` that ``?listen=1`` is possible.
+    `state`, `tx_errors` and `rx_errors` are those of the controller, if the driver reports them.
     """
 
     interface: str
@@ -28,7 +28,9 @@ class CanFacts:
 
 
 def can_facts(endpoint: Endpoint) -> CanFacts:
-    """Ask the kernel, or read the endpoint. Raises `Unreachable` for a kernel interface that does not exist."""
+    """Return the properties of an endpoint, from the kernel or from the URL.
+
+    Raises `Unreachable` for a kernel interface that does not exist."""
     interface = endpoint.interface
     if interface == "fieldtwin":
         return CanFacts(interface)

@@ -1,4 +1,4 @@
-"""The kernel's information about a network interface: is it CAN, is it up, at which bit rate (rtnetlink(7)).
+"""The kernel's information about a network interface: whether it is CAN, whether it is up, its bit rate (rtnetlink(7)).
 
 Read-only: the kernel owns a CAN interface's bit rate, which is checked and never set. Decoding is separate from asking
 the kernel, so that it can be tested on any system. This module sends and receives no frames.
@@ -31,8 +31,7 @@ _TIMEOUT_S = 1.0
 class CanLink:
     """A network interface. `bitrate` in bit/s is 0 if the interface has none (vcan) or none was set.
 
-    `kind` is the driver's name for it (``vcan`` and ``vxcan`` for virtual interfaces, ``can`` for controllers), else
-    empty.
+    `kind` is ``vcan`` or ``vxcan`` for virtual interfaces, ``can`` for controllers, or empty if the driver names no kind.
     """
 
     is_can: bool
@@ -49,7 +48,7 @@ class CanLink:
 
 
 def query_link(name: str) -> CanLink:
-    """Ask the kernel about interface `name`. Raises `OSError`: ENODEV if it does not exist."""
+    """Ask the kernel about interface `name`. Raises `OSError` (ENODEV if the interface does not exist)."""
     index = socket.if_nametoindex(name)
     request = _MESSAGE.pack(_MESSAGE.size + _LINK.size, _RTM_GETLINK, _NLM_F_REQUEST, 1, 0)
     with socket.socket(socket.AF_NETLINK, socket.SOCK_RAW, socket.NETLINK_ROUTE) as netlink:

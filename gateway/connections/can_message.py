@@ -10,8 +10,9 @@ from fieldtwin.gateway.core.errors import UsageError
 
 
 def message_of(frame: CanFrame, endpoint: Endpoint) -> can.Message:
-    """Return the message for `frame`, to be sent at `endpoint`. Raises `UsageError` for an error frame, which a node
-    cannot send.
+    """Return python-can's message for `frame`, which is to be sent at `endpoint`.
+
+    Raises `UsageError` for an error frame, which a node cannot send.
     """
     if frame.error:
         raise UsageError("an error frame cannot be sent", got=str(frame), where=str(endpoint))

@@ -1,6 +1,7 @@
 """The counters and control lines of a serial port's driver: ``TIOCGICOUNT`` and ``TIOCMGET`` of Linux (tty_ioctl(4)).
 
-A pty, many USB adapters and other operating systems have no counters; the result is then None, never zeros. Only reads.
+A pty, many USB adapters and other operating systems have no counters; the result is then None, never zeros. This module only
+reads.
 """
 
 from __future__ import annotations
@@ -65,13 +66,13 @@ def unpack_counters(data: bytes) -> LineCounters:
 
 
 def read_counters(descriptor: int) -> LineCounters | None:
-    """Ask the driver; None if it has no such counters."""
+    """Return the driver's counters, or None if it has none."""
     answer = _ask(descriptor, TIOCGICOUNT, _INTS.size)
     return unpack_counters(answer) if answer is not None else None
 
 
 def read_control_lines(descriptor: int) -> dict[str, bool]:
-    """Ask the driver; empty if it has no such lines."""
+    """Return the state of the driver's control lines, or an empty result if it has none."""
     answer = _ask(descriptor, TIOCMGET, _INT.size)
     if answer is None:
         return {}

@@ -29,9 +29,10 @@ ACCEPT_PAUSE_S = 0.1
 
 
 class ClientConnection(TcpConnection, Client):
-    """One client. `peer` is its address, `last_used_s` the loop's time when it last sent data.
+    """The connection of one client.
 
-    `role` is the role that its certificate names (MBTLS 8.4), empty without a role and without TLS.
+    `peer` is the client's address, and `last_used_s` the loop's time when it last sent data. `role` is the role that its
+    certificate names (MBTLS 8.4), or empty.
     """
 
     def __init__(self, endpoint: Endpoint, peer: str, port: int) -> None:
@@ -49,7 +50,7 @@ class ClientConnection(TcpConnection, Client):
         self.last_used_s = self._loop.time()
 
     async def take(self, sock: socket.socket, tls: ssl.SSLContext | None) -> None:
-        """Become the connection of an accepted socket, with a TLS handshake if a context is given."""
+        """Take over an accepted socket, with a TLS handshake if a context is given."""
         self._secured = tls is not None
         limit_s = HANDSHAKE_LIMIT_S if tls is not None else None
         await self._loop.connect_accepted_socket(lambda: self._wire, sock, ssl=tls, ssl_handshake_timeout=limit_s)
@@ -61,7 +62,7 @@ class ClientConnection(TcpConnection, Client):
             self._wire.transport.abort()
 
     def on_end_of_stream(self, error: ConnectionLost) -> bool:
-        """Without TLS, keep the connection half-open: data that arrived before is read, and may still be answered.
+        """Keep a connection without TLS half-open, so that data that arrived before can be read and answered.
 
         TLS has no half-closed connections.
         """
@@ -88,7 +89,7 @@ OnClient = Callable[[Client], Awaitable[None]]
 
 
 class TcpListener:
-    """Runs `on_client(connection)` for each client that `admits` accepts; when that returns, the client is closed.
+    """A listener that runs `on_client(connection)` for each client that `admits` accepts, and then closes the client.
 
     When `max_clients` are connected, the next one takes the place of the one that has been silent for longest (TG
     4.2.1, case MB-065). A client that has been silent for `idle_s` is closed as well; 0 means never. `refused` counts

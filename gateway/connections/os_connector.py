@@ -1,6 +1,6 @@
-"""The plant's `Connector`: it opens an endpoint with the end of the operating system that the scheme requires.
+"""The plant's `Connector`: it opens the serial port, socket or CAN bus that an endpoint names.
 
-This module must not know that a simulation exists: a wrapper around it may map an endpoint to that of an emulator.
+This module must not know that a simulation exists. A wrapper around the connector may map an endpoint to that of an emulator.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ BYTE_SCHEMES = "rtu:, ascii:, tcp:, rtu+tcp:, udp: or tls:"
 
 
 class OsConnector(Connector):
-    """Opens serial ports, TCP and TLS streams, UDP sockets and CAN buses of this computer.
+    """A connector for the serial ports, TCP and TLS streams, UDP sockets and CAN buses of this computer.
 
     The code for each kind of link is imported when the first one is opened: a plant without CAN does not load
     python-can.

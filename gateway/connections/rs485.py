@@ -21,8 +21,7 @@ _NO_SUCH_REQUEST = errno.ENOTTY
 
 
 def settings_sent(driver: bytes) -> bytes:
-    """Return the struct serial_rs485 to set, given the one that the driver has: RTS high while sending and low
-    otherwise.
+    """Return the struct serial_rs485 to set, based on the driver's present one: RTS is high while sending and low otherwise.
 
     Delays, termination and other settings of the board from the driver or the device tree are not changed.
     """
@@ -31,7 +30,10 @@ def settings_sent(driver: bytes) -> bytes:
 
 
 def let_driver_switch(fd: int) -> None:
-    """Turn RS485 mode on. Raises `OSError`: ENOTTY if the port has none (ptys, most USB adapters) or does not keep it."""
+    """Turn RS485 mode on.
+
+    Raises `OSError` (ENOTTY if the port has no such mode, as ptys and most USB adapters, or ignores it).
+    """
     import fcntl  # not on Windows, which has no such request
 
     driver = fcntl.ioctl(fd, TIOCGRS485, bytes(_SERIAL_RS485.size))

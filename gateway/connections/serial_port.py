@@ -38,10 +38,9 @@ _ABSENT = (errno.ENOENT, errno.ENXIO, errno.ENODEV)
 
 
 def open_port(endpoint: Endpoint, read_s: float = 0.0, write_s: float = 0.0) -> Port:
-    """Lock and configure the port. `read_s` and `write_s` limit the waiting of reads and writes in seconds; 0 does not
-    wait.
+    """Lock and configure the port. Reads and writes wait at most `read_s` and `write_s` seconds; 0 does not wait.
 
-    Raises the errors of `SerialConnection.open`. It may take seconds: call it in a thread.
+    Raises the errors of `SerialConnection.open`. This may take seconds: call it in a thread.
     """
     settings = endpoint.serial
     try:
@@ -76,7 +75,7 @@ def open_port(endpoint: Endpoint, read_s: float = 0.0, write_s: float = 0.0) -> 
 def _is_pty(path: str) -> bool:
     """Return whether the port is a pty, which drops parity silently.
 
-    glibc reports that as an error if no other setting changes, so a second 8E1 is refused.
+    glibc reports the lost parity as an error if no other setting changes, so setting 8E1 a second time fails.
     """
     return os.path.realpath(path).startswith("/dev/pts/")
 
@@ -134,7 +133,7 @@ def _ports_hint() -> str:
 
 
 def _group_hint(path: str) -> str:
-    """Return a hint with the group that may use the port, read from the file: dialout on Debian, uucp on other systems."""
+    """Return a hint with the group that owns the port's device file: dialout on Debian, uucp on other systems."""
     if grp is None:
         return ""
     try:

@@ -35,7 +35,7 @@ SEND_BUFFER_BYTES = 8 * 1024
 
 
 class SoftBusConnection(CanConnection):
-    """One node on a software CAN bus. Make it with `open`.
+    """One node on a software CAN bus; create it with `open`.
 
     Received frames carry the bus's exact end of frame as `t_ns`, on this host's monotonic clock. Error frames among
     them report the state of this node's controller (gateway/core/can_error.py).
@@ -140,7 +140,7 @@ class SoftBusConnection(CanConnection):
 
 
 class _Wire(asyncio.Protocol):
-    """The TCP connection: cuts the stream into records; the first one is the answer to the hello."""
+    """The TCP connection to the bus. It cuts the stream into records; the first record is the answer to the hello."""
 
     def __init__(self, connection: SoftBusConnection) -> None:
         loop = asyncio.get_running_loop()
@@ -166,7 +166,7 @@ class _Wire(asyncio.Protocol):
             self.take_frames()
 
     def take_frames(self) -> None:
-        """Deliver whole records, from now on as they arrive."""
+        """Deliver the complete records received so far, and from now on each record as it arrives."""
         self._joined = True
         whole = len(self._buffer) - len(self._buffer) % RECORD_SIZE
         records = bytes(self._buffer[:whole])
@@ -291,8 +291,9 @@ class SoftBus(can.BusABC):
     def recv(self, timeout: float | None = None) -> can.Message | None:
         """Return the next message, or None after `timeout` seconds (None: wait without a limit).
 
-        If another thread calls `shutdown` meanwhile, it returns None at the end of its timeout, or immediately without
-        one: python-can's Notifier polls until it is stopped itself. Raises `can.CanOperationError` if the bus is gone.
+        If another thread calls `shutdown` meanwhile, this call returns None at the end of its timeout, or immediately if it has
+        no timeout, because python-can's Notifier keeps polling until it is stopped. Raises `can.CanOperationError` if the bus is
+        gone.
         """
         deadline_ns = self._clock.monotonic_ns() + int((timeout or 0) * NS_PER_S)
         try:

@@ -23,10 +23,10 @@ from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid
 
 
 class TappedConnector(Connector):
-    """Opens connections with `inner`, and lets `taps` observe them.
+    """A connector that opens connections with `inner` and lets `taps` observe them.
 
-    It is the outermost wrapper, so that the taps receive the endpoint in the plant even if it is mapped to a different
-    one.
+    It has to be the outermost wrapper. Then the taps receive the plant's endpoint, even if an inner connector maps it to an
+    emulator's.
     """
 
     def __init__(self, inner: Connector, taps: Sequence[Tap], clock: Clock) -> None:
@@ -70,7 +70,7 @@ class _Observers:
                 self._take_off(tap, endpoint, e)
 
     def _take_off(self, tap: Tap, endpoint: Endpoint, error: Exception) -> None:
-        """Remove the tap and report it. A loop over the taps that is running now still uses the previous tuple."""
+        """Remove the tap and report it. A loop over the taps that is already running still uses the previous tuple."""
         self._taps = tuple(other for other in self._taps if other is not tap)
         self.failed += 1
         asyncio.get_running_loop().call_exception_handler(
@@ -79,7 +79,7 @@ class _Observers:
 
 
 class _TappedBytes(ByteConnection):
-    """The same stream object as the inner connection's; only the calls pass through this class."""
+    """A byte connection that reports its calls to the taps. It shares the stream object of the inner connection."""
 
     def __init__(self, inner: ByteConnection, endpoint: Endpoint, observers: _Observers) -> None:
         super().__init__(inner.inbound, endpoint, inner.max_pending)
@@ -124,7 +124,10 @@ class _TappedBytes(ByteConnection):
 
 
 class _TappedCan(CanConnection):
-    """As `_TappedBytes`, for frames. Frames dropped by an overrun were not received; the inner end counts them."""
+    """A CAN connection that reports its calls to the taps.
+
+    Frames that an overrun dropped are not reported; the inner end counts them.
+    """
 
     def __init__(self, inner: CanConnection, endpoint: Endpoint, observers: _Observers) -> None:
         self._inner = inner  # before the base class, which sets `overruns`
@@ -182,7 +185,7 @@ class Captured:
 
 
 class CaptureTap(Tap):
-    """Keeps the last `capacity` chunks and frames in memory; `dropped` counts the older ones that were removed."""
+    """A tap that keeps the last `capacity` chunks and frames in memory. `dropped` counts the older items that were removed."""
 
     def __init__(self, capacity: int = 10_000) -> None:
         self._seen: deque[Captured] = deque(maxlen=capacity)
@@ -194,7 +197,7 @@ class CaptureTap(Tap):
         return list(self._seen)
 
     def stream(self, endpoint: Endpoint, direction: Direction) -> bytes:
-        """Return all kept bytes of one direction of one endpoint, in order, without chunk boundaries, which mean nothing."""
+        """Return all kept bytes of one direction of one endpoint, joined in order."""
         kept = (c.item for c in self._seen if c.endpoint == endpoint and c.direction is direction)
         return b"".join(item for item in kept if isinstance(item, bytes))
 
@@ -211,7 +214,7 @@ class CaptureTap(Tap):
 
 
 class TapFile(Tap):
-    """Writes JSON lines: ``{"t_ns", "endpoint", "direction", "hex"}``; a frame adds ``"frame"`` in candump's notation.
+    """A tap that writes JSON lines: ``{"t_ns", "endpoint", "direction", "hex"}``; a frame adds ``"frame"`` in candump's notation.
 
     A line has been passed to the operating system when the call returns, so after a crash at most the last line is
     incomplete. At most `max_bytes` are written. `dropped` counts items that were not written, and `error` gives the
@@ -219,7 +222,7 @@ class TapFile(Tap):
     """
 
     def __init__(self, path: Path, max_bytes: int = 1 << 30, *, head: Mapping[str, object] | None = None) -> None:
-        """Create the file, replacing an old one. `head`, if given, is its first line and describes the run; it has a
+        """Create the file, replacing an existing file. `head`, if given, becomes the first line and describes the run; it has a
         key ``started``.
 
         Raises `FileInvalid` if the file cannot be created.
@@ -246,7 +249,9 @@ class TapFile(Tap):
         self._write(line)
 
     def on_refusal(self, refusal: Mapping[str, object]) -> None:
-        """Record a write that did not reach its device, with its ``t_ns``: not traffic, but part of the history."""
+        """Record, with its ``t_ns``, a write that was refused before it reached its device: part of the run's history, though not
+        traffic.
+        """
         self._write({"t_ns": refusal["t_ns"], "refused": dict(refusal)})
 
     def close(self) -> None:

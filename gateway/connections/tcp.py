@@ -35,9 +35,9 @@ UNACKNOWLEDGED_MS = 20_000
 class TcpConnection(ByteConnection):
     """One end of a TCP stream.
 
-    At most `max_pending` chunks of `CHUNK` bytes wait here. Then the socket is not read until half of them have been
-    taken, and TCP holds the sender back. After the end of the stream, a reset, or no sign of life, the bytes that
-    arrived are read, then `ConnectionLost` is raised.
+    At most `max_pending` chunks of `CHUNK` bytes wait here. Then the socket is not read until half of them have been taken, and
+    TCP holds the sender back. When the stream has ended, was reset, or the peer gave no sign of life, `read` still returns the
+    bytes that arrived, and then raises `ConnectionLost`.
     """
 
     def __init__(self, endpoint: Endpoint, max_pending: int = 1024) -> None:
@@ -118,7 +118,10 @@ class TcpConnection(ByteConnection):
 
 
 class _Wire(asyncio.BufferedProtocol):
-    """The protocol object that asyncio calls. A plain protocol would receive up to 256 KiB per chunk, so it is a buffered one."""
+    """The protocol object that asyncio calls.
+
+    It is a buffered protocol because a plain one would receive up to 256 KiB per chunk.
+    """
 
     transport: asyncio.Transport
 

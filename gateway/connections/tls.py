@@ -20,10 +20,10 @@ from fieldtwin.gateway.core.errors import Unreachable, UsageError
 class TlsConnection(TcpConnection):
     """A `TcpConnection` inside TLS 1.2 or later.
 
-    The endpoint's ``ca`` is a file of the trusted authorities (else the system's), ``cert`` and ``key`` are the local
-    certificate and key (one file may hold both), and ``name`` is the name that the server's certificate must have if it
-    is not the host. The server is always verified. The server may refuse the local certificate only after `open` (TLS
-    1.3): then the first read or write raises the error.
+    The endpoint's ``ca`` is a file of the trusted authorities (default: the system's). ``cert`` and ``key`` are the local
+    certificate and key; one file may hold both. ``name`` is the name that the server's certificate must have (default: the host).
+    The server is always verified. With TLS 1.3 the server may refuse the local certificate only after `open` has returned; the
+    first read or write then raises the error.
     """
 
     def __init__(self, endpoint: Endpoint, max_pending: int = 1024) -> None:
@@ -47,7 +47,7 @@ class TlsConnection(TcpConnection):
 
     @property
     def peer_role(self) -> str:
-        """Return the role in the server's certificate; empty without one."""
+        """Return the role in the server's certificate, or an empty text."""
         certificate = self._ssl_object().getpeercert(binary_form=True)
         return role_in(certificate) if certificate else ""
 

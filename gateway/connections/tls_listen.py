@@ -17,7 +17,7 @@ HANDSHAKE_LIMIT_S = 10.0
 
 
 def check_files(endpoint: Endpoint) -> None:
-    """Raise `UsageError` if a ``tls://`` endpoint to listen on does not name the required files."""
+    """Raise `UsageError` if the ``tls://`` endpoint of a listener does not name the required files."""
     missing = [name for name in ("cert", "ca") if not endpoint.param(name)]
     if missing:
         raise UsageError(

@@ -1,8 +1,7 @@
 """A UDP socket as a `ByteConnection`: each chunk is one datagram, and so is each `write`.
 
-There is no connection that could be lost: an absent peer shows only by silence, or by an error of the network that the
-port is closed. This module must not know a protocol, and neither the content of a datagram nor the order of datagrams
-concerns it.
+There is no connection that could be lost. An absent peer is noticed only by its silence, or by the network's error that the port
+is closed. This module must not know a protocol: it interprets neither the content nor the order of datagrams.
 """
 
 from __future__ import annotations
@@ -70,7 +69,7 @@ class UdpConnection(ByteConnection):
         await self._wire.gone.wait()
 
     def end(self, reason: FieldtwinError) -> None:
-        """Close the socket for `reason`; only the first one counts."""
+        """Close the socket for `reason`. Only the first reason is kept."""
         self.feed_lost(reason)
         self._wire.room.set()
         self._wire.transport.abort()

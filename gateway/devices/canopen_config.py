@@ -1,4 +1,4 @@
-"""CANopen configuration besides addresses: what a bus's master produces, and how a node is booted."""
+"""The CANopen configuration without addresses: what the master of a bus produces, and how a node is booted."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from fieldtwin.gateway.protocols.canopen.sdo import WHOLE_S
 
 @dataclass(frozen=True)
 class CanopenBusConfig:
-    """The master of a bus: SYNC every `sync_ms` with a counter up to `sync_counter` (0: no counter), TIME every
-    `time_ms`; 0: never.
+    """The settings of a bus's CANopen master.
 
-    `short_sdo`: accept replies of fewer than 8 bytes, as old controllers send them. `sdo_transfer_s`: the longest time
-    for a whole SDO transfer, in seconds.
+    It sends SYNC every `sync_ms`, with a counter up to `sync_counter` (0: no counter), and TIME every `time_ms` (0: never). With
+    `short_sdo` it accepts replies of fewer than 8 bytes, as old controllers send them. `sdo_transfer_s` is the longest time for a
+    whole SDO transfer, in seconds.
     """
 
     sync_ms: int = 0
@@ -30,8 +30,11 @@ class CanopenBusConfig:
 
 @dataclass(frozen=True)
 class RpdoConfig:
-    """The tags that RPDO1 of a node is to carry. `synchronous`: the values take effect at the next SYNC. `event_ms`:
-    how often it is sent without a change; 0: never."""
+    """The tags that RPDO1 of a node has to carry.
+
+    With `synchronous` the values take effect at the next SYNC. `event_ms` is the period in which the RPDO is sent without a
+    change; 0: never.
+    """
 
     tags: tuple[str, ...]
     synchronous: bool = False
@@ -40,13 +43,13 @@ class RpdoConfig:
 
 @dataclass(frozen=True)
 class CanopenNodeConfig:
-    """How a node is booted. `identity` is the expected identity; `configuration` is what the node is to hold, from the
-    DCF `dcf`.
+    """How a node is booted.
 
-    `lss`: the LSS address by which the node gets its node ID if no node has that ID. `tpdos`: the process data that the
-    node sends, from its DCF; None if `adopt_tpdos` asks to read them from the node, or if nothing is configured.
-    `rpdos` and `adopt_rpdos`: the same for the process data that the node receives; `rpdo1`: how its RPDO1 is to be
-    configured. `sdo_transfer_s`: as of the bus, for this node; None: the bus's.
+    `identity` is the expected identity, and `configuration` the configuration that the node has to hold, from the DCF `dcf`.
+    `lss` is the LSS address by which the node gets its node ID if no node on the bus has that ID. `tpdos` are the TPDOs of the
+    DCF; None if `adopt_tpdos` asks to read them from the node, or if nothing is configured. `rpdos` and `adopt_rpdos` are the
+    same for RPDOs, and `rpdo1` is the configuration for RPDO1. `sdo_transfer_s` replaces the limit of the bus for this node
+    unless it is None.
     """
 
     identity: ExpectedIdentity = field(default_factory=ExpectedIdentity)

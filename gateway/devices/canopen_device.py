@@ -69,7 +69,7 @@ class TpdoSeen:
 
 
 class CanopenDriver(DeviceDriver):
-    """A driver of one node, made from its profile."""
+    """The driver of one node, created from its profile."""
 
     wire_types = frozenset({PROTOCOL.CAN})
 
@@ -92,12 +92,12 @@ class CanopenDriver(DeviceDriver):
 
     @property
     def message_tag(self) -> str | None:
-        """None: a node emits no message that a program could be bound to."""
+        """Return None: a node emits no messages to which a program could be bound."""
         return None
 
     @property
     def master(self) -> CanopenMaster:
-        """The master of the bus that this node is connected to."""
+        """Return the master of the bus that this node is connected to."""
         if self._master is None:
             raise Bug("a driver without a master was used", where=self.config.where)
         return self._master
@@ -109,12 +109,12 @@ class CanopenDriver(DeviceDriver):
             seen.puts = None
 
     def understood(self, tag_name: str, held: TagValue, of: TagValue | None) -> TagValue:
-        """Decode a tag's stored bytes under the present configuration."""
+        """Return the value of a tag's stored bytes, decoded with the present configuration."""
         return decode_little(self.profile.tags[tag_name], held.raw, held.t_ns)
 
     @property
     def pdo_tags(self) -> list[str]:
-        """The full names of the tags that TPDOs bring."""
+        """Return the full names of the tags that TPDOs carry."""
         names = [n for n in self.config.tpdo1.tags if n not in self.unmapped] if self.config.tpdo1 else []
         mapped = [(e.index, e.subindex) for seen in self.tpdos for e in seen.mapping.entries]
         names += [self._by_object[o].name for o in mapped if o in self._by_object]
@@ -122,9 +122,9 @@ class CanopenDriver(DeviceDriver):
 
     @property
     def operational(self) -> bool:
-        """Whether the node takes process data.
+        """Return whether the node accepts process data, according to its heartbeat.
 
-        Its heartbeat shows that. For a node without a heartbeat it is True if the last NMT command was "start".
+        For a node without a heartbeat, return whether the last NMT command was "start".
         """
         state = self.master.node_state(self.node)
         if state in (None, NmtState.INITIALISING):
@@ -133,7 +133,7 @@ class CanopenDriver(DeviceDriver):
 
     @property
     def is_watched(self) -> bool:
-        """Whether the loss of the node would be noticed: its heartbeat has a limit and was received.
+        """Return whether a loss of the node would be noticed: its heartbeat has a consumer time and has been received.
 
         A node that produces no heartbeat, because the gateway only listens, is not watched (CiA 301, 7.2.8.3.2.2:
         monitoring starts with the first heartbeat).
@@ -141,7 +141,7 @@ class CanopenDriver(DeviceDriver):
         return self.config.heartbeat is not None and self.master.heartbeat_watched(self.node)
 
     def stale_after_ms(self, tag: Tag) -> int | None:
-        """Return for how many milliseconds a value of `tag` is good without being refreshed.
+        """Return how long a value of `tag` stays good without being refreshed, in milliseconds.
 
         Return None for a value that cannot change while the node runs, and for a value that a TPDO sends only when it
         changes, while the heartbeat shows that the node is alive.
@@ -169,7 +169,7 @@ class CanopenDriver(DeviceDriver):
     # -- bringing the node up (CiA 302-2, boot slave) ---------------------------------------------------------------
 
     async def identify(self) -> None:
-        """Read over SDO the identity that the system file states, and compare. Raises `WrongDevice` on a difference."""
+        """Read the node's identity over SDO and compare it with that in the system file. Raises `WrongDevice` on a difference."""
         differences = await identity_differences(self.master, self.node, self.config.canopen.identity)
         if differences:
             self.identity_error = ", ".join(f"{name}: {difference}" for name, difference in differences.items())
@@ -188,8 +188,10 @@ class CanopenDriver(DeviceDriver):
             )
 
     async def read_once(self) -> None:
-        """Read over SDO the tags that no TPDO brings and that `identify` did not read. A tag that the node refuses has
-        no value."""
+        """Read over SDO the tags that no TPDO carries and that `identify` did not read.
+
+        A tag that the node refuses gets no value.
+        """
         others = {*(self.config.tpdo1.tags if self.config.tpdo1 else ()), *self.config.expect}
         for tag in self.profile.tags.values():
             if tag.readable and tag.name not in others:
@@ -200,7 +202,7 @@ class CanopenDriver(DeviceDriver):
 
     @property
     def to_configure(self) -> str:
-        """What `configure` may write, in words; empty if the system file configures nothing that is written."""
+        """Return what `configure` may write, in words; empty if the system file configures nothing that has to be written."""
         canopen, parts = self.config.canopen, []
         if canopen.configuration is not None:
             parts.append(f"{canopen.dcf}(only if the node holds different values)")
@@ -213,8 +215,8 @@ class CanopenDriver(DeviceDriver):
         return f"{', '.join(parts)} as in the system file" if parts else ""
 
     async def configure(self) -> None:
-        """Write the DCF, unless the node already holds it, then heartbeat and TPDO1 as the system file states, and
-        listen.
+        """Write the DCF unless the node already holds it, then heartbeat and TPDO1 as the system file states. Then listen to the
+        TPDOs.
 
         These are writes: call this only where writing is allowed.
         """
@@ -233,9 +235,9 @@ class CanopenDriver(DeviceDriver):
         await self._take_rpdos()
 
     async def adopt(self) -> None:
-        """Use the TPDOs as the node or its DCF has them, and listen. This only reads.
+        """Take over the TPDOs that the node or its DCF has, and listen to them. This only reads.
 
-        A tag of the configured `tpdo1` that none of them carries is in `unmapped` afterwards.
+        Afterwards `unmapped` holds the tags of the configured `tpdo1` that no TPDO carries.
         """
         tpdos = await self._other_tpdos()
         if self.config.tpdo1 is not None:
@@ -248,12 +250,12 @@ class CanopenDriver(DeviceDriver):
 
     @property
     def unmapped_ms(self) -> int:
-        """The period in which `read_unmapped` is due: half of the time for which a value is good, but 100 ms at least."""
+        """Return the period of `read_unmapped` in milliseconds: half the time for which a value stays good, at least 100 ms."""
         shortest = min((self.stale_after_ms(self.profile.tags[n]) or 1000 for n in self.unmapped), default=1000)
         return max(100, shortest // 2)
 
     async def read_unmapped(self) -> None:
-        """Read the tags over SDO that the node's TPDOs should carry and do not. A tag that the node refuses has no value."""
+        """Read over SDO the tags that the node's TPDOs should carry but do not. A tag that the node refuses gets no value."""
         for name in self.unmapped:
             if self.profile.tags[name].poll in self.config.poll:
                 continue  # its poll group reads it
@@ -271,7 +273,7 @@ class CanopenDriver(DeviceDriver):
         return not await holds_configuration(self.master, self.node, configuration.date)
 
     async def _other_tpdos(self) -> list[PdoConfig]:
-        """Return the TPDOs other than the configured TPDO1: from the DCF, or read from the node."""
+        """Return all TPDOs except the configured TPDO1, from the DCF or read from the node."""
         boot, first = self.config.canopen, 2 if self.config.tpdo1 else 1
         held = boot.tpdos or ()
         if boot.adopt_tpdos:
@@ -312,9 +314,9 @@ class CanopenDriver(DeviceDriver):
         self._rpdos = taken
 
     async def _filled(self, config: PdoConfig) -> Rpdo | None:
-        """Return the RPDO filled with the values that the node holds now.
+        """Return the RPDO, filled with the values that the node holds now.
 
-        Return None if the node does not return one of them: values that are not commanded would be overwritten.
+        Return None if one of them cannot be read, because sending the RPDO would then overwrite it with a wrong value.
         """
         held = []
         for entry in config.mapping.entries:
@@ -364,18 +366,17 @@ class CanopenDriver(DeviceDriver):
             self.emitter.emit(MEASUREMENT(data))
 
     def _put_of(self, entry: PdoEntry) -> tuple[str, Tag] | None:
-        """Return the tag that an entry brings, with its full name; None if there is no such tag, or if its size
-        differs."""
+        """Return the full name and the tag of a mapped entry; None if there is no such tag, or if its size differs."""
         tag = self._by_object.get((entry.index, entry.subindex))
         if tag is None or BITS.get(tag.type) != entry.bits:
             return None
         return f"{self.config.name}.{tag.name}", tag
 
     def on_event(self, event: NodeEvent) -> None:
-        """Follow a change of the node's state or the loss of its heartbeat: the quality of its values changes at once.
+        """Adapt the quality of the node's values to a change of its state or the loss of its heartbeat.
 
-        A node that restarted, or may have restarted, can have lost its mappings: until it is brought up again, its
-        process data means nothing.
+        A node that restarted, or may have restarted, can have lost its mappings. Its process data is ignored until it has been
+        configured again.
         """
         if event.kind == "boot-up":
             self._rpdos, self._started = {}, False
@@ -389,12 +390,12 @@ class CanopenDriver(DeviceDriver):
     # -- sent messages -------------------------------------------------------------------------------------------------
 
     def rpdo_of(self, tag_name: str) -> Rpdo | None:
-        """Return the RPDO by which this tag is commanded; None if it goes by SDO."""
+        """Return the RPDO by which this tag is commanded, or None if it is written over SDO."""
         return self._rpdos.get(tag_name)
 
     @property
     def rpdos(self) -> list[Rpdo]:
-        """The RPDOs that this driver sends."""
+        """Return the RPDOs that this driver sends."""
         return list(dict.fromkeys(self._rpdos.values()))
 
     async def send_rpdo(self, rpdo: Rpdo, values: Mapping[str, bytes]) -> None:
@@ -417,7 +418,7 @@ class CanopenDriver(DeviceDriver):
         return value
 
     async def _read(self, what: str) -> list[DATA]:
-        """Read a poll group over SDO, except the tags that TPDOs bring. A tag that the node refuses has no value."""
+        """Read a poll group over SDO, except the tags that TPDOs carry. A tag that the node refuses gets no value."""
         brought = self.pdo_tags
         for tag in self.profile.group(what):
             if f"{self.config.name}.{tag.name}" not in brought:

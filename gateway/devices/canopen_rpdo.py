@@ -1,7 +1,7 @@
 """The process data that a node receives: the contents of each RPDO, and which of its RPDOs the gateway may send.
 
-An RPDO carries all of its objects each time. So it may be used only if each of them may be written, and it is filled
-with what the node held when it was brought up. This module must not know a bus, a master or the time of sending.
+An RPDO always carries all of its objects. So it may be used only if each of them may be written, and the gateway first fills it
+with the values that the node holds when it connects. This module must not know a bus, a master or the time of sending.
 """
 
 from __future__ import annotations
@@ -28,8 +28,9 @@ ObjectTags = Mapping[tuple[int, int] | None, Tag]
 
 @dataclass(eq=False)
 class Rpdo:
-    """One RPDO. `held` is what was last sent to the node, object by object; `repeat_ms` 0: sent only when a value
-    changes."""
+    """One RPDO. `held` is the value of each object as the node holds it.
+
+    `repeat_ms` is the period in which the RPDO is repeated; 0: it is sent only when a value changes."""
 
     number: int
     cob_id: int
@@ -40,7 +41,7 @@ class Rpdo:
     repeat_ms: int = 0
 
     def frame(self, values: Mapping[str, bytes]) -> CanFrame:
-        """Return the frame with `values` (tag: bytes, little endian) in place of what is held."""
+        """Return the frame with `values` (tag: bytes, little endian), and the held bytes for all other objects."""
         return CanFrame(self.cob_id, self.mapping.pack(self._with(values)))
 
     def sent(self, values: Mapping[str, bytes]) -> None:
@@ -52,12 +53,12 @@ class Rpdo:
 
 
 def is_gap(entry: PdoEntry) -> bool:
-    """Return whether a mapped entry is a gap and not an object."""
+    """Return whether a mapped entry is a dummy entry that only fills a gap."""
     return entry.index <= DUMMY_MAX
 
 
 def tags_in(mapping: PdoMapping, by_object: ObjectTags) -> tuple[str, ...]:
-    """Return the tag of each mapped object; "" for a gap and for an object without a tag of this size."""
+    """Return the tag of each mapped object, or "" for a gap and for an object that has no tag of this size."""
     return tuple(_tag_of(entry, by_object) for entry in mapping.entries)
 
 
@@ -71,10 +72,11 @@ def _tag_of(entry: PdoEntry, by_object: ObjectTags) -> str:
 def usable(
     held: Collection[PdoConfig], by_object: ObjectTags, writable: Collection[str], taken: Collection[str] = ()
 ) -> list[PdoConfig]:
-    """Return those of a node's RPDOs that we may send: enabled, each object in `writable`, and no tag in two of them.
+    """Return the RPDOs of a node that the gateway may send.
 
-    `taken` are tags that another RPDO carries already: a second RPDO would restore the value that the first changed.
-    The RPDO with the most tags comes first, so that related values go in one frame.
+    Such an RPDO is enabled, each of its objects is in `writable`, and no tag is in two RPDOs: the second one would restore the
+    value that the first one changed. `taken` are tags that another RPDO already carries. The RPDO with the most tags comes first,
+    so that related values are sent in one frame.
     """
     candidates = []
     for config in held:

@@ -75,8 +75,7 @@ def _decode_number(tag: Tag, ordered: bytes, data: bytes, t_ns: int) -> TagValue
 
 
 def _odd_number(tag: Tag, ordered: bytes) -> int | None:
-    """Return the number in decimal digits, or in some bits, of big-endian bytes; None for an invalid digit (a BCD digit
-    above 9)."""
+    """Return the number that big-endian bytes hold as BCD digits or in some of their bits; None for a BCD digit above 9."""
     if tag.type.startswith("bcd"):
         digits = ordered.hex()
         return int(digits) if digits.isdigit() else None
@@ -86,8 +85,7 @@ def _odd_number(tag: Tag, ordered: bytes) -> int | None:
 
 
 def apply_scale(tag: Tag, value: TagValue, exponent: TagValue | None) -> TagValue:
-    """Return `value` times ten to the power in its scale-factor register (SunSpec). Without a valid factor the value is
-    bad, not unscaled."""
+    """Return `value` times ten to the power of its scale-factor register (SunSpec). Without a valid factor the value is bad."""
     if not isinstance(value.value, int | float):
         return value
     if exponent is None or not isinstance(exponent.value, int) or not -10 <= exponent.value <= 10:

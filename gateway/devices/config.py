@@ -11,12 +11,11 @@ from fieldtwin.gateway.devices.canopen_config import CanopenBusConfig, CanopenNo
 
 @dataclass(frozen=True)
 class BusConfig:
-    """A bus and the plant's endpoint for it. `bitrate` (bit/s) is for CAN only; the fields after it are for Modbus.
+    """A bus and its endpoint in the plant. `bitrate` (bit/s) is for CAN only; the fields after it are for Modbus.
 
-    `spacing_s` is a pause after every exchange, `turnaround_s` a pause after a broadcast, `connect_pause_s` a pause
-    after the connection was opened. `echo`: sent bytes are received back first. `strict`: RTU silences as in SL
-    2.5.1.1. `probe_share` is the largest share of the bus's time that goes to devices that do not answer while other
-    devices do.
+    `spacing_s` is a pause after every exchange, `turnaround_s` a pause after a broadcast, `connect_pause_s` a pause after the
+    connection was opened. `echo` says that the adapter returns the bytes sent. `strict` applies the RTU silences of SL 2.5.1.1.
+    `probe_share` limits the share of the bus's time that is spent on devices that do not answer, as long as other devices do.
     """
 
     name: str
@@ -37,7 +36,7 @@ class BusConfig:
 class Heartbeat:
     """CANopen heartbeat times in milliseconds: the node's producer time and our consumer time.
 
-    `producer_ms` None: the node's producer time (1017h) is not changed, and the gateway only listens.
+    If `producer_ms` is None, the gateway does not change the node's producer time (1017h) and only listens.
     """
 
     producer_ms: int | None
@@ -46,7 +45,7 @@ class Heartbeat:
 
 @dataclass(frozen=True)
 class Tpdo:
-    """The tags that TPDO1 of a node is to carry, and its event timer in milliseconds."""
+    """The tags that TPDO1 of a node has to carry, and its event timer in milliseconds."""
 
     tags: tuple[str, ...]
     event_ms: int
@@ -56,10 +55,10 @@ class Tpdo:
 class DeviceConfig:
     """A device of the system. `address` is the Modbus unit ID (1 to 255) or the CANopen node ID (1 to 127).
 
-    `poll` gives each group's period in milliseconds; a group without one is read once after connecting. `phase` is the
-    offset within its period at which a group is read, in milliseconds; the other groups are spread evenly. `timeout_s`
-    and `retries` None: as configured for the bus. `spacing_s` is the device's pause after each exchange with it. A
-    device that does not answer is left alone for `backoff_first_s`, then twice as long, up to `backoff_limit_s`.
+    `poll` gives each group's period in milliseconds; a group without one is read once after connecting. `phase` is the offset
+    within its period at which a group is read, in milliseconds; the other groups are spread evenly. `timeout_s` and `retries`
+    replace the settings of the bus unless they are None. `spacing_s` is the pause that the device needs after each exchange. A
+    device that does not answer is not asked for `backoff_first_s`, then for twice as long each time, up to `backoff_limit_s`.
     `writable` holds the tags that the system file allows to be written, and `safe` the values that are written when the
     controller is lost.
     """
@@ -88,6 +87,6 @@ class DeviceConfig:
 
     @property
     def where(self) -> str:
-        """Device, bus and address, for messages."""
+        """Return device, bus and address, for messages."""
         kind = "unit" if self.profile.protocol == "modbus" else "node"
         return f"{self.name} ({self.bus} {kind} {self.address})"

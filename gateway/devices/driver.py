@@ -1,7 +1,7 @@
-"""SPEC row DeviceDriver: one concrete connection, an emitter and a consumer.
+"""SPEC row DeviceDriver: a driver with one concrete connection, an emitter and a consumer.
 
-Send is consume ; write. Receive is read ; emit. A driver opens no connection (it is attached to one that the runtime
-opened through a Connector), uses only the clock it is given, and cannot distinguish an emulator from the device.
+Send is "consume, then write"; Receive is "read, then emit". A driver opens no connection: the runtime opens it through a
+Connector and attaches the driver. It uses only the clock that it is given, and cannot distinguish an emulator from the device.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from fieldtwin.gateway.devices.config import DeviceConfig
 
 
 class TagSink(Protocol):
-    """The destination of a driver's values: the runtime's tag table."""
+    """The interface to which a driver passes its values: the runtime's tag table."""
 
     def put(self, name: str, value: TagValue) -> None:
         """Store the newest value of the tag `name` (``device.tag``)."""
@@ -44,23 +44,23 @@ class DeviceDriver(ABC):
 
     @property
     def command_list(self) -> frozenset[str]:
-        """The commands that this driver can send to its device; a quirk may add to those of the profile."""
+        """Return the commands that this driver can send to its device: those of the profile, and those that a quirk adds."""
         return self.profile.command_list
 
     @property
     def connection(self) -> ByteConnection | CanConnection:
-        """The connection that this driver is attached to."""
+        """Return the connection that this driver is attached to."""
         if self._connection is None:
             raise Bug("a driver without a connection was used", where=self.config.where)
         return self._connection
 
     @property
     def tag_names(self) -> list[str]:
-        """The full names of all tags that this driver publishes."""
+        """Return the full names of all tags that this driver publishes."""
         return [f"{self.config.name}.{t.name}" for t in self.profile.tags.values() if t.readable]
 
     def attach(self, connection: ByteConnection | CanConnection) -> None:
-        """Init: use this connection from now on; items that waited to be sent over an earlier one stay queued."""
+        """Use this connection from now on (Init). Items that were not sent over an earlier connection stay queued."""
         if connection.inbound.type not in self.wire_types:
             raise FileInvalid(
                 f"device {self.config.name!r} does not fit this bus",
@@ -71,8 +71,11 @@ class DeviceDriver(ABC):
         self._connection = connection
 
     def reconfigure(self, config: DeviceConfig) -> None:
-        """Use `config` from now on: the same device at the same address, with different limits, scaling or timing. Must
-        not be called while something is being read or written."""
+        """Use `config` from now on.
+
+        It describes the same device at the same address, with different limits, scaling or timing. Must not be called during a
+        read or write.
+        """
         self.config, self.profile = config, config.profile
 
     def check(self, command: COMMAND) -> None:
@@ -88,7 +91,7 @@ class DeviceDriver(ABC):
         raise NotAllowed(f"the tag {tag_name!r} cannot be written", where=self.config.where)
 
     def behaviour(self, name: str) -> tuple[COMMAND, ...]:
-        """Return the commands that the profile maps to a named behaviour, in its order (SPEC ruling 14).
+        """Return the commands that the profile maps to a named behaviour, in the profile's order (SPEC ruling 14).
 
         Raises `NotAllowed` for a name that the profile does not have, and otherwise as `command`.
         """
@@ -99,18 +102,17 @@ class DeviceDriver(ABC):
         return tuple(self.command(form.commands[command], value) for command, value in form.behaviours[name].items())
 
     def change_behaviour(self, name: str) -> int:
-        """ChangeBehavior: queue the behaviour's commands, all of them or none, and return how many. Raises as
-        `behaviour`."""
+        """Queue all commands of a behaviour, or none, and return their number (ChangeBehavior). Raises as `behaviour`."""
         commands = self.behaviour(name)
         for command in commands:
             self.consumer.observe(command)
         return len(commands)
 
     async def send(self) -> None:
-        """Send: consume ; write. The consumer's queue must not be empty.
+        """Consume one item and write it to the device (Send). The consumer's queue must not be empty.
 
-        An item that the device or the configuration refused is dropped; an item that a communication error lost stays
-        first in the queue.
+        An item that the device or the configuration refused is dropped. After a communication error, the item stays first in the
+        queue.
         """
         item = self.consumer.consume()
         try:
@@ -122,13 +124,16 @@ class DeviceDriver(ABC):
             raise
 
     async def receive(self, what: str) -> None:
-        """Receive: read ; emit. `what` is a poll group, or anything else that the driver reads by name."""
+        """Read from the device and emit what occurred (Receive).
+
+        `what` is a poll group, or another name that the driver can read.
+        """
         for item in await self._read(what):
             self.emitter.emit(item)
 
     @abstractmethod
     async def _write(self, item: DATA) -> None:
-        """Carry out what was consumed. Raises communication errors or errors of the device."""
+        """Write the consumed item to the device. Raises communication errors or errors of the device."""
 
     @abstractmethod
     async def _read(self, what: str) -> list[DATA]:

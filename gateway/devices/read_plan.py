@@ -1,10 +1,10 @@
-"""How a poll group is read: in the fewest transactions, and without the gaps that the device was found to have.
+"""The plan by which a poll group is read: with the fewest transactions, and without the gaps that the device was found to have.
 
-Neighbouring registers are read together, over gaps up to a profile's `max_gap`. A device that refuses such a read with
-exception 02 (address) or 03 (too many) has a gap in it or a limit of its own. The read is then halved until each part
-is accepted or is a single value. What was proved on the way is kept and offered for the profile (case 25 of the
-test-case list). A gap is proved when both sides of it are accepted and the two together are not. A value or a message
-is never split over two transactions.
+Neighbouring registers are read together, over gaps up to a profile's `max_gap`. A device that refuses such a read with exception
+02 (address) or 03 (too many) has a gap in it or a limit of its own. The read is then halved until each part is accepted or is a
+single value. The gaps that this proves are kept and offered for the profile (case 25 of the test-case list). A gap is proved when
+the device accepts the reads on both sides of it, but not the two joined. A value or a message is never split over two
+transactions.
 """
 
 from __future__ import annotations
@@ -31,12 +31,15 @@ class Read:
 
     @cached_property
     def places(self) -> tuple[tuple[Tag, slice], ...]:
-        """Each tag with the position of its bytes in the data of the read."""
+        """Return each tag with the position of its bytes in the data of the read."""
         return tuple((tag, place_of(tag.registers, self.range)) for tag in self.tags)
 
     @property
     def members(self) -> list[Member]:
-        """The tags and messages that are read, by address; the longer first if two begin at one address."""
+        """Return the tags and messages that are read, sorted by address.
+
+        If two begin at one address, the longer one comes first.
+        """
         both: list[Member] = [(t.registers, t) for t in self.tags]
         both += [(m.at, m) for m in self.messages]
         return sorted(both, key=lambda m: (m[0].address, -m[0].count))
@@ -51,7 +54,7 @@ def place_of(at: RegisterRange, read: RegisterRange) -> slice:
 
 @dataclass
 class Learnt:
-    """The gaps and limits that a device's refusals have shown, over all its poll groups.
+    """The gaps and limits that a device's refusals have shown, for all its poll groups.
 
     `gaps` are ranges between two values that no read may cover. A gap of 0 registers is a border: a new read begins
     after it (the device accepts fewer registers per read than the profile states). `missing` are tags that the device
@@ -73,7 +76,7 @@ class Learnt:
         self.changes += bool(new)
 
     def found(self, tags: Sequence[str]) -> bool:
-        """Note tags that were read; return True if one of them was missing before."""
+        """Note that these tags were read; return True if at least one of them was missing before."""
         back = [t for t in tags if t in self.missing]
         self.missing = [t for t in self.missing if t not in back]
         self.changes += bool(back)
@@ -81,7 +84,7 @@ class Learnt:
 
     @property
     def profile_gaps(self) -> tuple[RegisterRange, ...]:
-        """The gaps as a profile states them, by address; borders are not included."""
+        """Return the gaps in the form of a profile, sorted by address, without borders."""
         return tuple(sorted((g for g in self.gaps if g.count), key=lambda g: (g.table, g.address)))
 
 
@@ -139,8 +142,9 @@ def _read(profile: DeviceProfile, members: Sequence[Member]) -> Read:
 
 
 def split(profile: DeviceProfile, read: Read) -> tuple[Read, Read] | None:
-    """Split `read` in two, at the border nearest to its middle that cuts no value (nor pair, if the device only
-    supports pairs); return None if there is no such border."""
+    """Return the two parts of `read`, or None if it cannot be split.
+
+    It is split as near to its middle as possible without cutting a value (or a pair, if the device only supports pairs)."""
     members = read.members
     borders: list[tuple[int, int]] = []
     end = _paired(profile, members[0][0]).end
@@ -157,8 +161,10 @@ def split(profile: DeviceProfile, read: Read) -> tuple[Read, Read] | None:
 
 @dataclass
 class _Split:
-    """A refused read and its two parts. `taken` are the parts that the device accepted; with both, the gap is
-    proved."""
+    """A refused read and its two parts.
+
+    `taken` are the parts that the device accepted; if it accepted both, the gap is proved.
+    """
 
     first: Read
     second: Read
@@ -167,7 +173,7 @@ class _Split:
 
 
 class GroupPlan:
-    """A poll group's reads, as planned and as learnt. `learnt` is shared by all groups of a device."""
+    """The reads of a poll group, adapted to the device's refusals. All groups of a device share `learnt`."""
 
     def __init__(self, profile: DeviceProfile, group: str, learnt: Learnt | None = None) -> None:
         self.learnt = learnt if learnt is not None else Learnt()
@@ -179,13 +185,13 @@ class GroupPlan:
         self.plan_again()
 
     def plan_again(self) -> None:
-        """Make the plan from the profile and what is learnt by now. Missing tags are asked for again."""
+        """Make the plan from the profile and from `learnt`. Missing tags are requested again."""
         self.reads = list(plan_reads(self._profile, self._group, self.learnt))
         self._splits.clear()
         self._refused_any = self._found_any = False
 
     def refused(self, read: Read, code: int = ILLEGAL_ADDRESS) -> tuple[Read, ...]:
-        """Return what to read instead, after the device refused `read` with exception `code`.
+        """Return the reads that replace `read`, which the device refused with exception `code`.
 
         The result is empty when a single value is refused: it is left out of the plan.
         """
@@ -212,10 +218,10 @@ class GroupPlan:
             del self._splits[first], self._splits[second]
 
     def pass_ended(self) -> None:
-        """End a pass, in which every read was answered or refused.
+        """End a pass, in which the device answered or refused every read.
 
-        After a refusal, reads that were halved without need are joined again, and missing tags stay out. If no read is
-        left, one value is still asked for: when the device has it, it may also have the others.
+        If it refused a read, halves that need not be separate are joined again, and missing tags are left out. If no read is
+        left, one value is still requested: when the device has that value, it may also have the other ones.
         """
         if self._found_any:
             self.plan_again()

@@ -36,8 +36,7 @@ NOTHING_READ = 1 << 16
 
 
 class GroupReading:
-    """A poll group that is being read, transaction by transaction. `items` holds what occurred, once the reading is
-    complete."""
+    """A poll group that is being read, transaction by transaction. When the reading is complete, `items` holds what occurred."""
 
     __slots__ = ("blocks", "items", "todo", "values", "what")
 
@@ -51,17 +50,17 @@ class GroupReading:
 
 @dataclass
 class Progress:
-    """How far the writing of several tags got: the tags that were sent, and the tags that the device confirmed."""
+    """The progress of writing several tags: the tags that were sent, and the tags that the device confirmed."""
 
     sent: set[str] = field(default_factory=set)
     confirmed: set[str] = field(default_factory=set)
 
 
 class RegisterDriver(DeviceDriver):
-    """A driver of a Modbus device, made from its profile.
+    """A driver of a Modbus device, created from its profile.
 
-    `receive` reads a whole group. Where other devices share the bus, call `begin`, then `read_next` until it returns
-    True, which carries out one transaction each time, then `finish`, which emits what occurred.
+    `receive` reads a whole group. If other devices share the bus, call `begin`, then `read_next` until it returns True, then
+    `finish`, which emits what occurred. Each call of `read_next` carries out one transaction.
     """
 
     wire_types = frozenset({PROTOCOL.RS232, PROTOCOL.TCP})
@@ -84,12 +83,12 @@ class RegisterDriver(DeviceDriver):
 
     @property
     def message_tag(self) -> str | None:
-        """The full name of the message that this driver emits, or None."""
+        """Return the full name of the message that this driver emits, or None."""
         return next((f"{self.config.name}.{name}" for name in self.profile.messages), None)
 
     @property
     def client(self) -> ModbusClient:
-        """The Modbus client of the bus that this device is connected to."""
+        """Return the Modbus client of the bus that this device is connected to."""
         if self._client is None:
             raise Bug("a driver without a client was used", where=self.config.where)
         return self._client
@@ -111,20 +110,24 @@ class RegisterDriver(DeviceDriver):
             self._client.set_pace(config.address, UnitPace(config.timeout_s, config.spacing_s))
 
     def understood(self, tag_name: str, held: TagValue, of: TagValue | None) -> TagValue:
-        """Decode a tag's stored bytes under the present configuration; `of` is the value of the tag that scales it."""
+        """Return the value of a tag's stored bytes, decoded with the present configuration.
+
+        `of` is the value of the tag that scales it."""
         tag = self.profile.tags[tag_name]
         value = decode(tag, held.raw, held.t_ns)
         return apply_scale(tag, value, of) if tag.scale_by is not None else value
 
     def know(self, learnt: Learnt) -> None:
-        """Take over the gaps and missing tags that were learnt in an earlier run, before anything is read. Missing tags
-        are read once more."""
+        """Take over the gaps and missing tags that an earlier run learnt.
+
+        Call it before the first read. Missing tags are requested once more.
+        """
         self.learnt.gaps = list(learnt.gaps)
         self.learnt.missing = list(learnt.missing)
         self.ask_again()
 
     def ask_again(self) -> None:
-        """Plan to read tags again that the device did not have: after an absence it may have them."""
+        """Request missing tags again, because the device may have them after it was absent."""
         for plan in self.plans.values():
             plan.plan_again()
 
@@ -156,21 +159,22 @@ class RegisterDriver(DeviceDriver):
             )
 
     def cost(self, what: str) -> int:
-        """Return how many registers or bits the first transaction of the group `what` reads: the cost of a failed try.
+        """Return the number of registers or bits that the first transaction of the group `what` reads: the cost of a failed
+        attempt.
 
-        A group that reads nothing shows nothing about the device, so its cost is higher than any other.
+        A group that reads nothing cannot show whether the device is present, so its cost is higher than any other.
         """
         plan = self.plans.get(what)
         return plan.reads[0].range.count if plan is not None and plan.reads else NOTHING_READ
 
     def begin(self, what: str) -> GroupReading:
-        """Start to read the poll group `what`. Nothing is sent yet."""
+        """Prepare to read the poll group `what`. Nothing is sent yet."""
         return GroupReading(what, self.plans[what].reads)
 
     async def read_next(self, reading: GroupReading) -> bool:
         """Carry out one transaction of `reading`. Return True when it was the last one and all values are published.
 
-        When it raises an error, the same transaction is next, so it may be tried again.
+        After an error, the next call repeats the same transaction.
         """
         if reading.todo:
             await self._read_block(reading)
@@ -212,7 +216,7 @@ class RegisterDriver(DeviceDriver):
             values[tag.name] = self._decode(tag, raw[place], t_ns)
 
     def _decode(self, tag: Tag, raw: bytes, t_ns: int) -> TagValue:
-        """Decode as `codec.decode` does, but call it only when the bytes differ from the last ones."""
+        """Return the value as `codec.decode` does, which is called only if the bytes differ from the last ones."""
         last = self._decoded.get(tag.name)
         if last is not None and last.raw == raw:
             return TagValue(last.value, last.quality, last.reason, t_ns, raw)
@@ -257,7 +261,7 @@ class RegisterDriver(DeviceDriver):
         return form.wait_ms if form is not None and form.poll == group else 0
 
     async def trigger(self) -> None:
-        """Make the device measure. This is a write, so it is allowed only with `may_trigger`."""
+        """Start a measurement of the device. This is a write, so it is allowed only with `may_trigger`."""
         form = self.profile.form.trigger
         if form is None or not self.may_trigger:
             raise NotAllowed("this device may not be triggered", where=self.config.where)
@@ -266,10 +270,9 @@ class RegisterDriver(DeviceDriver):
     # -- samples ----------------------------------------------------------------------------------------------------
 
     def _note_sample(self, values: dict[str, TagValue]) -> bool:
-        """Distinguish a new sample from an old one, and set the age of every value of the group. Return True for a new
-        sample.
+        """Return whether the values are a new sample, and set the age of every value of the group.
 
-        The first count is only a baseline: the age of that sample is unknown.
+        The first count is only a baseline, because the age of that sample is unknown.
         """
         sampled = self.profile.sampled
         assert sampled is not None
@@ -309,8 +312,7 @@ class RegisterDriver(DeviceDriver):
     # -- writing ------------------------------------------------------------------------------------------------------
 
     async def _write(self, item: DATA) -> None:
-        """Write a command's tag with one request and read it back, so that the published value is what the device
-        holds."""
+        """Write a command's tag with one request and read it back, so that the published value is the one in the device."""
         if not isinstance(item, COMMAND):
             raise Bug("a register device accepts only commands", got=type(item).__name__, where=self.config.where)
         self.check(item)
@@ -331,10 +333,10 @@ class RegisterDriver(DeviceDriver):
                 )
 
     async def write_together(self, commands: Sequence[COMMAND], progress: Progress) -> None:
-        """Write the tags of `commands` and read each of them back: with one request if their registers, or coils, are
-        adjacent, otherwise one after another in their order.
+        """Write the tags of `commands` and read each of them back.
 
-        When this raises an error, it may be called again with the same `progress` for the remaining tags.
+        One request writes tags whose registers, or coils, are adjacent. Other tags are written one after another in their order.
+        After an error, call this again with the same `progress` to write the remaining tags.
         """
         tags = [self._tag_of(command) for command in commands]
         data = {tag.name: command.data for tag, command in zip(tags, commands, strict=True)}
@@ -375,8 +377,11 @@ class RegisterDriver(DeviceDriver):
             await self.client.write_registers(self.config.address, first.address, words)
 
     async def _write_tag(self, tag: Tag, data: bytes) -> None:
-        """Write a tag's registers with one request: function 10h, or 06 if the device does not support 10h; a coil with
-        05, or with 0Fh if the device does not support 05."""
+        """Write a tag with one request.
+
+        Registers are written with function 10h, or 06 if the device does not support 10h; a coil with 05, or 0Fh if the device
+        does not support 05.
+        """
         at = tag.registers
         functions = self.profile.form.limits.functions
         if at.table == "coil" and functions is not None and 5 not in functions:
@@ -401,5 +406,5 @@ class SensorDriver(RegisterDriver):
 
 
 def _cells(reply: BitsReply | RegistersReply) -> bytes:
-    """Return the bytes of registers as they were received; bits as one byte each."""
+    """Return registers as the bytes that were received, and bits as one byte each."""
     return bytes(reply.bits) if isinstance(reply, BitsReply) else reply.raw

@@ -1,12 +1,12 @@
 """SPEC row TransmitterDriver: a pure relay between two mailboxes and two queues (SPEC ruling 17).
 
-A mailbox holds one message: sequence, length and payload, in holding registers that are written with one request. The
-sequence that the receiver acknowledges is in a separate register. 0 means empty; sequences run from 1 to 65535 and then
-start again at 1. A message whose sequence equals the acknowledged one was already taken: duplicates are discarded, and
-the same command sent twice is two commands.
+A mailbox holds one message: sequence, length and payload, in holding registers that are written with one request. The sequence
+that the receiver acknowledges is in a separate register. 0 means empty; sequences run from 1 to 65535 and then start again at 1.
+A message whose sequence equals the acknowledged one is a duplicate and is discarded. A command that is sent twice has two
+sequences and counts as two commands.
 
-The plant's end and the topside end use this same class. At the topside end, COMMANDs come in and RESPONSEs go out; at
-the plant's end it is the reverse. Payloads are never interpreted.
+The plant's end and the topside end use this same class. The topside end receives COMMANDs and sends RESPONSEs; the plant's end
+does the reverse. Payloads are never interpreted.
 """
 
 from __future__ import annotations
@@ -65,15 +65,15 @@ class TransmitterDriver(RegisterDriver):
 
     @property
     def outbox_tag(self) -> str:
-        """The name under which the control logic sends through this transmitter."""
+        """Return the name under which the control logic sends through this transmitter."""
         return f"{self.config.name}.outbox"
 
     async def synchronise(self) -> None:
-        """After (re)connecting, read from the device what was taken on either side, so that no message is handled
-        twice.
+        """Read from the device which messages each side has taken, so that no message is handled twice. Call it after each
+        (re)connection.
 
-        A message that was emitted here and is not acknowledged keeps that state, and so does one that was taken before.
-        A message that was written but whose reply was lost counts as sent.
+        An emitted message that is not acknowledged yet keeps that state, and so does a message that was taken before. A message
+        that was written, but whose reply was lost, counts as sent.
         """
         unit, inbox = self.config.address, self._inbox.at
         held = await self.client.read_registers(unit, "holding", inbox.address, inbox.count)
@@ -125,13 +125,13 @@ class TransmitterDriver(RegisterDriver):
         return [self._incoming(reply.raw[4 : 4 + length])]
 
     async def acknowledge(self) -> None:
-        """Acknowledge the emitted message to the transmitter; its mailbox is then free for the next one."""
+        """Acknowledge the emitted message to the transmitter; its mailbox is then free for the next message."""
         if self.to_acknowledge:
             await self.client.write_registers(self.config.address, self._inbox.ack.address, [self.to_acknowledge])
             self.to_acknowledge = 0
 
     async def check_outbox(self) -> bool:
-        """Ask whether the transmitter took the last message. If the mailbox is still full, this counts as a wait."""
+        """Read whether the transmitter took the last message. If the mailbox is still full, this counts as a wait."""
         reply = await self.client.read_registers(self.config.address, "holding", self._outbox.ack.address, 1)
         free = reply.registers[0] == self._sent
         self.taken += free and not self.outbox_free

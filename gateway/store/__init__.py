@@ -1,1 +1,1 @@
-"""Databases of exchanges and knowledge: SQLite and PostgreSQL."""
+"""The databases of exchanges and events: SQLite and PostgreSQL."""

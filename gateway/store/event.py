@@ -1,4 +1,4 @@
-"""Events, of which the stored knowledge consists, and the interface of the store, whatever its database.
+"""Events, of which the stored knowledge consists, and the interface of the store, independent of the database.
 
 An event is a value with its quality, a command, a refusal, a state, a verdict, a payload as received, or a record that
 some events were lost. Events of one origin are numbered from 1 without gaps: two stores hold the same knowledge of an
@@ -44,8 +44,10 @@ Value = None | int | float | str | bytes
 
 
 class Event(NamedTuple):
-    """One event of an origin. `sequence` is 0 until it is in a log; `t_ms` is UTC in milliseconds; for the rest see
-    `Kind`."""
+    """One event of an origin.
+
+    `sequence` is 0 until the event is in a log. `t_ms` is UTC in milliseconds. `Kind` describes the other fields.
+    """
 
     sequence: int
     t_ms: int
@@ -57,7 +59,7 @@ class Event(NamedTuple):
 
 
 def of_tag(t_ms: int, name: str, value: TagValue) -> Event:
-    """Return a tag's value as an event. NaN, which is not a value for a database, becomes None with a reason."""
+    """Return a tag's value as an event. NaN, which databases cannot store, becomes None with a reason."""
     kept, quality, reason = plain(value.value), value.quality, value.reason
     if isinstance(value.value, float) and math.isnan(value.value) and quality < Quality.BAD:
         quality, reason = Quality.BAD, Reason.NOT_A_NUMBER
@@ -65,8 +67,7 @@ def of_tag(t_ms: int, name: str, value: TagValue) -> Event:
 
 
 def plain(value: Scalar | None) -> Value:
-    """Return `value` as stores and threads keep it: 0 and 1 for a bool, None for NaN, a float for an integer beyond 64
-    bits."""
+    """Return `value` as stores and digital threads hold it: 0 or 1 for a bool, None for NaN, a float for more than 64 bits."""
     if isinstance(value, bool):
         return int(value)
     if isinstance(value, int):
@@ -84,7 +85,7 @@ class StoreFull(Unreachable):
 
 
 class KnowledgeStore(Protocol):
-    """A store for events of several origins. Every method may raise `Unreachable` (`StoreFull` if room is lacking).
+    """A store for events of several origins. Every method may raise `Unreachable` (`StoreFull` if there is no room).
 
     When a method has returned, its change is permanent: it survives a killed process and a power failure.
     """
@@ -93,34 +94,39 @@ class KnowledgeStore(Protocol):
         """Return the origin under which this side of `system` writes: the existing one, or a new one named
         ``name:log``.
 
-        `prototype` is part of the identity of an origin (SPEC ruling 15). `log` distinguishes a new store from an
-        earlier one.
+        `prototype` is part of the identity of an origin (SPEC ruling 15). `log` distinguishes a new store from an earlier store
+        of the same name.
         """
         ...
 
     async def origins(self, system: str = "") -> dict[str, bool]:
-        """Return every origin in the store, and whether its events come from a prototype. With `system`: the origins of
-        that system, and those for which an older store does not record the system."""
+        """Return every origin in the store, and whether its events come from a prototype.
+
+        With `system`, return only the origins of that system, and those for which an older store does not record the system."""
         ...
 
     async def append(self, origin: str, events: Sequence[Event]) -> int:
-        """Number `events` and store all of them or none; return the last number. Only the writer of this origin's log
-        calls this."""
+        """Number `events`, store all of them or none, and return the last number.
+
+        Only the writer of this origin's log may call this.
+        """
         ...
 
     async def keep(self, origin: str, events: Sequence[Event], *, system: str = "", prototype: bool = False) -> int:
-        """Store numbered events of another writer's log, of `system`; return how many were new. A repeated event is
-        stored once."""
+        """Store numbered events from the log of another writer in `system`; return the number of new events.
+
+        A repeated event is stored once.
+        """
         ...
 
     async def span(self, origin: str) -> tuple[int, int]:
-        """Return the first and the last number of an origin's events that are not forgotten; (1, 0) if there are
-        none."""
+        """Return the numbers of the first and the last stored event of an origin; (1, 0) if there are none."""
         ...
 
     async def gaps(self, origin: str) -> list[tuple[int, int]]:
-        """Return the ranges of missing numbers up to the last, each as first and last; events known to be lost are not
-        included."""
+        """Return the ranges (first, last) of missing numbers up to the last event, except those of events that are known to be
+        lost.
+        """
         ...
 
     async def read(self, origin: str, first: int, limit: int) -> list[Event]:
@@ -132,15 +138,15 @@ class KnowledgeStore(Protocol):
         ...
 
     async def note_lost(self, origin: str, first: int, last: int) -> None:
-        """Note that the writer no longer has these events: they are lost, and no longer count as gaps."""
+        """Note that the writer no longer has these events, so they no longer count as gaps."""
         ...
 
     async def forget(self, origin: str, through: int) -> int:
-        """Delete an origin's events up to a number; return how many there were."""
+        """Delete an origin's events up to a number; return how many were deleted."""
         ...
 
     def room_bytes(self) -> int | None:
-        """Return how many more bytes fit, as far as this is known; otherwise None."""
+        """Return the number of free bytes, or None if it is unknown."""
         ...
 
     async def aclose(self) -> None:
@@ -160,7 +166,7 @@ def merged(ranges: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
 
 
 def without(ranges: Iterable[tuple[int, int]], holes: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Return `ranges` without what is in `holes`, in order."""
+    """Return the parts of `ranges` that are not in `holes`, in order."""
     out = merged(ranges)
     for hole_first, hole_last in merged(holes):
         parts: list[tuple[int, int]] = []

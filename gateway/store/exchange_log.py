@@ -1,9 +1,8 @@
 """The exchange log: the control logic's dataLog, kept in SQLite.
 
-The PLC logs what it exchanged while its period was positive (SPEC ruling 1) and sends each record through the process
-image; here the records are stored in order, duplicates included. Rows are committed in batches, outside the event
-loop's critical path: `append` only queues, and `flush` writes. The queue is limited, and rows that do not fit are
-counted.
+While its period is positive, the PLC logs each exchanged message (SPEC ruling 1) and sends the record through the process image.
+This module stores the records in order, duplicates included. Rows are committed in batches, outside the event loop's critical
+path: `append` only queues, and `flush` writes. The queue is limited, and rows that do not fit are counted.
 """
 
 from __future__ import annotations
@@ -23,8 +22,8 @@ KNOWN = 1_000
 class ExchangeLog:
     """One database file. `dropped` counts rows that did not fit the queue.
 
-    A gateway process that is killed leaves neither gaps nor duplicates: it reports to the PLC only rows that are stored
-    (`pending`). Its successor receives the other rows again, and leaves out those that were stored but not reported.
+    A killed gateway process leaves neither gaps nor duplicates, because it reports to the PLC only rows that are stored
+    (`pending`). The next gateway process receives the other rows again, and ignores those that were stored but not reported.
     """
 
     def __init__(self, path: Path, *, system: str, prototype: bool) -> None:
@@ -71,21 +70,23 @@ class ExchangeLog:
 
     @property
     def waiting(self) -> int:
-        """How many rows are queued."""
+        """Return the number of queued rows."""
         return len(self._queue)
 
     def pending(self, tag: str) -> int:
         """Return how many rows of `tag` are lost if this process is killed now, so that the PLC has to keep them.
 
-        The result is 0 while the disk refuses: up to `QUEUE` rows are kept here then, so that the PLC can continue.
+        The result is 0 while writing to the disk fails; this object then keeps up to `QUEUE` rows, so that the PLC can continue.
         """
         if self._refused or self._volatile:
             return 0
         return self._pending[tag] + sum(row[0] == tag for row in tuple(self._queue))
 
     def flush(self) -> int:
-        """Write the queued rows in one transaction and return their number. Raises `Unreachable` if the disk refuses;
-        the rows stay queued."""
+        """Write the queued rows in one transaction and return their number.
+
+        Raises `Unreachable` if the write fails; the rows stay queued.
+        """
         count = len(self._queue)
         if not count:
             return 0

@@ -1,4 +1,4 @@
-"""Opening the knowledge store: a file's path, or the URL of a PostgreSQL database."""
+"""Open the knowledge store from the path of a file or the URL of a PostgreSQL database."""
 
 from __future__ import annotations
 
@@ -22,8 +22,10 @@ def check_place(place: str) -> None:
 
 
 async def open_knowledge(place: str, *, max_bytes: int = 0, offload: Offload | None = None) -> KnowledgeStore:
-    """Open a store at a path or URL. `max_bytes` and `offload` are for files. Raises `Unreachable`, `FileInvalid`,
-    `UsageError`."""
+    """Open the store at a path or URL.
+
+    `max_bytes` and `offload` apply to files only. Raises `Unreachable`, `FileInvalid`, `UsageError`.
+    """
     if not place.startswith(URLS):
         return await SqliteKnowledge.open(Path(place), max_bytes=max_bytes, offload=offload)
     check_place(place)

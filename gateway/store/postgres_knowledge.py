@@ -1,6 +1,6 @@
 """Knowledge in a PostgreSQL database, for twins that share one server (the extra `postgres`).
 
-Everything is in a separate schema, `fieldtwin`, which also holds its version. One connection is used; it is opened
+All tables are in a separate schema, `fieldtwin`, which also holds the schema's version. One connection is used; it is opened
 again after it was lost.
 """
 

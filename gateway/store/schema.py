@@ -1,7 +1,7 @@
 """The numbered schemas of our SQLite files, and the migration of an old file.
 
-Each number is a script in this folder, run once, in one transaction with the number itself: a file has one version or
-the next, never an intermediate state. A file that a newer fieldtwin wrote is not changed.
+Each version has a script in this folder. The script runs once, in the transaction that also stores the new version number, so a
+file never has an intermediate state. A file that a newer fieldtwin wrote is not changed.
 """
 
 from __future__ import annotations
@@ -22,8 +22,10 @@ def script(number: int) -> str:
 
 
 def refuse_newer(db: sqlite3.Connection, path: Path) -> int:
-    """Return the version of the file, before anything is changed in it. Raises `FileInvalid` for a file that is newer
-    than this program."""
+    """Return the version of the file; call it before the first change.
+
+    Raises `FileInvalid` for a file that is newer than this program.
+    """
     (version,) = db.execute("PRAGMA user_version").fetchone()
     if version > LATEST:
         raise FileInvalid(
@@ -37,7 +39,10 @@ def refuse_newer(db: sqlite3.Connection, path: Path) -> int:
 
 
 def migrate(db: sqlite3.Connection, path: Path) -> None:
-    """Migrate the file to the latest version. `db` is in autocommit mode. Raises `FileInvalid` for a newer one."""
+    """Migrate the file to the latest version.
+
+    `db` is in autocommit mode. Raises `FileInvalid` for a file with a newer version.
+    """
     for number in range(refuse_newer(db, path) + 1, LATEST + 1):
         try:
             db.executescript(f"BEGIN IMMEDIATE;{script(number)}PRAGMA user_version={number};COMMIT;")

@@ -1,6 +1,7 @@
 """Knowledge in a SQLite file (write-ahead log), the default: no server, one file, readable while it is written.
 
-Work on the file goes through `offload`: a separate thread on the wall clock (`in_thread`), in place under virtual time.
+`offload` carries out the work on the file: in a separate thread in real time (`in_thread`), in the caller's thread in virtual
+time.
 """
 
 from __future__ import annotations
@@ -29,13 +30,12 @@ _COLUMNS = "sequence, t_ms, kind, name, value, quality, reason"
 
 
 async def in_place(work: Work) -> Any:
-    """Run the work at once: for virtual time, in which no threads are used."""
+    """Run the work immediately in the caller's thread, for virtual time, which uses no threads."""
     return work()
 
 
 class SqliteKnowledge:
-    """A SQLite store, see `fieldtwin.gateway.store.event.KnowledgeStore`. `max_bytes` limits the file; 0: only the disk
-    limits it.
+    """A SQLite store, see `fieldtwin.gateway.store.event.KnowledgeStore`. `max_bytes` limits the size of the file; 0: no limit.
 
     ``store = await SqliteKnowledge.open(path)``. Raises `FileInvalid` for a file that is not a fieldtwin store.
     """

@@ -80,7 +80,7 @@ class RecordedObjects:
 
     def __init__(
         self,
-        frames: Iterable[tuple[float, CanFrame]],
+        frames: Iterable[tuple[int, CanFrame]],
         dictionary: Dictionary,
         node_id: int,
         when_used_up: EndOfRecording = EndOfRecording.HOLD,
@@ -129,11 +129,11 @@ class RecordedObjects:
         self._next[key] = at + 1
         return answers[min(at, len(answers) - 1)]
 
-    def _learn(self, frames: Iterable[tuple[float, CanFrame]]) -> None:
-        began_s: float | None = None
-        for t_s, frame in frames:
-            began_s = t_s if began_s is None else began_s
-            self.duration_s = max(t_s - began_s, 0.0)
+    def _learn(self, frames: Iterable[tuple[int, CanFrame]]) -> None:
+        began_ns: int | None = None
+        for t_ns, frame in frames:
+            began_ns = t_ns if began_ns is None else began_ns
+            self.duration_s = max(t_ns - began_ns, 0) / NS_PER_S
             if frame.extended or frame.remote:
                 continue
             if frame.can_id == REQUEST + self._node_id and len(frame.data) == 8:

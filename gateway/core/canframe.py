@@ -103,8 +103,21 @@ class CanFrame(msgspec.Struct, frozen=True, gc=False):
         width = 8 if self.extended else 3
         if self.fd:
             return f"{self.can_id:0{width}X}##{self.brs + 2 * self.esi:X}{self.data.hex().upper()}"
-        body = f"R{self.dlc}" if self.remote else self.data.hex().upper()
+        body = f"R{self.dlc or ''}" if self.remote else self.data.hex().upper()
         return f"{self.can_id:0{width}X}#{body}"
+
+
+def parse_frame(text: str, *, error: bool = False) -> CanFrame:
+    """Parse a classic frame in candump's notation: ``705#7F``, ``605#R8``, eight digits of identifier for the extended format.
+
+    `error` says that it is an error frame. Raises `ValueError` if the text is malformed, and `Desync` if the identifier
+    or the data is too long.
+    """
+    identifier, _, body = text.partition("#")
+    can_id, extended = int(identifier, 16), len(identifier) == 8 and not error
+    if body[:1] in ("R", "r"):
+        return CanFrame(can_id, extended=extended, remote=True, error=error, dlc=int(body[1:] or "0"))
+    return CanFrame(can_id, bytes.fromhex(body), extended=extended, error=error)
 
 
 def pack_record(frame: CanFrame, *, confirmed: bool = False, fd: bool = False) -> bytes:

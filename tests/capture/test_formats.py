@@ -13,7 +13,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from fieldtwin.capture.formats.can_files import SUFFIXES, read_can_file
-from fieldtwin.capture.formats.candump import LeftOut, line_of, read_log
 from fieldtwin.capture.formats.csv_table import import_csv
 from fieldtwin.capture.formats.poll_text import read_polls
 from fieldtwin.capture.recordings.exporting import export
@@ -21,6 +20,7 @@ from fieldtwin.capture.recordings.importing import import_can, import_polls, kin
 from fieldtwin.capture.recordings.rotating_file import exchanges_of
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid, UsageError
+from fieldtwin.gateway.core.files.candump import LeftOut, line_of, read_log
 from fieldtwin.gateway.core.files.profile import load_profile
 from fieldtwin.gateway.core.files.recording import (
     RecordedExchange,

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import pytest
 
-from fieldtwin.capture.formats.candump import line_of
 from fieldtwin.capture.recordings.log_sheet import LogSheet, nodes_of
 from fieldtwin.emulators.canopen.dictionary import parse_eds
 from fieldtwin.emulators.canopen.node import CanopenNode, NodeContext
-from fieldtwin.emulators.replay.can_log import read_can_log
 from fieldtwin.emulators.replay.objects import RecordedObjects
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.files.candump import line_of, read_lines
 
 MS = 1_000_000
 Log = list[tuple[int, CanFrame]]
@@ -47,8 +46,8 @@ def node_of(frames: Log) -> CanopenNode:
     text = LogSheet(frames, 5).eds("a log")
     dictionary = parse_eds(text)
     assert not dictionary.notes, "there is nothing to mend in it"
-    lines = b"".join(line_of(t_ns, f) for t_ns, f in frames).decode().splitlines()
-    objects = RecordedObjects(read_can_log(lines), dictionary, 5)
+    written = read_lines(line_of(t_ns, f) for t_ns, f in frames)
+    objects = RecordedObjects(((t_ns, f) for t_ns, _, f in written), dictionary, 5)
     return CanopenNode(dictionary, 5, NodeContext(source=objects, factory=objects.initial, refusals=objects.refusals))
 
 

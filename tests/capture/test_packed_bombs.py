@@ -16,10 +16,10 @@ import pytest
 
 from fieldtwin.capture.formats import packed
 from fieldtwin.capture.formats.can_files import read_can_file
-from fieldtwin.capture.formats.candump import LeftOut
 from fieldtwin.capture.formats.cnv import import_cnv
 from fieldtwin.capture.formats.packet_file import PacketFile
 from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.files.candump import LeftOut
 
 PIECE = 16 << 20
 PIECES = 64

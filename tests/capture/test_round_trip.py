@@ -17,7 +17,6 @@ from pymodbus.server import ModbusTcpServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 from support import eventually, run
 
-from fieldtwin.capture.formats.candump import read_log
 from fieldtwin.capture.formats.pcap import read_capture
 from fieldtwin.capture.recordings.comparing import Comparer, Comparison, Rules, pairs_of, request_of
 from fieldtwin.capture.recordings.comparing_can import Frames, compare_logs
@@ -50,6 +49,7 @@ from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.connection import Direction
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import Unreachable, UsageError
+from fieldtwin.gateway.core.files.candump import read_log
 from fieldtwin.gateway.core.files.profile import load_profile
 from fieldtwin.gateway.core.files.recording import RecordedExchange, RecordingHeader, encode_exchange, encode_header
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient

@@ -21,7 +21,6 @@ import yaml
 from fieldtwin.acoustic.network import load_network
 from fieldtwin.capture.decoding.trace_file import read_events
 from fieldtwin.capture.formats.can_files import read_can_file
-from fieldtwin.capture.formats.candump import LeftOut, read_log
 from fieldtwin.capture.formats.csv_table import import_csv
 from fieldtwin.capture.formats.packet_file import PacketFile
 from fieldtwin.capture.formats.pcap import read_capture
@@ -31,6 +30,7 @@ from fieldtwin.emulators.canopen.dictionary import load_eds
 from fieldtwin.emulators.faults.schema import load_faults
 from fieldtwin.emulators.replay.can_log import CanLog
 from fieldtwin.gateway.core.errors import FieldtwinError
+from fieldtwin.gateway.core.files.candump import LeftOut, read_log
 from fieldtwin.gateway.core.files.profile import load_profile
 from fieldtwin.gateway.core.files.recording import RecordingReader
 from fieldtwin.gateway.protocols.canopen.dictionary import load_dictionary

@@ -33,7 +33,7 @@ from fieldtwin.emulators.models.register_device import ProfileRegisters, add_own
 from fieldtwin.emulators.models.sampled_sensor import SampledSensor
 from fieldtwin.emulators.models.simulated_registers import SimulatedRegisters
 from fieldtwin.emulators.recorded_device import RecordedDevice, load_replay
-from fieldtwin.emulators.replay.can_log import SUFFIX, CanLog
+from fieldtwin.emulators.replay.can_log import CanLog
 from fieldtwin.emulators.replay.replay import ExchangeReplay
 from fieldtwin.emulators.signals import SignalPlayer, Signals, SignalTrack
 from fieldtwin.emulators.stated import parts_of
@@ -42,6 +42,7 @@ from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.connection import ByteConnection, CanConnection, RS232Connection, TCPConnection
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
+from fieldtwin.gateway.core.files.candump import SUFFIX
 from fieldtwin.gateway.core.files.profile import DeviceProfile
 from fieldtwin.gateway.devices.config import DeviceConfig
 from fieldtwin.twin.prototype.field_faults import FieldFaults

@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
-from fieldtwin.emulators.replay.can_log import SUFFIX
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
+from fieldtwin.gateway.core.files.candump import SUFFIX
 from fieldtwin.gateway.core.files.profile import DeviceProfile, load_profile
 from fieldtwin.gateway.core.files.recording import shown
 from fieldtwin.gateway.core.files.yaml_file import Key, YamlFile, load, validate

@@ -15,10 +15,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, Any
 
-from fieldtwin.capture.formats.candump import LeftOut
 from fieldtwin.capture.formats.packed import most_unpacked, too_much
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid, UsageError
+from fieldtwin.gateway.core.files.candump import LeftOut
 from fieldtwin.gateway.core.files.input_file import open_input
 
 SUFFIXES = (".asc", ".blf", ".trc")

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from fieldtwin.gateway.connections.tap import Captured
-from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.canframe import CanFrame, parse_frame
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.connection import Direction
 from fieldtwin.gateway.core.endpoint import Endpoint
@@ -80,23 +80,13 @@ def read_capture(path: Path, refusals: list[dict[str, Any]] | None = None) -> It
 
 
 def captured_of(line: dict[str, object]) -> Captured:
-    data = bytes.fromhex(str(line["hex"]))
-    item: bytes | CanFrame = data
+    item: bytes | CanFrame = bytes.fromhex(str(line["hex"]))
     if "frame" in line:
-        item = _frame(str(line["frame"]), data, error=bool(line.get("error")))
+        item = parse_frame(str(line["frame"]), error=bool(line.get("error")))
     t_ns = line["t_ns"]
     if not isinstance(t_ns, int):
         raise ValueError(f"t_ns is {t_ns!r}")
     return Captured(t_ns, Endpoint.parse(str(line["endpoint"])), Direction(line["direction"]), item)
-
-
-def _frame(text: str, data: bytes, *, error: bool) -> CanFrame:
-    """Parse a frame in candump's notation: ``705#7F``, ``605#R8``, eight digits of identifier for the extended format."""
-    identifier, _, body = text.partition("#")
-    remote = body.startswith("R")
-    dlc = int(body[1:] or "0") if remote else len(data)
-    extended = len(identifier) == 8 and not error
-    return CanFrame(int(identifier, 16), data, extended=extended, remote=remote, error=error, dlc=dlc)
 
 
 @dataclass(frozen=True, slots=True)

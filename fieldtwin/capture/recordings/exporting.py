@@ -17,7 +17,6 @@ from typing import Any
 
 from fieldtwin.capture.decoding.modbus_pdu import parse_reply, parse_request, words
 from fieldtwin.capture.decoding.tags import TagMap
-from fieldtwin.capture.formats.candump import line_of, read_log
 from fieldtwin.capture.formats.pcap import read_capture, write_pcap
 from fieldtwin.capture.recordings.rotating_file import RotatingFile, exchanges_of, header_of, parts_of
 from fieldtwin.gateway.connections.tap import Captured
@@ -26,6 +25,7 @@ from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.connection import Direction
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
+from fieldtwin.gateway.core.files.candump import line_of, read_log
 from fieldtwin.gateway.core.files.input_file import open_input
 from fieldtwin.gateway.core.files.profile import DeviceProfile
 from fieldtwin.gateway.core.files.recording import RecordedExchange, RecordingHeader, RecordingReader, SignalRow

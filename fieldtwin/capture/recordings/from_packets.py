@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 
-from fieldtwin.capture.formats.candump import line_of
 from fieldtwin.capture.formats.packet_file import PacketFile
 from fieldtwin.capture.formats.tcp_segments import Conversation, Conversations, PacketCounters, Side
 from fieldtwin.capture.recordings.draft import Drafts
@@ -24,6 +23,7 @@ from fieldtwin.capture.recordings.rotating_file import RotatingFile
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid
+from fieldtwin.gateway.core.files.candump import line_of
 from fieldtwin.gateway.core.files.recording import RecordedExchange, RecordingHeader, encode_exchange, encode_header
 
 LINK_CAN, LINK_USER0, LINK_RTAC = 227, 147, 250

@@ -15,7 +15,6 @@ from typing import IO
 
 from fieldtwin.capture.formats.can_files import SUFFIXES as CAN_SUFFIXES
 from fieldtwin.capture.formats.can_files import read_can_file
-from fieldtwin.capture.formats.candump import LeftOut, line_of, read_log
 from fieldtwin.capture.formats.packet_file import is_packet_file
 from fieldtwin.capture.formats.pcap import read_capture
 from fieldtwin.capture.formats.poll_text import IS_POLL_TEXT, read_polls
@@ -28,6 +27,7 @@ from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.connection import Direction
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
+from fieldtwin.gateway.core.files.candump import LeftOut, line_of, read_log
 from fieldtwin.gateway.core.files.input_file import open_input
 from fieldtwin.gateway.core.files.recording import RecordingHeader, encode_exchange, encode_header
 from fieldtwin.gateway.protocols.modbus.framings import framing_of

@@ -8,13 +8,13 @@ from __future__ import annotations
 import json
 from datetime import UTC, datetime
 
-from fieldtwin.capture.formats.candump import line_of
 from fieldtwin.capture.recordings.rotating_file import RotatingFile
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.clock import NS_PER_S, Clock
 from fieldtwin.gateway.core.connection import Direction, Tap
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import FieldtwinError
+from fieldtwin.gateway.core.files.candump import line_of
 from fieldtwin.gateway.core.files.recording import RecordedExchange, encode_exchange
 
 

@@ -13,7 +13,6 @@ from typing import Any
 import click
 from rich.table import Table
 
-from fieldtwin.capture.formats.candump import read_log
 from fieldtwin.capture.recordings.comparing import Comparer, Comparison, Rules, Tolerance, pairs_of, request_of
 from fieldtwin.capture.recordings.comparing_can import Frames, compare_logs
 from fieldtwin.capture.recordings.rotating_file import exchanges_of, header_of, parts_of
@@ -26,6 +25,7 @@ from fieldtwin.console import stderr, stdout
 from fieldtwin.gateway.core.concurrency.stop_signal import stop_signal
 from fieldtwin.gateway.core.endpoint import SCHEMES
 from fieldtwin.gateway.core.errors import FileInvalid, NotAllowed, UsageError
+from fieldtwin.gateway.core.files.candump import read_log
 from fieldtwin.gateway.core.files.profile import DeviceProfile, load_profile
 from fieldtwin.gateway.core.files.recording import shown
 from fieldtwin.gateway.protocols.canopen.sdo import SdoUpload

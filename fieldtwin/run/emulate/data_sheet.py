@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from fieldtwin.capture.formats.candump import read_log
 from fieldtwin.capture.recordings.log_sheet import LogSheet, nodes_of
 from fieldtwin.console import stderr
 from fieldtwin.emulators.canopen.dictionary import Dictionary, load_eds
@@ -19,7 +18,6 @@ from fieldtwin.emulators.models.by_profile import model_for
 from fieldtwin.emulators.models.emulated_node import NodeOptions, node_remarks
 from fieldtwin.emulators.replay.can_log import CanLog
 from fieldtwin.emulators.replay.objects import recorded_objects
-from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.concurrency.stop_signal import stop_signal
 from fieldtwin.gateway.core.connection import CanConnection
@@ -72,17 +70,14 @@ async def run_data_sheet(
 
 async def run_log(path: Path, endpoints: tuple[str, ...], node_id: int | None, bitrate: int | None = None) -> int:
     """Run as `run_data_sheet`, with a data sheet made from the log, so that the node has exactly the logged objects."""
-
-    def frames() -> Iterator[tuple[int, CanFrame]]:
-        return ((t_ns, frame) for t_ns, _, frame in read_log(path))
-
-    there = nodes_of(frames())
+    log = CanLog(path)
+    there = nodes_of(log.frames())
     if node_id is None and len(there) != 1:
         if not there:
             raise UsageError(f"{path.name} contains no node")
         raise UsageError(f"{path.name}: the node is not given", expected=f"--node, one of {', '.join(map(str, there))}")
     node_id = node_id or there[0]
-    text = LogSheet(frames(), node_id).eds(path.stem)
+    text = LogSheet(log.frames(), node_id).eds(path.stem)
     stderr.print(f"node {node_id} has what {path.name} has of it; names and meanings are not known", soft_wrap=True)
     with TemporaryDirectory(prefix="fieldtwin-") as folder:
         sheet = Path(folder) / f"{path.stem}.eds"

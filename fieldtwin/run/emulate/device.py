@@ -37,7 +37,7 @@ from fieldtwin.emulators.models.mailbox_modem import ModemPair
 from fieldtwin.emulators.models.register_device import ProfileRegisters, add_own_functions
 from fieldtwin.emulators.models.sampled_sensor import SampledSensor
 from fieldtwin.emulators.recorded_device import load_replay
-from fieldtwin.emulators.replay.can_log import SUFFIX, CanLog
+from fieldtwin.emulators.replay.can_log import CanLog
 from fieldtwin.emulators.replay.profiled import ProfiledReplay
 from fieldtwin.emulators.replay.replay import ExchangeReplay, NeverRecorded
 from fieldtwin.emulators.replay.unit import ReplayUnit
@@ -50,6 +50,7 @@ from fieldtwin.gateway.core.concurrency.stop_signal import stop_signal
 from fieldtwin.gateway.core.connection import ByteConnection, CanConnection
 from fieldtwin.gateway.core.endpoint import SERIAL_SCHEMES, Endpoint
 from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.files.candump import SUFFIX
 from fieldtwin.gateway.core.files.profile import DeviceProfile, load_profile
 from fieldtwin.gateway.core.files.recording import looks_like_another_file, shown
 from fieldtwin.gateway.wallclock import WallClock

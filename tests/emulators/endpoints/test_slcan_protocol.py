@@ -48,7 +48,7 @@ class Adapter:
         (b"T000001231AB\r", b"Z\r", "00000123#AB"),
         (b"T1FFFFFFF0\r", b"Z\r", "1FFFFFFF#"),
         (b"r6058\r", b"z\r", "605#R8"),
-        (b"R000006050\r", b"Z\r", "00000605#R0"),
+        (b"R000006050\r", b"Z\r", "00000605#R"),
         (b"t1231AA1234\r", b"z\r", "123#AA"),  # a time stamp along with it
         (b"t8000\r", BEL, None),  # not an 11-bit identifier
         (b"T200000000\r", BEL, None),

@@ -13,7 +13,7 @@ from fieldtwin.cli.options import Duration
 
 @dataclass(frozen=True)
 class SourceOptions:
-    """What is recorded instead of a device that is polled by the tags of its profile."""
+    """The source of a recording that replaces polling a device by the tags of its profile."""
 
     taps: tuple[str, str] | None = option(
         "--tap", nargs=2, metavar="A B", help="Connect a client (A) with its devices (B), and record all traffic."

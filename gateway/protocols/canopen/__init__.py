@@ -1,1 +1,1 @@
-"""The CANopen master (CiA 301): protocol cores that know only frames and ``now``, and a thin asyncio master around them."""
+"""The CANopen master (CiA 301): pure protocol modules that handle frames and ``now``, and a thin asyncio master around them."""

@@ -49,5 +49,5 @@ MEANINGS: dict[int, str] = {
 
 
 def meaning(code: int) -> str:
-    """Return the standard's text for `code`, or ``vendor or profile specific`` if it has none."""
+    """Return the standard's text for `code`, or ``vendor or profile specific`` if the standard does not define the code."""
     return MEANINGS.get(code, "vendor or profile specific")

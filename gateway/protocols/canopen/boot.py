@@ -1,7 +1,7 @@
 """Boot a node as CiA 302-2 describes: check that it is the expected node, and that it holds the required configuration.
 
-The procedures use a master. They know object numbers of the standards but no particular device. The caller decides who
-may write, and what follows from an error.
+The procedures use a master. They know object numbers of the standards but no particular device. The caller decides whether
+writing is allowed, and how to react to an error.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class ExpectedIdentity:
 
     @property
     def objects(self) -> dict[str, tuple[int, int, int]]:
-        """Return the expected fields: name -> index, subindex, value, in the order in which CiA 302 checks them."""
+        """Return the expected fields as name -> (index, subindex, value), in the order in which CiA 302 checks them."""
         every = {
             "device_type": (DEVICE_TYPE, 0, self.device_type),
             "vendor": (IDENTITY, 1, self.vendor),
@@ -56,8 +56,8 @@ class ExpectedIdentity:
 class Configuration:
     """The configuration that a node has to hold.
 
-    `date` is the expected configuration date and time (1F26h, 1F27h); None writes the configuration every time. With
-    `store` the node saves it (1010h:01), so that it need not be written again after the node's next start.
+    `date` is the expected configuration date and time (1F26h, 1F27h); if it is None, the configuration is written at every boot.
+    With `store` the node saves the configuration (1010h:01), so that it need not be written again after the node's next start.
     """
 
     settings: tuple[Setting, ...]
@@ -68,7 +68,7 @@ class Configuration:
 async def identity_differences(master: CanopenMaster, node: int, expected: ExpectedIdentity) -> dict[str, str]:
     """Read the expected parts of the node's identity; return name -> "expected X, got Y" for those that differ.
 
-    An object that the node does not have also differs. Raises the errors of a read if the node does not answer.
+    An object that the node does not have counts as different. Raises the errors of a read if the node does not answer.
     """
     wrong: dict[str, str] = {}
     for name, (index, sub, value) in expected.objects.items():
@@ -83,7 +83,7 @@ async def identity_differences(master: CanopenMaster, node: int, expected: Expec
 
 
 async def holds_configuration(master: CanopenMaster, node: int, date: tuple[int, int] | None) -> bool:
-    """Return whether the node reports that it was configured on `date` (1020h:01 and :02); False without a date."""
+    """Return whether the node reports that it was configured on `date` (1020h:01 and :02); False if `date` is None."""
     if date is None or date == (0, 0):
         return False
     try:

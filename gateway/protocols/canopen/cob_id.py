@@ -1,5 +1,4 @@
-"""CAN identifiers of CANopen: the pre-defined connection set, and those that a PDO must not use (CiA 301, 7.3.3 and
-7.3.5).
+"""CAN identifiers of CANopen: the pre-defined connection set, and the restricted CAN-IDs (CiA 301, 7.3.3 and 7.3.5).
 
 Pure arithmetic, without frames or a bus.
 """

@@ -1,5 +1,4 @@
-"""The concise DCF (CiA 302-3, object 1F22h): a node's configuration as one block of bytes, and its conversion from a
-DCF.
+"""The concise DCF (CiA 302-3, object 1F22h): a node's configuration as one block of bytes, converted from a DCF.
 
 Format, all little-endian: UNSIGNED32 number of entries; then for each entry UNSIGNED16 index, UNSIGNED8 subindex,
 UNSIGNED32 size in bytes, and the data. Pure; sends nothing.
@@ -41,7 +40,7 @@ class Setting:
 
 
 def encode_concise(settings: Iterable[Setting]) -> bytes:
-    """Return the block of bytes as 1F22h holds it."""
+    """Return the settings as the block of bytes that 1F22h holds."""
     listed = list(settings)
     if len(listed) > MAX_SETTINGS:
         raise UsageError("a concise DCF", expected=f"at most {MAX_SETTINGS} entries", got=str(len(listed)))
@@ -80,9 +79,9 @@ def decode_concise(data: bytes) -> tuple[Setting, ...]:
 def settings_of(dictionary: ObjectDictionary) -> tuple[Setting, ...]:
     """Return the settings of a DCF (its ParameterValues), in an order that a node accepts.
 
-    PDOs follow the procedure of CiA 301, 7.5.2.36 and 7.5.2.38: first the PDO is made invalid, with no objects mapped;
-    then come the objects, their number, and the other parameters; the COB-ID is last. Raises `FileInvalid` for a value
-    that its type cannot hold.
+    PDOs follow the procedure of CiA 301, 7.5.2.36 and 7.5.2.38. First the PDO is made invalid and its number of mapped objects is
+    set to 0. Then the mapped objects, their number, the other parameters and finally the COB-ID are written. Raises `FileInvalid`
+    for a value that does not fit its type.
     """
     wanted = {
         (entry.index, entry.subindex): Setting(entry.index, entry.subindex, _bytes_of(entry, dictionary.path))
@@ -100,9 +99,9 @@ def settings_of(dictionary: ObjectDictionary) -> tuple[Setting, ...]:
 
 
 def configuration_date(dictionary: ObjectDictionary) -> tuple[int, int] | None:
-    """Return the expected configuration date and time (1F26h, 1F27h): the DCF's values for 1020h:01 and :02, or None.
+    """Return the expected configuration date and time (1F26h, 1F27h), or None if the DCF does not set 1020h:01 and :02.
 
-    They are days since 1984-01-01 and milliseconds since midnight.
+    The date is in days since 1984-01-01, the time in milliseconds since midnight.
     """
     entries = [dictionary.get(CONFIGURATION_DATE, sub) for sub in (1, 2)]
     values = [e.default for e in entries if e is not None and e.configured and isinstance(e.default, int)]

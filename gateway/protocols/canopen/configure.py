@@ -1,4 +1,4 @@
-"""Configure a node over SDO at start, as CiA 301 prescribes, and read back what it then holds.
+"""Configure a node over SDO when it starts, as CiA 301 prescribes, and read the configuration back.
 
 The procedures use a master; they know object numbers of CiA 301 but no particular device.
 """
@@ -62,8 +62,8 @@ class Identity:
 class PdoConfig:
     """The configuration of a PDO in the node.
 
-    `cob_id` is the CAN-ID alone. `event_ms` is a TPDO's event timer or an RPDO's deadline; 0 when off, None when not
-    supported.
+    `cob_id` is the CAN-ID without flag bits. `event_ms` is a TPDO's event timer or an RPDO's deadline in milliseconds: 0 if it is
+    off, None if the node does not support it.
     """
 
     number: int
@@ -116,7 +116,7 @@ async def set_heartbeat_producer(master: CanopenMaster, node: int, ms: int) -> N
 
 
 async def read_identity(master: CanopenMaster, node: int) -> Identity:
-    """Read device type and identity. Entries beyond the node's highest sub-index are None."""
+    """Read device type and identity. An entry beyond the node's highest sub-index is None."""
     u32 = DataType.UNSIGNED32
     device_type = await read_number(master, node, DEVICE_TYPE, 0, u32)
     highest = await read_number(master, node, IDENTITY, 0, DataType.UNSIGNED8)
@@ -211,11 +211,10 @@ async def configure_tpdo(
 ) -> PdoMapping:
     """Configure TPDO `number` (from 1) by the procedure of 7.5.2.38, verify it, and return its mapping.
 
-    `mapping` is (index, subindex, bits) in order, at most 64 bits. `cob_id` is the CAN-ID; the node's setting for
-    remote frames is not changed. `event_ms` 0 switches the event timer off; None does not write event timer and inhibit
-    time, which a node need not have. Call it in PRE-OPERATIONAL. Raises `UsageError` before anything is sent,
-    `SdoAborted` if the node refuses a step (the TPDO is then left disabled), `VerifyFailed` if it finally holds
-    different values.
+    `mapping` is (index, subindex, bits) in order, at most 64 bits. `cob_id` is the CAN-ID; the node's setting for remote frames
+    is not changed. `event_ms` 0 switches the event timer off; None does not write event timer and inhibit time, which a node need
+    not have. Call it in PRE-OPERATIONAL. Raises `UsageError` before anything is sent, `SdoAborted` if the node refuses a step
+    (the TPDO then stays disabled), `VerifyFailed` if the node finally holds different values.
     """
     parameters = ((2, transmission_type), (3, inhibit_100us), (5, event_ms))
     return await _configure_pdo(master, node, _tpdo(number), mapping, cob_id, parameters)
@@ -231,7 +230,8 @@ async def configure_rpdo(
 ) -> PdoMapping:
     """Configure RPDO `number` (from 1) by the procedure of 7.5.2.36, verify it, and return its mapping.
 
-    Otherwise as `configure_tpdo`. With `transmission_type` 0 to 240 the node takes the values at the SYNC that follows.
+    Parameters and errors are those of `configure_tpdo`. With `transmission_type` 0 to 240 the node applies the values at the next
+    SYNC.
     """
     return await _configure_pdo(master, node, _rpdo(number), mapping, cob_id, ((2, transmission_type),))
 
@@ -244,7 +244,7 @@ async def _configure_pdo(
     cob_id: int,
     optional: Iterable[tuple[int, int | None]],
 ) -> PdoMapping:
-    """Configure a PDO. `optional` are sub-indices of the communication record and their values; None is not written."""
+    """Configure a PDO. `optional` maps sub-indices of the communication record to values; a value of None is not written."""
     name, communication, mapped = records
     wanted = PdoMapping.of(mapping)
     cob_ids.check_pdo_cob_id(cob_id)

@@ -74,7 +74,7 @@ def size_of(data_type: int) -> int | None:
 
 
 def is_signed(data_type: int) -> bool:
-    """Return whether it is one of the INTEGER types."""
+    """Return whether the type is one of the INTEGER types."""
     kind = _KINDS.get(data_type)
     return kind is not None and _INTEGERS.get(kind, (0, False))[1]
 
@@ -106,7 +106,10 @@ def decode(data_type: int, data: bytes) -> Scalar:
 
 
 def encode(data_type: int, value: Scalar) -> bytes:
-    """Return the bytes of `value`. Raises `UsageError` if it has a wrong type or does not fit; nothing is rounded or cut."""
+    """Return the bytes of `value`.
+
+    Raises `UsageError` if it has a wrong type or does not fit; values are never rounded or cut.
+    """
     kind = _KINDS.get(data_type, DataType.DOMAIN)
     try:
         return _encode(kind, value)

@@ -90,9 +90,9 @@ class ObjectDictionary:
         return self.entries.get((index, subindex))
 
     def find(self, name: str) -> DictionaryEntry:
-        """Return the entry with that name: its full name, or the sub-object's name alone if that is unique.
+        """Return the entry with this name: the full name, or the sub-object's name alone if it is unique.
 
-        Raises `UsageError` with the most similar name if there is none.
+        If there is no such entry, raises `UsageError` with the most similar name.
         """
         exact = [entry for entry in self if entry.name == name]
         found = exact or [entry for entry in self if entry.name.endswith(f".{name}")]
@@ -108,8 +108,7 @@ class ObjectDictionary:
 def load_dictionary(path: Path, node_id: int | None = None) -> ObjectDictionary:
     """Read an EDS or DCF file. Raises `FileInvalid` with file, line, section and key.
 
-    A DOMAIN's DownloadFile (CiA 306, 4.7.3) is read from the file's own folder: its bytes are the value that the DCF
-    sets.
+    A DOMAIN's DownloadFile (CiA 306, 4.7.3) is read from the folder of the DCF: its bytes are the value that the DCF sets.
     """
     try:
         raw = read_input(path, MAX_EDS_BYTES)
@@ -129,8 +128,8 @@ def parse_dictionary(
 ) -> ObjectDictionary:
     """Read the text of an EDS or DCF.
 
-    `node_id` replaces $NODEID; without it, the DCF's own node ID does, if it has one. Files that the text names are
-    read from `folder`; with None they are not read.
+    `node_id` replaces $NODEID; if it is not given, the node ID of the DCF does, if there is one. Files that the text names are
+    read from `folder`, or not at all if `folder` is None.
     """
     if node_id is not None:
         check_node(node_id)
@@ -159,7 +158,7 @@ def parse_dictionary(
 def _entries(
     objects: Iterable[ODVariable | ODArray | ODRecord], eds: EdsText, values: _Values
 ) -> dict[tuple[int, int], DictionaryEntry]:
-    """Return every variable of the package as an entry, in order of index and subindex."""
+    """Return every variable of the package's dictionary as an entry, in order of index and subindex."""
     entries: dict[tuple[int, int], DictionaryEntry] = {}
     for item in objects:
         if item.index in _TYPE_AREA:
@@ -178,7 +177,7 @@ def _entries(
 def _downloads(
     entries: Mapping[tuple[int, int], DictionaryEntry], values: _Values, folder: Path | None
 ) -> dict[tuple[int, int], DictionaryEntry]:
-    """Set the DOMAINs that name a DownloadFile to its content; one that cannot be read becomes None and is noted."""
+    """Set each DOMAIN that names a DownloadFile to the content of the file. A file that cannot be read gives None and a note."""
     found: dict[tuple[int, int], DictionaryEntry] = {}
     for key, entry in entries.items():
         section = values.section(*key)
@@ -199,7 +198,7 @@ def _downloads(
 
 
 def _expand(array: ODArray, members: list[DictionaryEntry], count: int) -> list[DictionaryEntry]:
-    """Return all entries of a compact array (CiA 306, 4.6.3.2.3); `canopen` makes only the first one and those with names."""
+    """Return all entries of a compact array (CiA 306, 4.6.3.2.3). `canopen` creates only the first entry and the named ones."""
     known = {entry.subindex: entry for entry in members}
     template = known[1]
     known[0] = replace(known[0], access="ro", default=count)
@@ -209,7 +208,7 @@ def _expand(array: ODArray, members: list[DictionaryEntry], count: int) -> list[
 
 
 class _Values:
-    """The values in the sections of the file. `mended` lists those that could not be read."""
+    """The values in the sections of the file. `mended` lists the values that could not be read."""
 
     def __init__(self, eds: EdsText, node_id: int | None) -> None:
         self._sections = eds.sections
@@ -217,11 +216,11 @@ class _Values:
         self.mended: list[str] = []
 
     def section(self, index: int, subindex: int) -> Section:
-        """Return the section that describes a value: its own section, or that of its object."""
+        """Return the section that describes a value: the section of the sub-object if there is one, else that of the object."""
         return self._sections.get(f"{index:04X}sub{subindex:X}") or self._sections[f"{index:04X}"]
 
     def entry(self, var: ODVariable, name: str) -> DictionaryEntry:
-        """Return the entry for a variable of the package."""
+        """Return the dictionary entry for a variable of the `canopen` package."""
         section, kind = self.section(var.index, var.subindex), int(var.data_type or DataType.DOMAIN)
         configured = bool(section.values.get("ParameterValue", ""))
         default = self._value(section, "ParameterValue", kind) if configured else None

@@ -1,7 +1,7 @@
 """EDS and DCF files as text (CiA 306): sections and keys with their lines, and the repairs that real files need.
 
-Vendors' files leave numbers empty, write octal, vary the case of keys, put sub-objects before their object and use the
-encoding of the vendor's editor. This module reads all that, lists its repairs, and refuses ambiguous content with file,
+Vendors' files leave numbers empty, write octal numbers, vary the case of keys, put sub-objects before their object and use the
+encoding of the vendor's editor. This module accepts such files and lists its repairs. It refuses ambiguous content, with file,
 section and key. It produces the repaired text; it knows no data types and no nodes.
 """
 
@@ -53,7 +53,7 @@ _CANONICAL = {
 
 @dataclass(slots=True)
 class Section:
-    """One section: canonical key -> value, and the line of each key; `line` is that of the heading."""
+    """One section: canonical key -> value, and the line of each key. `line` is the line of the heading."""
 
     name: str
     line: int
@@ -69,7 +69,7 @@ class EdsText:
     mended: tuple[str, ...]
 
     def __str__(self) -> str:
-        """Return the repaired file, objects before their sub-objects, without content that does not concern objects."""
+        """Return the text of the repaired file: only content that concerns objects, with each object before its sub-objects."""
         blocks = []
         for name, section in self.sections.items():
             lines = [f"{key}={value}" for key, value in section.values.items() if key not in _VALUE_KEYS]
@@ -78,7 +78,9 @@ class EdsText:
 
 
 def decode_eds(raw: bytes, path: str = "") -> tuple[str, tuple[str, ...]]:
-    """Return the text of a file, and the assumptions made: UTF-8 or UTF-16 (by their marks), else Windows-1252."""
+    """Return the text of a file and the assumptions made about its encoding.
+
+    A byte order mark shows UTF-16 or UTF-8; otherwise the encoding is UTF-8 if the bytes are valid, else Windows-1252."""
     if len(raw) > MAX_BYTES:
         raise FileInvalid("not an EDS", path=path, expected=f"at most {MAX_BYTES} bytes", got=str(len(raw)))
     if raw[:2] in (b"\xff\xfe", b"\xfe\xff"):
@@ -91,7 +93,7 @@ def decode_eds(raw: bytes, path: str = "") -> tuple[str, tuple[str, ...]]:
 
 
 def read_eds_text(text: str, path: str = "") -> EdsText:
-    """Read and repair. Raises `FileInvalid` with file, line, section and key for errors that cannot be repaired."""
+    """Read and repair a text. Raises `FileInvalid` with file, line, section and key for errors that cannot be repaired."""
     mended: list[str] = []
     sections = _split(text, path, mended)
     if not any(_OBJECT.match(name) for name in sections):
@@ -119,7 +121,7 @@ def read_eds_text(text: str, path: str = "") -> EdsText:
 
 
 def invalid(message: str, section: Section, key: str, path: str, *, expected: str, got: str = "") -> FileInvalid:
-    """Return the error for a key of a section."""
+    """Return a `FileInvalid` for a key of a section."""
     line = section.lines.get(key, section.line)
     return FileInvalid(f"[{section.name}] {key}: {message}", path=path, line=line, expected=expected, got=got)
 
@@ -129,7 +131,7 @@ def _commissioning() -> tuple[tuple[str, ...], tuple[str, ...]]:
 
 
 def _order(name: str) -> tuple[int, int, int]:
-    """Return the sort key: objects, then their sub-objects, then their names, then their values."""
+    """Return the sort key of a section: first the object, then its sub-objects, its names and its values."""
     rank = {"Name": 1, "Value": 2}.get(name[4:], 0)
     return int(name[:4], 16), rank, -1 if rank or len(name) == 4 else int(name[7:], 16)
 
@@ -147,7 +149,7 @@ def _canonical_section(name: str) -> str:
 
 
 def _split(text: str, path: str, mended: list[str]) -> dict[str, Section]:
-    """Return sections and keys; a repeated key or object is refused unless both are the same."""
+    """Return the sections with their keys. A repeated key or object is refused unless the repetition is identical."""
     sections: dict[str, Section] = {}
     current: Section | None = None
     for number, raw in enumerate(text.replace("\r\n", "\n").replace("\r", "\n").split("\n"), 1):
@@ -189,7 +191,9 @@ def _put(section: Section, written: str, value: str, line: int, path: str, mende
 
 
 def _number(section: Section, key: str, if_empty: str, path: str, mended: list[str]) -> str:
-    """Return a number as `canopen` reads it: decimal or 0x. Octal (a leading 0 in CiA 306) is rewritten, empty filled in."""
+    """Return a number in the notation that `canopen` reads: decimal, or with 0x.
+
+    Octal numbers (with a leading 0 in CiA 306) are rewritten, and an empty number becomes the default."""
     value = section.values[key].replace(" ", "")
     if not value:
         if not if_empty:
@@ -206,7 +210,7 @@ def _number(section: Section, key: str, if_empty: str, path: str, mended: list[s
 def _mend_information(
     section: Section, allowed: tuple[tuple[str, ...], tuple[str, ...]], path: str, mended: list[str]
 ) -> Section:
-    """Return the keys of [DeviceInfo] or [DeviceComissioning] that are needed."""
+    """Return the section [DeviceInfo] or [DeviceComissioning] with only the keys that are needed."""
     texts, numbers = allowed
     kept = Section(section.name, section.line)
     for key in section.values:
@@ -220,7 +224,7 @@ def _mend_information(
 
 
 def _mend_count(section: Section, key: str, kept: Section, path: str, mended: list[str]) -> None:
-    """Take a number that describes the whole device; an impossible one is left out, since no object depends on it."""
+    """Copy a number that describes the whole device. An impossible number is left out, since no object depends on it."""
     try:
         number = int(_number(section, key, "0", path, mended), 0)
     except FileInvalid:
@@ -238,12 +242,12 @@ def _kind(section: Section, path: str) -> int:
 
 
 def _holds_values(section: Section, path: str) -> bool:
-    """Return whether the object is a DOMAIN, VAR, ARRAY or RECORD (CiA 306-1, 4.6.3.2)."""
+    """Return whether the object can hold values: whether it is a DOMAIN, VAR, ARRAY or RECORD (CiA 306-1, 4.6.3.2)."""
     return _kind(section, path) in (0x2, 0x7, 0x8, 0x9)
 
 
 def _data_type(section: Section, kept: Section, sections: dict[str, Section], path: str, mended: list[str]) -> str:
-    """Return the basic data type of a value, as written into the text; a type that is not defined is read as DOMAIN."""
+    """Return the basic data type of a value as text; a type that is not defined becomes DOMAIN."""
     if _kind(section, path) == 0x2:
         return _DOMAIN
     if not kept.values.get("DataType"):
@@ -260,7 +264,7 @@ def _data_type(section: Section, kept: Section, sections: dict[str, Section], pa
 
 
 def _mend_object(section: Section, sections: dict[str, Section], path: str, mended: list[str]) -> Section:
-    """Return the keys of an object or sub-object, complete enough for the strict reader of `canopen`."""
+    """Return the section of an object or sub-object with all keys that the strict reader of `canopen` requires."""
     kept = Section(section.name, section.line, lines=section.lines)
     for key, value in section.values.items():
         if key in _NUMBER_KEYS:

@@ -1,6 +1,6 @@
-"""Values as an electronic data sheet writes them (CiA 306-1, 4.6.3.2): text to a number, a string or bytes.
+"""Convert the values in an electronic data sheet (CiA 306-1, 4.6.3.2) from text to a number, a string or bytes.
 
-The `canopen` package reads these texts too, but it ignores octal numbers, limits of real types and signed numbers that
+The `canopen` package also reads these texts, but it does not support octal numbers, limits of real types and signed numbers that
 are written as their bits, and it does not report a value that it cannot read. Pure; knows no sections and no nodes.
 """
 
@@ -24,8 +24,8 @@ _WITH_NODE_ID = re.compile(r"\$NODEID(?:\+(?P<after>[0-9A-FX]+))?|(?P<before>[0-
 def read_value(data_type: int, text: str, node_id: int | None = None) -> Scalar | None:
     """Return the value of `text` for an object of `data_type`; None if it needs a node ID and none is given.
 
-    Raises `ValueError` for a text that is not a value of the type, or is outside its range. A signed type also accepts
-    the unsigned reading of its bits (FFh for -1). A time is its six octets, or a number of 48 bits.
+    Raises `ValueError` for a text that is not a value of the type, or is outside its range. A signed type also accepts a number
+    that is written as its bits (FFh for -1). A time is written as six octets, or as a number of 48 bits.
     """
     text = text.strip()
     if data_type in _TEXTS:
@@ -76,7 +76,7 @@ def _whole(text: str) -> int:
 
 
 def _held(value: int, size: int, *, signed: bool) -> int:
-    """Return the number as the type holds it. Raises `ValueError` if it does not fit."""
+    """Return the number in the range of the type. Raises `ValueError` if it does not fit."""
     bits = 8 * size
     if not (-(1 << bits - 1) if signed else 0) <= value < 1 << bits:
         raise ValueError("the type has no room for it")
@@ -84,7 +84,7 @@ def _held(value: int, size: int, *, signed: bool) -> int:
 
 
 def _real(form: str, text: str, size: int) -> float:
-    """Return the number as the type holds it; a hexadecimal number gives its bits."""
+    """Return a number of a REAL type. A hexadecimal number is read as the bits of the floating-point number."""
     try:
         raw = _whole(text).to_bytes(size, "little") if text[:2].lower() == "0x" else struct.pack(form, float(text))
     except OverflowError as e:

@@ -29,9 +29,10 @@ class EmcyLog:
         self.total = 0
 
     def add(self, emcy: Emcy, t_ns: int) -> None:
-        """Add a message. An error reset ends all errors, unless its error register says that some are left (CO-054).
+        """Add a message.
 
-        The message does not say which of them ended, so all are kept until the register is clear.
+        An error reset ends all errors, unless its error register says that some are left (CO-054). The message does not say which
+        errors ended, so all are kept until the register is clear.
         """
         self.total += 1
         self._entries.append(EmcyEntry(t_ns, emcy))
@@ -43,7 +44,7 @@ class EmcyLog:
             self._active.clear()
 
     def restarted(self) -> None:
-        """Forget the active errors because the node booted: it will report its present errors again. The history stays."""
+        """Forget the active errors because the node booted and will report its present errors again. The history is kept."""
         self._active.clear()
 
     @property

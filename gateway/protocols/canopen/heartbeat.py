@@ -1,5 +1,4 @@
-"""The heartbeat consumer (CiA 301, 7.2.8.2.2.2 and 7.2.8.3.2.2): which nodes are alive, their states, and lost
-heartbeats.
+"""The heartbeat consumer (CiA 301, 7.2.8.2.2.2 and 7.2.8.3.2.2): the states of the nodes, and the loss of heartbeats.
 
 A pure object: heartbeats and `now` in, events out. Monitoring of a node starts at its first heartbeat (CO-036). A late
 heartbeat within the consumer time is not an event (CO-037). A boot-up counts as a sign of life of a node that is being
@@ -45,7 +44,7 @@ class HeartbeatConsumer:
         self.ignored = 0
 
     def monitor(self, node: int, consumer_ms: int) -> None:
-        """Monitor `node` from its next heartbeat on, or stop monitoring it (0). A node that is already monitored stays so."""
+        """Monitor `node` from its next heartbeat on; a time of 0 stops this. A node that is already monitored stays monitored."""
         known = self._node(cob_id.check_node(node))
         if not known.consumer_ns or not consumer_ms:
             known.monitored = known.lost = False
@@ -67,7 +66,7 @@ class HeartbeatConsumer:
         return known is not None and known.lost
 
     def expect_boot_up(self, node: int) -> None:
-        """Note that the next boot-up of `node` (0: of every node) was requested."""
+        """Note that this master has requested the next boot-up of `node` (0: of every node)."""
         for known in self._nodes.values() if node == cob_id.ALL_NODES else [self._node(node)]:
             known.boot_expected = True
 

@@ -36,14 +36,14 @@ class LateReplies:
         self._outstanding: deque[Multiplexor] = deque(maxlen=MAX_OUTSTANDING)
 
     def unanswered(self, request: Multiplexor) -> None:
-        """Note that a request was given up (timeout, cancellation, protocol error): its reply may arrive later, or never."""
+        """Note that a request was given up (timeout, cancellation, protocol error). Its reply may still arrive."""
         self._outstanding.append(request)
 
     def answered(self, request: Multiplexor) -> bool:
         """Note that a reply for `request` arrived, and return whether one more reply for it may still arrive.
 
-        If an earlier request for the same object is unanswered, the reply may belong to that one: only older requests
-        are then settled, the result is True, and the caller has to expect one more reply.
+        If an earlier request for the same object is unanswered, the reply may belong to that request. Then only older requests
+        are settled, the result is True, and the caller has to expect one more reply.
         """
         while self._outstanding:
             if self._outstanding.popleft() == request:
@@ -59,7 +59,9 @@ class LateReplies:
         return request in self._outstanding
 
     def probe(self) -> Multiplexor:
-        """Return the object to probe: one without an outstanding reply, or, if all have one, that of the oldest request."""
+        """Return the object for the probe: an object without an outstanding reply, or else the one that was requested longest
+        ago.
+        """
         for candidate in PROBES:
             if candidate not in self._outstanding:
                 return candidate

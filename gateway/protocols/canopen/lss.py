@@ -75,7 +75,9 @@ def request(command: int, data: bytes = b"") -> CanFrame:
 
 
 def fastscan(number: int, bit: int, part: int, following: int) -> CanFrame:
-    """Return a fastscan request: does any slave's `part` (0 vendor to 3 serial) agree with `number` down to `bit`?"""
+    """Return a fastscan request: it asks whether a slave's `part` (0 vendor to 3 serial) agrees with `number` from bit 31 to
+    `bit`.
+    """
     return request(FASTSCAN, number.to_bytes(4, "little") + bytes([bit, part, following]))
 
 

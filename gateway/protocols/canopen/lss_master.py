@@ -1,9 +1,9 @@
 """The LSS master (CiA 305): gives node IDs and bit rates to slaves that are addressed by their identity.
 
-It is the asynchronous part around `lss`; it sends over the CANopen master and receives the frames on 7E4h. One request
-at a time. Simultaneous replies of several slaves look like one (they have the same bits), and one may arrive later than
-another. So where more than one slave may answer, the master waits for the whole reply time; otherwise a late reply
-could be taken for the answer to the next request (CO-056, CO-059).
+It is the asynchronous part around `lss`; it sends over the CANopen master, one request at a time, and receives the frames on
+7E4h. Simultaneous replies of several slaves have the same bits and look like one reply. A reply of another slave may also arrive
+later. So if more than one slave may answer, the master waits for the whole reply time; otherwise a late reply could be taken for
+the answer to the next request (CO-056, CO-059).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ STORE_S = 2.0
 class LssMaster:
     """An LSS master. `send` puts a frame on the bus; call `on_reply` with the data of each frame on 7E4h.
 
-    `ignored` counts replies that answered no request. Raises `ReplyTimeout` if no slave answers, `LssRefused` if a
+    `ignored` counts replies that answered no request. The methods raise `ReplyTimeout` if no slave answers, `LssRefused` if a
     slave refuses, and `Desync` if a reply is invalid.
     """
 
@@ -54,9 +54,9 @@ class LssMaster:
     # -- states ---------------------------------------------------------------------------------------------------
 
     async def switch_all(self, *, configuration: bool) -> None:
-        """Switch every slave to the configuration or the waiting state. Unconfirmed.
+        """Switch every slave to the configuration or the waiting state. The service is not confirmed.
 
-        A slave that had no node ID and was given one boots when it enters the waiting state.
+        A slave that had no node ID and got one boots when it enters the waiting state.
         """
         async with self._turn:
             await self._send(lss.request(lss.SWITCH_GLOBAL, bytes([configuration])))
@@ -73,14 +73,19 @@ class LssMaster:
     # -- slave in configuration -------------------------------------------------------------------------------------
 
     async def configure_node_id(self, node: int) -> None:
-        """Give the slave in configuration its node ID (255: none). It takes effect at the next reset or switch to waiting."""
+        """Assign a node ID (255: none) to the slave in the configuration state.
+
+        It takes effect at the next reset or switch to the waiting state."""
         lss.check_node_id(node)
         async with self._turn:
             reply = await self._ask([lss.request(lss.CONFIGURE_NODE_ID, bytes([node]))], lss.CONFIGURE_NODE_ID)
         lss.check_result(f"node id {node}", reply)
 
     async def configure_bit_rate(self, bit_rate: int) -> None:
-        """Give the slave in configuration a bit rate of the standard table; it takes effect with `activate_bit_rate`."""
+        """Set the bit rate of the slave in the configuration state, from the standard table.
+
+        `activate_bit_rate` makes it effective.
+        """
         if bit_rate not in lss.BIT_RATES:
             known = ", ".join(str(rate) for rate in lss.BIT_RATES)
             raise UsageError("not a bit rate of LSS", expected=known, got=str(bit_rate))
@@ -90,20 +95,23 @@ class LssMaster:
         lss.check_result(f"bit rate {bit_rate}", reply)
 
     async def activate_bit_rate(self, delay_ms: int) -> None:
-        """Make all slaves in configuration pause for `delay_ms`, change the bit rate, and pause again. Unconfirmed."""
+        """Make all slaves in the configuration state pause for `delay_ms`, change the bit rate, and pause again.
+
+        Not confirmed.
+        """
         if not 0 <= delay_ms <= 0xFFFF:
             raise UsageError("the switch delay", expected="0 to 65535 ms", got=str(delay_ms))
         async with self._turn:
             await self._send(lss.request(lss.ACTIVATE_BIT_TIMING, delay_ms.to_bytes(2, "little")))
 
     async def store(self) -> None:
-        """Make the slave in configuration save node ID and bit rate for the next power cycle."""
+        """Make the slave in the configuration state save node ID and bit rate in non-volatile memory."""
         async with self._turn:
             reply = await self._ask([lss.request(lss.STORE)], lss.STORE, wait_s=STORE_S)
         lss.check_result("store", reply)
 
     async def inquire_address(self) -> LssAddress:
-        """Read the identity of the slave in configuration."""
+        """Read the identity of the slave in the configuration state."""
         parts = []
         async with self._turn:
             for command in lss.INQUIRE:
@@ -112,24 +120,24 @@ class LssMaster:
         return LssAddress(*parts)
 
     async def inquire_node_id(self) -> int:
-        """Read the node ID of the slave in configuration: 1 to 127, or 255 if it has none."""
+        """Read the node ID of the slave in the configuration state: 1 to 127, or 255 if it has no node ID."""
         async with self._turn:
             return (await self._ask([lss.request(lss.INQUIRE_NODE_ID)], lss.INQUIRE_NODE_ID))[1]
 
     # -- finding slaves ---------------------------------------------------------------------------------------------
 
     async def any_unconfigured(self) -> bool:
-        """Return whether a slave without a node ID is on the bus (slaves with one do not answer: CO-057)."""
+        """Return whether a slave without a node ID is on the bus (slaves that have a node ID do not answer: CO-057)."""
         async with self._turn:
             return await self._anybody(lss.request(lss.IDENTIFY_NON_CONFIGURED), lss.NON_CONFIGURED_FOUND)
 
     async def fastscan(self, *, verify: bool = True) -> LssAddress | None:
-        """Find one slave without a node ID and leave it in configuration; return None if there is no such slave.
+        """Find one slave without a node ID and leave it in the configuration state; return None if there is no such slave.
 
-        If there are several, it finds the one with the smallest numbers, and the next scan finds the next one. While a
-        slave found before is still in configuration, call it without `verify`, because that slave would answer the
-        inquiry too. A scan takes 133 requests, each as long as a reply may take. Raises `Desync` if the answers
-        contradict each other, or if the slave that was found reports a different identity.
+        If there are several, it finds the slave with the smallest numbers, and the next scan finds the next slave. While a slave
+        that was found before is still in the configuration state, scan without `verify`, because that slave would answer the
+        inquiry too. A scan takes 133 requests, each as long as a reply may take. Raises `Desync` if the answers contradict each
+        other, or if the slave that was found reports a different identity.
         """
         async with self._turn:
             if not await self._anybody(lss.fastscan(0, lss.ANYBODY, 0, 0), lss.SLAVE_FOUND):
@@ -151,8 +159,8 @@ class LssMaster:
     async def assign(self, address: LssAddress, node: int, *, store: bool = True) -> int:
         """Give the slave with `address` the node ID `node` and switch it to waiting; return its previous node ID.
 
-        A slave that had none (255) boots immediately with the new node ID, any other when its communication is reset.
-        Calls of `assign` do not overlap: a slave that a different call selected would get the node ID too.
+        A slave that had no node ID (255) boots immediately with the new one; any other slave boots when its communication is
+        reset. Calls of `assign` do not overlap, because a slave that another call has selected would also get the node ID.
         """
         lss.check_node_id(node)
         async with self._procedure:
@@ -170,7 +178,7 @@ class LssMaster:
     # -- requests ---------------------------------------------------------------------------------------------------
 
     async def _ask(self, frames: list[CanFrame], expected: int, why: str = "", wait_s: float = 0.0) -> bytes:
-        """Send, and return the reply with that specifier; other replies are skipped and counted."""
+        """Send a request and return the reply with this specifier; other replies are skipped and counted."""
         self._begin()
         try:
             for frame in frames:
@@ -185,7 +193,7 @@ class LssMaster:
         raise ReplyTimeout(why or "no LSS slave answers", hint="is one in configuration state?" if not why else "")
 
     async def _anybody(self, frame: CanFrame, expected: int) -> bool:
-        """Return whether at least one slave answers, after the whole reply time, so that no late reply meets the next request."""
+        """Return whether at least one slave answers. Always wait for the whole reply time, so that no late reply is left."""
         self._begin()
         heard = False
         try:

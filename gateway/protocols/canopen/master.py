@@ -46,9 +46,8 @@ def _no_one(data: bytes, t_ns: int) -> None:
 class CanopenMaster:
     """SDO client, NMT master, heartbeat consumer, PDO and EMCY receiver for the nodes of one bus.
 
-    Nothing is received unless `run` is running. `on_event` may be set at any time. `run` calls it and the PDO
-    callbacks; they must be quick, and an exception that they raise ends `run`: an error of a callback is a bug and is
-    not hidden.
+    Frames are received only while `run` is running. `on_event` may be set at any time. `run` calls it and the PDO callbacks. They
+    must be quick. An exception in a callback is a bug, so it is not hidden: it ends `run`.
 
     `sdo_timeout_s` is the timeout for each SDO reply of a node without its own setting. `sdo_retries` is how often an
     upload without a valid reply is repeated. `sdo_transfer_s` is the longest time for a whole SDO transfer, in seconds;
@@ -103,7 +102,7 @@ class CanopenMaster:
         sdo_retries: int | None = None,
         sdo_transfer_s: float | None = None,
     ) -> None:
-        """Register `node`; with a consumer time its heartbeat is monitored from the first one on.
+        """Register `node`. If a consumer time is given, the node is monitored from its first heartbeat on.
 
         If `sdo_timeout_s`, `sdo_retries` or `sdo_transfer_s` is None, the setting of the master applies.
         """
@@ -187,25 +186,27 @@ class CanopenMaster:
         await self._transfer(lambda: SdoDownload(node, index, subindex, timeout_ns, data), retries)
 
     async def nmt(self, command: NmtCommand, node: int) -> None:
-        """Send an NMT command to `node`, or to all (0). It is not confirmed: the node's heartbeat shows the result."""
+        """Send an NMT command to `node` (0: all nodes). It is not confirmed: the node's heartbeat shows the result."""
         frame = nmt.command_frame(command, node)
         if command.boots:
             self._heartbeat.expect_boot_up(node)
         await self.send(frame)
 
     async def send(self, frame: CanFrame) -> None:
-        """Put a frame on the bus: SYNC, TIME, LSS. Waits while the transmit queue is full; raises `ConnectionLost`."""
+        """Send a SYNC, TIME or LSS frame. Waits while the transmit queue is full; raises `ConnectionLost`."""
         await self._connection.send(frame)
         self.counters.frames_out += 1
 
     def listen(self, can_id: int, callback: PdoCallback) -> None:
-        """Call `callback` for each data frame of a service that belongs to no node: 7E4h (LSS). One callback per identifier."""
+        """Call `callback` for each data frame on the identifier of a service without a node, such as 7E4h (LSS).
+
+        An identifier has only one callback."""
         if can_id in self._services:
             raise UsageError("this identifier already has a listener", got=f"{can_id:X}h")
         self._services[can_id] = callback
 
     def subscribe_pdo(self, cob_id_: int, callback: PdoCallback) -> None:
-        """Call `callback` for each data frame with that CAN-ID. Raises `UsageError` for one that a PDO must not use."""
+        """Call `callback` for each data frame with this CAN-ID. Raises `UsageError` for a CAN-ID that a PDO must not use."""
         self._pdos.setdefault(cob_id.check_pdo_cob_id(cob_id_), []).append(callback)
 
     def unsubscribe_pdo(self, cob_id_: int, callback: PdoCallback) -> None:
@@ -217,10 +218,9 @@ class CanopenMaster:
     # -- the reader -----------------------------------------------------------------------------------------------
 
     async def run(self) -> None:
-        """Receive and dispatch until cancelled or until the connection is lost; raises `ConnectionLost` then.
+        """Receive and dispatch frames until cancelled. Raises `ConnectionLost` when the connection is lost.
 
-        Heartbeats are also checked here, at their deadlines. Transfers that wait when it ends fail with
-        `ConnectionLost`.
+        Heartbeats are also checked here, at their deadlines. When this method ends, waiting transfers fail with `ConnectionLost`.
         """
         self._loop = asyncio.get_running_loop()
         self._stop(None)
@@ -238,7 +238,7 @@ class CanopenMaster:
             self._stop(reason)
 
     def _dispatch(self, frame: CanFrame) -> None:
-        """Pass a frame to its service. Extended, remote and error frames are not used by CANopen here (CO-060)."""
+        """Pass a frame to its service. Extended, remote and error frames are ignored (CO-060)."""
         self.counters.frames_in += 1
         if frame.extended or frame.remote or frame.error:
             self.counters.ignored += 1
@@ -324,7 +324,9 @@ class CanopenMaster:
             self._timer = None
 
     def _on_deadline(self) -> None:
-        """Check heartbeats up to the time of the oldest unread frame: a heartbeat that waits to be read is not late."""
+        """Check heartbeats only up to the time of the oldest unread frame, because that frame may be a heartbeat that arrived in
+        time.
+        """
         self._timer = None
         unread = self._connection.inbound.data_stream
         now_ns = self._clock.monotonic_ns()

@@ -1,4 +1,4 @@
-"""NMT: commands, states, and the events that a master reports about its nodes (CiA 301, 7.2.8 and 7.3.2).
+"""NMT commands and states, and the events that a master reports about its nodes (CiA 301, 7.2.8 and 7.3.2).
 
 Pure values, without sending or receiving.
 """
@@ -44,10 +44,10 @@ NodeEventKind = Literal["boot-up", "heartbeat-lost", "heartbeat-back", "state", 
 class NodeEvent:
     """An event concerning `node`.
 
-    `state` is the state after it (None: never received). `data` is the frame's data if a frame caused it. `t_ns` is
-    monotonic. `unexpected` marks a boot-up that this master did not request, of a node that it had received before: the
-    node restarted and has lost its configuration (CO-035). A ``conflict`` means that two nodes seem to share this node
-    ID (CO-042): `data` is the second reply to one request, or the second boot-up; `first` is the first reply, if known.
+    `state` is the node's state after the event (None: no state was ever received). `data` is the data of the frame that caused
+    the event, if any. `t_ns` is monotonic. `unexpected` marks a boot-up that this master did not request, of a node that it had
+    heard before: the node restarted and has lost its configuration (CO-035). A ``conflict`` means that two nodes seem to share
+    this node ID (CO-042): `data` is the second reply to one request, or the second boot-up; `first` is the first reply, if known.
     """
 
     node: int
@@ -60,7 +60,7 @@ class NodeEvent:
 
 
 def conflict_text(event: NodeEvent) -> str:
-    """Describe a conflict: which message was received twice, and what that means."""
+    """Return a text about a conflict: which message was received twice, and what that means."""
     end = f"two nodes seem to have the id {event.node}"
     if len(event.data) != 8:
         return f"two boot-ups in a row: {end}"
@@ -82,7 +82,7 @@ def command_frame(command: NmtCommand, node: int) -> CanFrame:
 def heartbeat_state(data: bytes) -> NmtState | None:
     """Return the state in a heartbeat or boot-up message, or None if it is neither (CO-039).
 
-    With bit 7 set it is a node guarding reply or unknown; with a length other than 1 it is not a heartbeat.
+    A heartbeat has one byte. If bit 7 is set, the message is a node guarding reply or unknown.
     """
     return _STATES.get(data[0]) if len(data) == 1 else None
 

@@ -1,7 +1,7 @@
 """PDO mappings (CiA 301, 7.5.2.36 and 7.5.2.38): the positions of objects in the 8 bytes of a PDO.
 
-Pure: takes mapping entries as 1A00h-style values, cuts data into objects. It knows no data types; `datatypes` reads
-each object.
+Pure: it takes mapping entries in the form of 1A00h and cuts data into objects. It knows no data types; `datatypes` reads each
+object.
 """
 
 from __future__ import annotations
@@ -30,8 +30,9 @@ class PdoEntry:
 
     @classmethod
     def from_word(cls, word: int) -> PdoEntry:
-        """Return the entry of an UNSIGNED32 in the node: index in bits 31 to 16, subindex in 15 to 8, length in bits in
-        7 to 0.
+        """Return the entry that a mapping record holds as UNSIGNED32.
+
+        Bits 31 to 16 are the index, 15 to 8 the subindex, 7 to 0 the length in bits.
         """
         return cls(word >> 16 & 0xFFFF, word >> 8 & 0xFF, word & 0xFF)
 
@@ -45,7 +46,7 @@ class PdoEntry:
 
 @dataclass(frozen=True, slots=True)
 class PdoMapping:
-    """Mapped objects in order, at most 64 bits together; otherwise `UsageError`.
+    """The mapped objects in order. Raises `UsageError` if they have more than 64 bits together.
 
     `bits` is the total number of bits, `length` the number of bytes of the PDO.
     """
@@ -70,8 +71,9 @@ class PdoMapping:
 
     @classmethod
     def from_words(cls, words: Iterable[int]) -> PdoMapping:
-        """Return the mapping of entries 1 to n of a mapping record (1600h, 1A00h...). Raises `Desync`, since the node
-        supplied them.
+        """Return the mapping for entries 1 to n of a mapping record (1600h, 1A00h...) that was read from a node.
+
+        Raises `Desync` if they are invalid.
         """
         try:
             return cls(tuple(PdoEntry.from_word(word) for word in words))
@@ -80,14 +82,14 @@ class PdoMapping:
 
     @classmethod
     def of(cls, objects: Iterable[tuple[int, int, int]]) -> PdoMapping:
-        """Return the mapping of (index, subindex, bits) tuples."""
+        """Return the mapping for tuples (index, subindex, bits)."""
         return cls(tuple(PdoEntry(*triple) for triple in objects))
 
     def unpack(self, data: bytes, *, exact: bool = False) -> tuple[bytes, ...]:
-        """Return the bytes of each object in order, little-endian, the last one padded with zero bits.
+        """Return the bytes of each object in order, little-endian; the last byte of each is padded with zero bits.
 
-        Raises `PdoLengthMismatch` if `data` is too short: none of it may be used (CO-043). If it is too long, the first
-        bytes are used, as the standard requires of receivers; `exact` refuses it too.
+        Raises `PdoLengthMismatch` if `data` is too short, because then none of it may be used (CO-043). If it is too long, the
+        first bytes are used, as the standard requires of receivers; with `exact` this is also an error.
         """
         if len(data) < self.length or (exact and len(data) > self.length):
             raise PdoLengthMismatch(

@@ -1,4 +1,4 @@
-"""Scan the bus for nodes: first listen for heartbeats, then ask every node ID for its device type. Reads only.
+"""Scan the bus for nodes: first listen for heartbeats, then ask every node ID for its device type. The scan writes nothing.
 
 It sends one request at a time, with a pause in between, so that a running plant is not disturbed.
 """
@@ -21,8 +21,8 @@ from fieldtwin.gateway.protocols.canopen.nmt import NmtState
 class FoundNode:
     """A node that was found.
 
-    `state` is from its heartbeat or boot-up, None if it sent none. `identity` is None if the node did not report one;
-    `answers` says whether it answers SDOs at all (a stopped node does not: CO-028).
+    `state` is the state in its heartbeat or boot-up, None if it sent neither. `identity` is None if the node did not report it.
+    `answers` says whether the node answers SDOs at all (a stopped node does not: CO-028).
     """
 
     node: int
@@ -43,8 +43,8 @@ async def scan_nodes(
 ) -> tuple[FoundNode, ...]:
     """Return the nodes of the bus, by node ID. `on_progress` is called with each node ID before it is asked.
 
-    The scan takes `listen_s`, and `timeout_s` and `pause_s` for each absent node ID: 17 s for all with these defaults.
-    Raises `ConnectionLost`.
+    The scan takes `listen_s`, plus `timeout_s` and `pause_s` for each absent node ID: with the defaults, at most 17 s. Raises
+    `ConnectionLost`.
     """
     await _pause(clock, listen_s)
     found = []

@@ -4,10 +4,10 @@ A transfer is a pure object: `start` returns the request, `feed` takes a receive
 `expire` ends the transfer when its time is over. It knows no bus, no clock and no other transfer; `late_replies`
 decides which replies may belong to an *earlier* transfer. Block transfers are in `sdo_block`.
 
-These frames are never accepted as a reply: a frame that is not 8 bytes (`tolerate_short` pads it: CO-026), of another
-COB-ID, remote, extended, or with another multiplexor (index and subindex). Such strays are counted, do not prolong the
-transfer, and end it if there are too many. Segments carry no multiplexor, so during them any protocol violation aborts
-the transfer.
+A frame is not accepted as a reply if it has fewer than 8 bytes (`tolerate_short` pads it: CO-026), a different COB-ID or a
+different multiplexor (index and subindex), or if it is a remote or extended frame. Such strays are counted, do not prolong the
+transfer, and end it if there are too many. Segments carry no multiplexor, so during them any protocol violation aborts the
+transfer.
 """
 
 from __future__ import annotations
@@ -51,7 +51,10 @@ ABORT = 0x80
 
 @dataclass(frozen=True, slots=True)
 class Send:
-    """Send this frame; the transfer continues. With `more`, `SdoTransfer.more` returns the next frame to send immediately."""
+    """The step "send this frame"; the transfer continues.
+
+    With `more`, `SdoTransfer.more` returns another frame to send immediately.
+    """
 
     frame: CanFrame
     more: bool = False
@@ -59,12 +62,12 @@ class Send:
 
 @dataclass(frozen=True, slots=True)
 class Wait:
-    """The frame advanced the transfer; nothing is to be sent yet."""
+    """The frame advanced the transfer, and there is nothing to send yet."""
 
 
 @dataclass(frozen=True, slots=True)
 class Done:
-    """The transfer succeeded. `data` is the object's value (upload) or empty (download). `last` is still to be sent."""
+    """The transfer succeeded. `data` is the object's value (upload) or empty (download). The caller still has to send `last`."""
 
     data: bytes
     last: CanFrame | None = None
@@ -72,7 +75,7 @@ class Done:
 
 @dataclass(frozen=True, slots=True)
 class Failed:
-    """The transfer failed. `abort` is to be sent first, unless the node itself aborted."""
+    """The transfer failed. The caller has to send `abort` first, unless the node itself aborted."""
 
     error: FieldtwinError
     abort: CanFrame | None
@@ -89,14 +92,14 @@ Step = Send | Wait | Done | Failed | Stray
 
 
 class TransferTooLong(ReplyTimeout):
-    """The whole transfer reached its limit. The node answers, so a repetition would take as long again."""
+    """The whole transfer reached its time limit. The node does answer, so a repetition would take just as long."""
 
 
 class SdoTransfer(ABC):
     """One transfer of one object with one node. After its end, every frame is a stray.
 
-    `timeout_ns` is for each reply and starts again with every reply that advances the transfer (CO-022). The whole
-    transfer is limited by `whole_ns`, and by `WHOLE_TIMEOUTS` and `WHOLE_NS_PER_BYTE`, whichever ends first. `answered`
+    `timeout_ns` is the timeout of each reply; it starts again with every reply that advances the transfer (CO-022). The time for
+    the whole transfer is limited by `whole_ns`, and by `WHOLE_TIMEOUTS` and `WHOLE_NS_PER_BYTE`, whichever is shorter. `answered`
     says whether the node has replied to the initiate request (or aborted).
     """
 
@@ -164,16 +167,18 @@ class SdoTransfer(ABC):
 
     @property
     def unmarked(self) -> bool:
-        """Return whether frames of the node may now look like a reply with a multiplexor without having one."""
+        """Return whether the node may now send segments that look like replies with a multiplexor."""
         return False
 
     @property
     def to_abort(self) -> bool:
-        """Return whether the node needs an abort if this transfer is abandoned: it may take the next request for a segment."""
+        """Return whether the node needs an abort if this transfer is abandoned, because it could take the next request for a
+        segment.
+        """
         return self.answered and not self.over
 
     def expire(self, now_ns: int) -> Send | Failed | None:
-        """Return the step for a reply that is overdue at `now_ns`, which usually ends the transfer; None before that."""
+        """Return the next step, usually the end of the transfer, if the reply is overdue at `now_ns`; otherwise None."""
         if self.over or now_ns < self.deadline_ns:
             return None
         if now_ns >= self._limit_ns:
@@ -229,12 +234,12 @@ class SdoTransfer(ABC):
         return self._stray("a reply to another request")
 
     def _patience_ns(self) -> int:
-        """Return how long the next frame may take."""
+        """Return the time limit for the next frame in ns."""
         return self.timeout_ns
 
     @property
     def _limit_ns(self) -> int:
-        """Return when the whole transfer is given up."""
+        """Return the time (ns) at which the whole transfer is given up."""
         slowest_ns = WHOLE_TIMEOUTS * self.timeout_ns + self._moved * WHOLE_NS_PER_BYTE
         return self._started_ns + min(max(self.whole_ns, self.timeout_ns), slowest_ns)
 
@@ -265,13 +270,13 @@ class SdoTransfer(ABC):
         return Failed(SdoAborted(self.index, self.subindex, code, abort_codes.meaning(code)), None)
 
     def _break(self, code: int, why: str, data: bytes) -> Failed:
-        """Give up because of what the node sent; the abort tells it the reason."""
+        """Give up because the node violated the protocol; the abort frame carries the reason."""
         self.over = True
         error = Desync(f"{self.name}: {why}; {abort_codes.meaning(code)}", got=data.hex(" "))
         return Failed(error, self.abort_frame(code))
 
     def _toggled(self, data: bytes) -> bool:
-        """Return whether the toggle bit is as expected (7.2.4.3.3, CO-001); if so, expect the other one next."""
+        """Return whether the toggle bit is as expected (7.2.4.3.3, CO-001); if so, expect the opposite bit next."""
         if (data[0] >> 4) & 1 != self._toggle:
             return False
         self._toggle ^= 1
@@ -279,9 +284,9 @@ class SdoTransfer(ABC):
 
 
 class SdoUpload(SdoTransfer):
-    """Read an object. `length` is its size if the caller knows it: an expedited reply may omit it (CO-029).
+    """An upload: the client reads an object. `length` is its size if the caller knows it.
 
-    Without `length` such a reply gives all 4 bytes.
+    An expedited reply may omit the size (CO-029); without `length`, all its 4 bytes then are the value.
     """
 
     _reply = _UPLOAD_REPLY
@@ -341,7 +346,10 @@ class SdoUpload(SdoTransfer):
 
 
 class SdoDownload(SdoTransfer):
-    """Write an object: 1 to 4 bytes expedited, anything else segmented (an empty value is one empty segment, CO-030)."""
+    """A download: the client writes an object.
+
+    1 to 4 bytes are expedited; all else is segmented (an empty value: one empty segment, CO-030).
+    """
 
     _reply = _DOWNLOAD_REPLY
     _segment_reply = _DOWNLOAD_SEGMENT_REPLY

@@ -1,17 +1,15 @@
 """SDO block transfers, both ways (CiA 301, 7.2.4.3.9 to 7.2.4.3.16): up to 127 segments for one acknowledgement.
 
-Pure, as `sdo`. Segments carry only a sequence number, so that a lost one can be sent again: the receiver acknowledges
-the last good one, and the rest is resent, renumbered from 1 (CO-016). Two rules ensure that the result is never a wrong
-object:
+Pure, as `sdo`. Segments carry a sequence number, so that lost segments can be sent again: the receiver acknowledges the last good
+segment, and the sender resends the rest, renumbered from 1 (CO-016). Two rules ensure that the result is never a wrong object:
 
-- When no more segments arrive, the received part of a sub-block is acknowledged. If nothing was received, the node may
-  take that for the acknowledgement of the previous sub-block and send that again. So this is done only once, and only
-  if the announced size shows in the end whether the node did so.
-- The client requests at most 63 segments per block. Their first bytes then differ from those of a reply to an upload
-  or of an abort (01h to 3Fh and 81h to BFh against 40h to 7Fh and 80h), so that segments that arrive late, after the
-  transfer was given up, cannot be taken for a reply to a later request.
+- When no more segments arrive, the client acknowledges the part of the sub-block that it received. If it received nothing, the
+node may take this for the acknowledgement of the previous sub-block and send that sub-block again. So the client does this only
+once, and only if the announced size shows in the end whether data was repeated. - The client requests at most 63 segments per
+block. Their first bytes then differ from those of a reply to an upload or of an abort (01h to 3Fh and 81h to BFh against 40h to
+7Fh and 80h), so that segments that arrive late, after the transfer was given up, cannot be taken for a reply to a later request.
 
-Finally, size and CRC are checked.
+At the end of the transfer, size and CRC are checked.
 """
 
 from __future__ import annotations
@@ -40,7 +38,8 @@ def crc16(data: bytes) -> int:
 
 
 class SdoBlockUpload(SdoUpload):
-    """Read an object in blocks. If a node answers with a plain upload instead, that is used (CO-021).
+    """An upload in blocks. If the node answers with a segmented or expedited upload instead, the transfer continues as such
+    (CO-021).
 
     `block` is the number of segments per block (1 to 127; with more than 63, late segments may be mistaken for replies,
     see the module). `switch_bytes` is the protocol switch threshold, 0 if the node must not switch.
@@ -116,7 +115,7 @@ class SdoBlockUpload(SdoUpload):
         return self._acknowledge() if last or number == self._block else Wait()
 
     def _again(self, data: bytes) -> Step:
-        """Acknowledge at the end of a sub-block of which a part is missing."""
+        """Acknowledge a sub-block that ended with a part missing."""
         self._repeats += not self._good
         if self._repeats > MAX_REPEATS:
             return self._break(abort_codes.INVALID_SEQUENCE, "blocks without new segments", data)
@@ -141,7 +140,9 @@ class SdoBlockUpload(SdoUpload):
         return Done(value, self._frame(bytes([0xA0 | _END])))
 
     def _patience_ns(self) -> int:
-        """Return half the timeout among segments, so that lost segments are requested before the node gives up."""
+        """Return the time limit for the next frame in ns: half the timeout among segments, to request lost ones before the node
+        gives up.
+        """
         return self.timeout_ns // 2 if self._may_recover() else self.timeout_ns
 
     def _may_recover(self) -> bool:
@@ -149,7 +150,7 @@ class SdoBlockUpload(SdoUpload):
         return self._in_blocks and not self._last_seen and safe
 
     def _recover(self, now_ns: int) -> Send | None:
-        """Acknowledge what has arrived, because the last segments of a sub-block were lost (CO-017)."""
+        """Acknowledge the segments that have arrived, because the last segments of the sub-block were lost (CO-017)."""
         if not self._may_recover():
             return None
         self._nudged = not self._good
@@ -159,7 +160,7 @@ class SdoBlockUpload(SdoUpload):
 
 
 class SdoBlockDownload(SdoDownload):
-    """Write an object in blocks of the size that the node requests. An early acknowledgement is accepted (CO-018)."""
+    """A download in blocks of the size that the node requests. An early acknowledgement is accepted (CO-018)."""
 
     def __init__(self, node: int, index: int, subindex: int, timeout_ns: int, data: bytes) -> None:
         super().__init__(node, index, subindex, timeout_ns, data)
@@ -238,7 +239,7 @@ class SdoBlockDownload(SdoDownload):
         return Send(self._frame(bytes([0xC0 | unused << 2 | _END]) + crc.to_bytes(2, "little")))
 
     def _recover(self, now_ns: int) -> Send | None:
-        """Send the last segment of the sub-block again, once: it may be lost, and the node waits for it (CO-017)."""
+        """Send the last segment of the sub-block again, but only once: it may be lost, and the node waits for it (CO-017)."""
         if not self.answered or self._done == self._segments or self._resent:
             return None
         self._resent = True

@@ -1,5 +1,4 @@
-"""One node's default SDO channel: one transfer at a time, and a reply is never paired with a request that it does not
-answer.
+"""One node's default SDO channel. It does one transfer at a time and never takes a reply for that to a different request.
 
 It connects the pure transfers (`sdo`), the tracking of late replies (`late_replies`) and the master, which owns the bus
 and delivers the frames on 580h + node ID. It knows nothing about the objects transferred.
@@ -61,19 +60,20 @@ class Counters:
 
 
 def is_final(data: bytes) -> bool:
-    """Return whether an SDO reply leaves no transfer open in the node: an abort, or an expedited upload's reply."""
+    """Return whether an SDO reply ends the transfer in the node: an abort, or the reply of an expedited upload."""
     return len(data) == 8 and (data[0] == ABORT or (data[0] >> 5 == 2 and bool(data[0] & 0x02)))
 
 
 def has_multiplexor(data: bytes) -> bool:
-    """Return whether an SDO reply carries a multiplexor: replies to initiate requests and aborts do. Segments may look
-    like either.
+    """Return whether an SDO reply looks like one with a multiplexor: a reply to an initiate request, or an abort.
+
+    A segment may look like either of them.
     """
     return data[0] == ABORT or data[0] >> 5 in (2, 3) or (data[0] >> 5 in (5, 6) and not data[0] & 3)
 
 
 def multiplexor_of(data: bytes) -> Multiplexor:
-    """Return index and subindex of an SDO that carries them."""
+    """Return index and subindex of an SDO frame that carries them."""
     return int.from_bytes(data[1:3], "little"), data[3]
 
 
@@ -112,9 +112,10 @@ class SdoChannel:
         """Whether replies to earlier requests for the same object could still arrive when the present transfer began."""
 
     def deliver(self, frame: CanFrame) -> bool:
-        """Take a frame of the node. Return True if it repeats an answer (CO-042): two nodes then share the node ID.
+        """Take a frame of the node. Return True if it is a second answer to one request: then two nodes share the node ID
+        (CO-042).
 
-        A reply to another client on the same SDO channel is not a repeated answer if that client's request was seen
+        A reply to another client on the same SDO channel does not count as a second answer if that client's request was seen
         (`foreign_request`).
         """
         active = self._active
@@ -127,7 +128,7 @@ class SdoChannel:
         return repeated
 
     def foreign_request(self, frame: CanFrame) -> None:
-        """Note a request of another client to the node: its reply is not a second reply to one of our requests."""
+        """Note a request of another client to the node, so that its reply is not taken for a second reply to our request."""
         self._counters.foreign_sdo_requests += 1
         if len(frame.data) == 8 and frame.data[0] >> 5 in (1, 2, 5, 6):  # not the segments of a transfer
             if len(self._foreign) >= MAX_ANSWERS:
@@ -135,9 +136,7 @@ class SdoChannel:
             self._foreign[multiplexor_of(frame.data)] = None
 
     def lose(self, error: ConnectionLost | None) -> None:
-        """Note that the bus is no longer read (None: that it is read again). Waiting transfers, and later ones, fail
-        immediately.
-        """
+        """Note that the bus is no longer read (None: that it is read again). Waiting and later transfers fail immediately."""
         self._lost = error
         self._arrived.set()
 
@@ -152,13 +151,13 @@ class SdoChannel:
             self._arrived.set()
 
     async def run(self, transfer: SdoTransfer) -> bytes:
-        """Do `transfer` after those before it. Raises `SdoAborted`, `ReplyTimeout`, `Desync` or `ConnectionLost`."""
+        """Carry out `transfer` after the queued transfers. Raises `SdoAborted`, `ReplyTimeout`, `Desync` or `ConnectionLost`."""
         async with self._turn:
             await self._settle(transfer)
             return await self._run(transfer)
 
     async def _settle(self, transfer: SdoTransfer) -> None:
-        """Make sure that no late reply can be taken for one to `transfer` (see `late_replies`)."""
+        """Make sure that no late reply can be taken for the reply to `transfer` (see `late_replies`)."""
         wanted = (transfer.index, transfer.subindex)
         if not self._late.is_ambiguous(wanted):
             return
@@ -179,7 +178,7 @@ class SdoChannel:
             raise ReplyTimeout(f"{transfer.name}: an earlier reply is still outstanding")
 
     async def _run(self, transfer: SdoTransfer) -> bytes:
-        """Drive one transfer to its end, and note whether its reply may still arrive."""
+        """Carry out one transfer to its end, and note whether its reply may still arrive."""
         if self._lost is not None:
             raise self._again(self._lost)
         request, complete = (transfer.index, transfer.subindex), False
@@ -214,7 +213,7 @@ class SdoChannel:
         self._answers[request] = self._reply
 
     def _owe(self, transfer: SdoTransfer) -> None:
-        """Keep the abort of an abandoned `transfer` (cancelled, or the bus accepts no frames), to send it later."""
+        """Keep the abort frame of an abandoned `transfer` (cancelled, or the bus accepts no frames), to send it later."""
         if transfer.to_abort:
             self._owed = transfer.abort_frame(abort_codes.GENERAL_ERROR)
 
@@ -247,7 +246,7 @@ class SdoChannel:
             step = await self._next_step(transfer)
 
     async def _after_send(self, transfer: SdoTransfer) -> Step | None:
-        """Return the next frame of several, unless a frame of the node waits to be handled (CO-018)."""
+        """Return the next frame of a sequence, unless a frame from the node waits to be handled (CO-018)."""
         await asyncio.sleep(0)  # else a bus that accepts frames immediately would never let the reader run
         return None if self._inbox else transfer.more(self._clock.monotonic_ns())
 
@@ -267,7 +266,7 @@ class SdoChannel:
         return step
 
     async def _request(self, frame: CanFrame, transfer: SdoTransfer) -> None:
-        """Send within the reply timeout: a transmit queue that never empties must not block forever (CO-063)."""
+        """Send a request within the reply timeout, because a full transmit queue must not block forever (CO-063)."""
         self._counters.sdo_requests += 1
         try:
             async with asyncio.timeout(self._left_s(transfer)):
@@ -288,7 +287,7 @@ class SdoChannel:
                     await self._send(last)
 
     async def _fail(self, failed: Failed, transfer: SdoTransfer) -> None:
-        """Send the abort, unless the node aborted, and raise the error."""
+        """Send the abort frame, unless the node itself aborted, and raise the error."""
         if isinstance(failed.error, SdoAborted):
             self._counters.sdo_aborts += 1
         if failed.abort is not None:
@@ -322,7 +321,7 @@ class SdoChannel:
         return (transfer.deadline_ns - self._clock.monotonic_ns()) / NS_PER_S
 
     def _is_foreign(self, frame: CanFrame, active: SdoTransfer | None) -> bool:
-        """Note a reply that does not answer the present request; return True if it answers an answered request again."""
+        """Note a reply that does not answer the present request. Return True if it is a second answer to an earlier request."""
         if len(frame.data) != 8 or not has_multiplexor(frame.data) or (active is not None and active.unmarked):
             return False
         request = multiplexor_of(frame.data)

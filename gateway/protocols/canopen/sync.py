@@ -1,4 +1,4 @@
-"""The SYNC and TIME producers (CiA 301, 7.2.5 and 7.2.6), which say when each frame is due.
+"""The SYNC and TIME producers (CiA 301, 7.2.5 and 7.2.6), which determine when each frame is due.
 
 Pure: `now` in, frames out. The average period is kept even if `due` is called late; missed frames are skipped and
 counted, never sent in a burst.
@@ -55,7 +55,8 @@ class _Periodic:
 
 
 class SyncProducer(_Periodic):
-    """SYNC each `period_us` (1006h). `overflow` is the counter's highest value (1019h): 2 to 240, 0 for no counter.
+    """A producer of SYNC every `period_us` (1006h). `overflow` is the counter's highest value (1019h): 2 to 240, or 0 for no
+    counter.
 
     The counter begins with 1 and counts the SYNCs that were sent.
     """
@@ -80,7 +81,9 @@ class SyncProducer(_Periodic):
 
 
 class TimeProducer(_Periodic):
-    """TIME each `period_ms`, the time of day in UTC. None while the host's clock is not set, which counts as missed."""
+    """A producer of TIME every `period_ms`, with the time of day in UTC.
+
+    While the host's clock is not set, no frame is sent, and it counts as missed."""
 
     name = "TIME"
 

@@ -1,4 +1,4 @@
-"""Detect whether more than one producer sends SYNC on a bus (CiA 301, 7.2.5 allows one).
+"""Detect whether more than one producer sends SYNC on a bus (CiA 301, 7.2.5 allows only one).
 
 All SYNCs have one identifier, so a frame does not name its producer. A second producer is detected by a SYNC that
 arrives while this master produces SYNC, by counters (1019h) that are out of order, by intervals that are alternately
@@ -24,7 +24,7 @@ _OUT_OF_ORDER = 3
 
 
 class SyncWatch:
-    """Detects a second SYNC producer; `feed` it each received SYNC.
+    """A detector of a second SYNC producer. Pass each received SYNC to `feed`.
 
     `own` says that this master produces SYNC, so that any other producer is a second one. `period_ns` is the
     communication cycle period, 0 if it is not known.
@@ -69,7 +69,7 @@ class SyncWatch:
         return f"SYNC comes at intervals of {times} in turn: there seem to be two producers"
 
     def _too_often(self) -> str:
-        """Check whether SYNCs at even intervals are more frequent than the cycle period allows."""
+        """Return whether SYNCs at even intervals are more frequent than the cycle period allows."""
         mean_ns = sum(self._intervals) / len(self._intervals)
         if not self._period_ns or mean_ns <= 0 or self._period_ns / mean_ns < _TOO_OFTEN:
             return ""

@@ -28,12 +28,12 @@ _START, _END = b":", b"\n"
 
 
 def lrc(data: bytes | bytearray) -> int:
-    """Return the check sum of an ASCII frame (SL 6.2.1), with which the bytes of the frame add up to 0 modulo 256."""
+    """Return the check sum (LRC) of an ASCII frame (SL 6.2.1). With it, the bytes of the frame add up to 0 modulo 256."""
     return -sum(data) & 0xFF
 
 
 class AsciiFramer(Framer):
-    """ASCII framing of one serial line. `echo` as in `RtuFramer`."""
+    """ASCII framing of one serial line. `echo` has the meaning it has in `RtuFramer`."""
 
     has_broadcast = True
     gap_ns = CHARACTER_GAP_NS
@@ -114,7 +114,7 @@ class AsciiFramer(Framer):
     # -- reading from the front ----------------------------------------------------------------------------------
 
     def _next_frame(self) -> bytes | None:
-        """Cut the next frame off the buffer, from its colon to its LF. Everything outside a frame is noise."""
+        """Remove the next frame, from its colon to its LF, from the buffer and return it. Everything outside a frame is noise."""
         buffer = self._buffer
         start = buffer.find(_START)
         self._skip(start if start >= 0 else len(buffer))
@@ -160,7 +160,7 @@ class AsciiFramer(Framer):
         return pdu
 
     def _strip_echo(self) -> bool:
-        """Remove the echo of the request from the front; False while it is incomplete."""
+        """Remove the echo of the request from the buffer's start; return False while the echo is incomplete."""
         start = self._buffer.find(_START)
         self._skip(len(self._buffer) if start < 0 else start)
         size = min(len(self._buffer), len(self._sent))

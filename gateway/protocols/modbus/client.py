@@ -1,7 +1,7 @@
-"""The Modbus client: one connection, one exchange at a time, one attempt each.
+"""The Modbus client. It has one connection, carries out one exchange at a time, and sends each request once.
 
-It moves bytes between a `ByteConnection` and a pure `Transaction`, keeps the silences of the line, and counts. It never
-retries, reconnects or scales: the runtime and the drivers do that. It opens nothing.
+It moves bytes between a `ByteConnection` and a pure `Transaction`, keeps the silences of the line, and counts results. It never
+retries, reconnects or scales values: the runtime and the drivers do that. It opens nothing.
 """
 
 from __future__ import annotations
@@ -54,11 +54,10 @@ _read_registers = lru_cache(maxsize=1024)(ReadRegisters)
 
 @dataclass(frozen=True, slots=True)
 class UnitPace:
-    """The timing of one unit, which applies to all its clients: how long it may take to answer, and the pause that it
-    needs.
+    """The timing of one unit: its timeout, and the pause that it needs. It applies to all users of the client.
 
-    `timeout_s` None means the same timeout as for every unit. The pause is the time from the end of an exchange with
-    the unit to the next request for it; other units may use the line meanwhile. Both are in seconds.
+    If `timeout_s` is None, the timeout of the client applies. The pause is the time from the end of an exchange with the unit to
+    the next request for it; other units may use the line meanwhile. Both are in seconds.
     """
 
     timeout_s: float | None = None
@@ -84,11 +83,11 @@ class Hold(NamedTuple):
 class ClientCounters:
     """Counters of this connection since it was opened.
 
-    Every request sent is counted in `requests` and, when it ends, in exactly one other counter: requests = broadcasts +
-    replies + exceptions + timeouts + crc_errors + desyncs + verify_failures + abandoned, plus the one in progress.
-    `replies` counts normal replies only; `broadcasts` all requests that are not answered; `abandoned` those that were
-    cancelled or lost with the connection. Of the bytes, `late_bytes` belong to late or duplicate replies, and
-    `noise_bytes` are not part of any reply to this client.
+    Every request sent is counted in `requests` and, when it ends, in exactly one other counter: requests = broadcasts + replies +
+    exceptions + timeouts + crc_errors + desyncs + verify_failures + abandoned, plus the request in progress. `replies` counts
+    normal replies only, `broadcasts` all requests that are never answered, and `abandoned` the requests that were cancelled or
+    lost with the connection. `late_bytes` counts bytes of late or duplicate replies, and `noise_bytes` those that are not part of
+    any reply to this client.
     """
 
     requests: int = 0
@@ -108,11 +107,11 @@ class ClientCounters:
 class ModbusClient:
     """A Modbus client on `connection`, which the client owns from now on.
 
-    `serial` gives the character time of a serial line. It is used for silences, and for deadlines that exclude the time
-    of transmission. Without it (RTU inside TCP) frames need no silence. `timeout_s` is the time in which a unit has to
-    answer, `turnaround_s` the time that all units get to execute a broadcast, `spacing_s` a pause after every exchange,
-    and `silence_s` the silence before a request if it is not the one of SL 2.5.1.1. `echo` and `strict` are as in
-    `RtuFramer`, `accepts_zero_id` as in `MbapFramer`. A setting that the framing does not have raises `UsageError`.
+    `serial` gives the character time of a serial line. It is used for silences, and for deadlines that exclude the time of
+    transmission. Without it (RTU inside TCP) frames need no silence. `timeout_s` is the time in which a unit has to answer,
+    `turnaround_s` the time that all units get to execute a broadcast, `spacing_s` a pause after every exchange, and `silence_s`
+    the silence before a request if it differs from that of SL 2.5.1.1. `RtuFramer` describes `echo` and `strict`, and
+    `MbapFramer` `accepts_zero_id`. A setting that the framing does not have raises `UsageError`.
     """
 
     def __init__(
@@ -216,7 +215,7 @@ class ModbusClient:
         self._spaces = self._spaces or bool(pace.spacing_s)
 
     def hurry(self, unit: int, timeout_s: float) -> None:
-        """Shorten the timeout of `unit` to `timeout_s`, and let other units use the line when it does not answer.
+        """Shorten the timeout of `unit` to `timeout_s`, and let other units use the line while its reply is outstanding.
 
         This ends with the first reply of `unit`, or with `relax`. Without a reply, the next request to `unit` waits
         until its normal timeout is also over, because a late reply does not say which request it answers (case MB-013).
@@ -228,13 +227,14 @@ class ModbusClient:
         self._hurried_ns.pop(unit, None)
 
     def hurried(self, unit: int) -> bool:
-        """Return whether the timeout of `unit` is shortened and it has not answered since."""
+        """Return whether the timeout of `unit` is shortened and the unit has not answered since then."""
         return unit in self._hurried_ns
 
     def spaced_ns(self, unit: int) -> int:
-        """Return the time from which `unit` may be asked: after its pause, and after a late reply can no longer arrive.
+        """Return the time (ns) from which `unit` may be asked, or 0 if it may be asked now.
 
-        A broadcast (unit 0) waits for the pauses of all units. The result is 0 if no wait is needed.
+        That is when its pause is over and a late reply can no longer arrive. A broadcast (unit 0) waits for the pauses of all
+        units.
         """
         if unit == 0 and self._framer.has_broadcast:
             return max(self._spaced_ns.values(), default=0)
@@ -243,7 +243,7 @@ class ModbusClient:
 
     @property
     def clear_ns(self) -> int:
-        """Return when the line can be used again if nothing arrives: now, or later after an exchange that ended badly."""
+        """Return the time (ns) when the line can be used again if nothing arrives: now, or later if the last exchange failed."""
         return self._line.clear_ns(self._clock.monotonic_ns())
 
     @property
@@ -314,7 +314,8 @@ class ModbusClient:
     ) -> dict[int, bytes]:
         """Return all objects of a category (1 basic, 2 regular, 3 extended) by their ID.
 
-        It takes as many exchanges of 2Bh/0Eh as needed; the IDs increase, so it ends. Errors as `execute`.
+        It carries out as many exchanges of 2Bh/0Eh as needed; it always ends, because the IDs have to increase. Errors as
+        `execute`.
         """
         objects: dict[int, bytes] = {}
         request = ReadDeviceIdentification(read_code)
@@ -452,7 +453,10 @@ class ModbusClient:
     # -- silence between exchanges -------------------------------------------------------------------------------
 
     def _is_silent(self) -> bool:
-        """Return whether a request may be sent immediately, which is the usual case. Otherwise call `_await_silence`."""
+        """Return whether a request may be sent immediately, which is the usual case.
+
+        If not, the caller calls `_await_silence`.
+        """
         connection = self._connection
         if connection.inbound.data_stream or connection.lost is not None:
             return False
@@ -498,7 +502,10 @@ class ModbusClient:
         self._line.may_go(now_ns)
 
     def _pass_over(self, unit: int, sent_ns: int, timeout_ns: int) -> None:
-        """Delay only the next request to a unit that did not answer within its shortened `timeout_ns`; the line stays usable."""
+        """Delay only the next request to a unit that did not answer within its shortened `timeout_ns`.
+
+        Other units can use the line.
+        """
         now_ns = self._clock.monotonic_ns()
         own_ns = round(self._timeout_of(unit) * NS_PER_S)
         self.hurried_timeouts += 1
@@ -509,7 +516,7 @@ class ModbusClient:
         self._line.passed_over(now_ns)
 
     def _note_strays(self) -> None:
-        """Note late replies of units with a shortened timeout: the unit answers, and no reply is outstanding any more."""
+        """Note late replies of units with a shortened timeout: such a unit answers, and its reply is no longer outstanding."""
         now_ns = self._clock.monotonic_ns()
         for unit, t_ns in self._framer.strays.items():
             hold = self._held.pop(unit, None)
@@ -528,13 +535,14 @@ class ModbusClient:
                 self._note_strays()
 
     def _read_until(self, deadline_ns: int) -> Coroutine[Any, Any, bytes]:
-        """Return the bytes that arrive next, or none at `deadline_ns`."""
+        """Return the bytes that arrive next, or b"" if none arrive before `deadline_ns`."""
         left_s = (deadline_ns - self._clock.monotonic_ns()) / NS_PER_S
         return self._connection.read_within(left_s if left_s > 0.0 else 0.0)
 
     async def _read_pending(self) -> bytes:
-        """Return the bytes that have already arrived, possibly none; only the first datagram, so that datagrams are
-        never joined.
+        """Return the bytes that have already arrived, possibly none.
+
+        Of datagrams, only the first one is returned, so that they are never joined.
         """
         connection = self._connection
         if not self._framer.datagrams:

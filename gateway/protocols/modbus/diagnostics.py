@@ -1,7 +1,7 @@
 """Diagnostics of a serial line: 08h, 0Bh and 0Ch (AP 6.8 to 6.10).
 
-The requests are encoded here because pymodbus has a class per sub-function, all of one shape, and cannot read the
-replies to 0Ch. The caller interprets the counters.
+This module encodes the requests itself, because pymodbus has a class for each sub-function although all have the same form, and
+it cannot read the replies to 0Ch. The caller interprets the counters.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _MOST_EVENTS = 64
 class Diagnostics(Request[DiagnosticsReply]):
     """Function 08h with one data word: loopback (sub-function 0), restart (1) and the counters (0Bh to 12h).
 
-    A unit in listen-only mode restarts without a reply, so 08h/1 may raise `ReplyTimeout` although it worked.
+    A unit in listen-only mode restarts without a reply, so 08h/1 may raise `ReplyTimeout` although the unit restarts.
     """
 
     sub_function: int
@@ -177,7 +177,7 @@ def _check_echo(sub_function: int, sent: bytes, pdu: bytes) -> None:
 
 
 def _busy(status: bytes) -> bool:
-    """Return whether a program command is being executed: the status word is then FFFFh, else 0000h (AP 6.9)."""
+    """Return whether the status word says that a program command is being executed: FFFFh, otherwise 0000h (AP 6.9)."""
     if status not in (b"\x00\x00", b"\xff\xff"):
         raise Desync("the status word of an event counter", expected="0000h or FFFFh", got=status.hex() + "h")
     return status == b"\xff\xff"

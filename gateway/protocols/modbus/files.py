@@ -1,7 +1,7 @@
 """File records and FIFO queues: 14h, 15h and 18h (AP 6.14, 6.15, 6.18).
 
-The requests are encoded here because pymodbus's classes for them check nothing and its replies to 18h cannot be framed
-(LIBRARIES). A file has a number and up to 10,000 records of one word; the device defines their meaning.
+This module encodes the requests itself, because pymodbus's classes for them check nothing, and its replies to 18h do not work
+with our framings. A file has a number and up to 10,000 records of one word; the device defines their meaning.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ class ReadFileRecords(Request[FileRecordsReply]):
 
 @dataclass(frozen=True, slots=True)
 class WriteFileRecords(Request[WriteReply]):
-    """Function 15h: (file, first record, values) groups. The reply repeats all of them, and all of it is verified."""
+    """Function 15h: groups of (file, first record, values). The reply repeats all groups, and all of them are verified."""
 
     groups: tuple[tuple[int, int, tuple[int, ...]], ...]
 

@@ -1,8 +1,7 @@
-"""The possible lengths of any RTU frame, which are needed to skip a frame that is not ours.
+"""The possible lengths of any RTU frame, which are needed to skip a frame that is not the awaited reply.
 
-On a serial line every frame of every unit arrives, including requests of another client, and only the function code and
-the byte count tell where a frame ends (AP 6). This module calculates with a frame's first bytes; it does not use check
-sums.
+A serial line carries the frames of every unit, and also requests of other clients. Only the function code and the byte count
+determine where a frame ends (AP 6). This module uses the first bytes of a frame and no check sums.
 """
 
 from __future__ import annotations

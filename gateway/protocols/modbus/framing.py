@@ -1,8 +1,8 @@
 """The interface of a framing: it turns a request PDU into a frame, and received bytes into the PDU of the awaited
 reply.
 
-Modules rtu, ascii and mbap (TCP, TLS and UDP) implement it. A framing decides which bytes are the reply, and whether
-they arrived whole; the request checks the reply's content. A framing has no clock: `now_ns` is passed.
+The modules rtu, ascii and mbap (TCP, TLS and UDP) implement it. A framing decides which bytes are the reply, and whether the
+reply is complete and undamaged; the request checks the reply's content. A framing has no clock: `now_ns` is passed.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from fieldtwin.gateway.protocols.modbus.request import Request
 class Framer(ABC):
     """The framing of one link. One request at a time: `begin`, then `feed` until it returns, raises, or time is up.
 
-    `late_bytes` counts bytes of earlier exchanges and duplicates, `noise_bytes` those of no exchange, and
-    `foreign_frames` whole frames of other devices. All three only increase.
+    `late_bytes` counts bytes of earlier exchanges and duplicates, `noise_bytes` those that belong to no exchange, and
+    `foreign_frames` complete frames of other devices. All three only increase.
     """
 
     confirms_transmission: bool = False
@@ -49,7 +49,10 @@ class Framer(ABC):
         """
 
     def _stray(self, unit: int, pdu: bytes | bytearray, now_ns: int) -> None:
-        """Note a frame of `unit` that no request awaited. A gateway's exception 0A or 0B does not show that the unit is alive."""
+        """Note a frame of `unit` that no request awaited.
+
+        Exception 0A or 0B comes from a gateway and does not show that the unit is alive.
+        """
         if not (len(pdu) >= 2 and pdu[0] & 0x80 and pdu[1] in (0x0A, 0x0B)):
             self.strays[unit] = now_ns
 
@@ -66,14 +69,17 @@ class Framer(ABC):
         """Take the bytes that arrived; return the reply PDU when it is complete. Raises `CrcError` or `Desync`."""
 
     def settle(self) -> bytes | None:
-        """Stop waiting for the rest of a frame that is not our reply, because the link has been silent for `gap_ns`. As
-        `feed`.
+        """Stop waiting for the rest of a frame that is not our reply, because the link was silent for `gap_ns`.
+
+        Returns as `feed`.
         """
         return None
 
     @abstractmethod
     def overdue(self, waited_s: float) -> WireError:
-        """Return the error for a reply that did not arrive in time: `ReplyTimeout`, or one that describes what came instead."""
+        """Return the error for a reply that did not arrive in time: `ReplyTimeout`, or an error that describes what arrived
+        instead.
+        """
 
     @abstractmethod
     def drained(self, data: bytes) -> None:

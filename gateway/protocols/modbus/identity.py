@@ -61,7 +61,7 @@ class ReportServerId(Request[ServerIdReply]):
 
 @dataclass(frozen=True, slots=True)
 class ReadDeviceIdentification(Request[DeviceIdentificationReply]):
-    """Function 2Bh/0Eh, one reply of a series. `read_code`: 1 basic, 2 regular, 3 extended, 4 only `object_id`."""
+    """Function 2Bh/0Eh: one request of a series. `read_code` is 1 (basic), 2 (regular), 3 (extended) or 4 (only `object_id`)."""
 
     read_code: int = 1
     object_id: int = 0

@@ -1,8 +1,8 @@
-"""The serial line between two exchanges: silence before a request, and quarantine after an exchange that ended badly.
+"""The serial line between two exchanges: the silence before a request, and the quarantine after a failed exchange.
 
-On a serial line a reply does not say which request it answers. So after a timeout, or when an exchange was given up, no
-request is sent until nothing has arrived for as long as the slowest reply so far took (case MB-013). Pure: it
-takes what arrived and when, and returns until when to wait. Times are monotonic nanoseconds.
+On a serial line a reply does not say which request it answers. So after a timeout, or when an exchange was given up, no request
+is sent until the line has been silent for as long as the slowest reply so far took (case MB-013). Pure: it is told what arrived
+and when, and returns the time until which to wait. Times are monotonic nanoseconds.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ _BABBLE_GRACE_NS = 500 * NS_PER_MS
 class LineSilence:
     """The times at which requests may be sent on a line.
 
-    `t35_ns` is the silence between frames (SL 2.5.1.1), 0 for none. `settle_ns` is the longest delay of the rest of a
-    damaged frame. `quarantines` is true if replies cannot be told apart. `turnaround_ns` is the pause after a request
-    that is not answered, and `spacing_ns` the pause after every other exchange, for devices that need one.
+    `t35_ns` is the silence between frames (SL 2.5.1.1), or 0. `settle_ns` is the longest time in which the rest of a damaged
+    frame may arrive. `quarantines` is true if replies do not identify their request. `turnaround_ns` is the pause after a
+    broadcast, and `spacing_ns` the pause after every other exchange, for devices that need one.
     """
 
     def __init__(
@@ -55,7 +55,7 @@ class LineSilence:
         self._turnaround_ns, self._spacing_ns = turnaround_ns, spacing_ns
 
     def may_go(self, now_ns: int) -> bool:
-        """Return whether a request may be sent now, if nothing has arrived since. If there was a quarantine, this ends it."""
+        """Return whether a request may be sent now. If so, this ends a quarantine."""
         if self._not_before_ns > now_ns or (
             self._active_ns is not None and self._active_ns + self._required_ns > now_ns
         ):
@@ -70,38 +70,37 @@ class LineSilence:
         return max(silent_ns, self._not_before_ns)
 
     def babble_ns(self, since_ns: int) -> int:
-        """Return the time from which bytes mean that the line will not become silent, if silence was awaited since `since_ns`."""
+        """Return the time at which to give up waiting for silence, if the wait began at `since_ns`."""
         return max(since_ns, self._not_before_ns) + _BABBLE_FACTOR * self._required_ns + _BABBLE_GRACE_NS
 
     def babbled(self) -> None:
-        """Discard the learned latency, because the bytes were no late reply; otherwise every quarantine would be longer
-        than the last.
+        """Discard the learned latency, because the received bytes were not a late reply.
+
+        Otherwise every quarantine would be longer than the previous one.
         """
         if self._in_quarantine:
             self.longest_latency_ns, self._required_ns = self._before_quarantine
 
     def heard(self, now_ns: int, *, live: bool) -> None:
-        """Note bytes that arrived between exchanges. `live` means that they arrived just now, so they show how late a
-        reply can be.
-        """
+        """Note bytes that arrived between exchanges. If they arrived just now (`live`), they show how late a reply can be."""
         self._active_ns = now_ns
         if live and self._in_quarantine:
             self._note_latency(now_ns)
             self._required_ns = max(self._required_ns, self.longest_latency_ns)
 
     def answered(self, now_ns: int, sent_ns: int) -> None:
-        """Note a reply, complete at `now_ns`, to the request that was sent at `sent_ns`."""
+        """Note that the reply to the request sent at `sent_ns` was complete at `now_ns`."""
         self._sent_ns = sent_ns
         if now_ns - sent_ns > self.longest_latency_ns:
             self._note_latency(now_ns)
         self._end(now_ns, self._t35_ns)
 
     def damaged(self, now_ns: int) -> None:
-        """Note a reply with a wrong check sum: no other reply will come, but the rest of this one may follow."""
+        """Note a reply with a wrong check sum. The rest of this reply may still arrive, but no other reply will."""
         self._end(now_ns, max(self._t35_ns, self._settle_ns))
 
     def given_up(self, now_ns: int, sent_ns: int, timeout_ns: int) -> None:
-        """Note an exchange that timed out, was cancelled, or was answered by a wrong frame: the reply may still arrive."""
+        """Note an exchange that timed out, was cancelled, or got a wrong frame. Its reply may still arrive."""
         self._sent_ns = sent_ns
         if self._quarantines:
             self._in_quarantine = True
@@ -109,13 +108,14 @@ class LineSilence:
             self._before_quarantine = self.longest_latency_ns, self._required_ns
 
     def passed_over(self, now_ns: int) -> None:
-        """Note that a unit did not answer and is not asked again before its reply can no longer arrive: others may use
-        the line.
+        """Note that a unit did not answer, and that the line stays usable for other units.
+
+        The caller does not ask the unit again before its late reply can no longer arrive.
         """
         self._end(now_ns, self._t35_ns)
 
     def broadcast(self, sent_ns: int) -> None:
-        """Note a broadcast. No unit answers; the units get time to execute it."""
+        """Note a broadcast: no unit answers it, and the units get time to execute it."""
         self._end(sent_ns, self._t35_ns)
         self._not_before_ns = sent_ns + max(self._turnaround_ns, self._spacing_ns)
 

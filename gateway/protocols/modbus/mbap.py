@@ -1,8 +1,8 @@
 """Modbus over TCP, TLS and UDP: the MBAP header (TG 3.1.3).
 
-A reply is identified by its transaction ID, so a late reply is recognised and discarded. In a stream, chunk boundaries
-mean nothing. After an invalid header (its length is out of bounds) or an ADU that never ends, the boundaries of ADUs
-are unknown; the stream is then searched for the header of the awaited reply. This module knows no sockets.
+The transaction ID identifies a reply, so a late reply is recognised and discarded. In a stream, chunk boundaries have no meaning.
+After an invalid header (its length is out of bounds) or an ADU that is never completed, the boundaries of ADUs are unknown; the
+stream is then searched for the header of the awaited reply. This module knows no sockets.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ class MbapFramer(Framer):
     """MBAP framing of one stream. A reply must carry the request's transaction ID, protocol ID 0 and the request's unit
     ID.
 
-    `accepts_zero_id` also accepts a reply with transaction ID 0, for servers that always send 0 (case MB-056). It has
-    to be enabled because a late reply can then no longer be recognised: such a connection is quarantined like a serial
-    line.
+    `accepts_zero_id` also accepts a reply with transaction ID 0, for servers that always send 0 (case MB-056). It has to be
+    enabled explicitly, because a late reply can then no longer be recognised. Such a connection is quarantined after an error,
+    like a serial line.
     """
 
     confirms_transmission = True
@@ -84,7 +84,7 @@ class MbapFramer(Framer):
         )
 
     def _header_for(self, adu: bytes) -> bytes | None:
-        """Return the header that `adu` has if it is the awaited reply and nothing follows it."""
+        """Return the header that `adu` must have to be the awaited reply with nothing after it."""
         length = len(adu) - _BEFORE_LENGTH_COUNTS
         if not _MIN_LENGTH <= length <= _MAX_LENGTH:
             return None
@@ -94,7 +94,7 @@ class MbapFramer(Framer):
         return transaction == self._transaction or (self._accepts_zero_id and transaction == 0)
 
     def _next_adu(self) -> bytearray | None:
-        """Cut the next whole ADU off the buffer, whether or not it is the awaited one."""
+        """Remove the next complete ADU from the buffer and return it, whether or not it is the awaited reply."""
         while True:
             if self._lost and not self._search():
                 return None
@@ -114,7 +114,7 @@ class MbapFramer(Framer):
             return adu
 
     def _search(self) -> bool:
-        """Discard everything before a header of the awaited reply; False while no such header has arrived."""
+        """Discard everything before the header of the awaited reply; return False while no such header has arrived."""
         ids = (self._transaction, 0) if self._accepts_zero_id else (self._transaction,)
         found = [at for at in (self._find_header(struct.pack(">HH", number, 0)) for number in ids) if at >= 0]
         if not found:
@@ -125,7 +125,9 @@ class MbapFramer(Framer):
         return not self._lost
 
     def _find_header(self, ids: bytes) -> int:
-        """Return the position of the first header that begins with `ids` and can be the reply's, complete or not; else -1."""
+        """Return the position of the first, possibly incomplete header that begins with `ids` and may be that of the reply, or
+        -1.
+        """
         at = 0
         while (at := self._buffer.find(ids, at)) >= 0:
             head = self._buffer[at : at + _HEADER.size]
@@ -140,14 +142,15 @@ class MbapFramer(Framer):
         del self._buffer[:count]
 
     def _drop_rest(self) -> None:
-        """Discard the bytes after the reply, which answer no request (one request at a time), but keep track of their
-        boundaries.
+        """Discard the bytes after the reply, but keep track of the boundaries of ADUs.
+
+        There is one request at a time, so these bytes answer no request.
         """
         self.feed(b"", 0)
 
 
 class UdpFramer(MbapFramer):
-    """MBAP in datagrams: each holds whole ADUs. The rest of a datagram does not continue in the next one and is dropped."""
+    """MBAP framing of datagrams. Each datagram holds complete ADUs; an incomplete ADU at its end is dropped."""
 
     datagrams = True
 

@@ -1,4 +1,4 @@
-"""Exception replies that are not a simple refusal: one type for each that a caller handles differently.
+"""Exception replies that are not a simple refusal: one type for each code that a caller handles differently.
 
 The types state only what the code means (TG 4.4.2.5, AP 7); the caller decides what to do. Every other code, vendor
 codes included, is a plain `ModbusExceptionReply`.
@@ -10,21 +10,22 @@ from fieldtwin.gateway.core.errors import ModbusExceptionReply
 
 
 class Acknowledged(ModbusExceptionReply):
-    """Code 05: the request was accepted and takes long. This is not a failure: keep polling, and do not send a write again."""
+    """Code 05: the request was accepted and takes long. This is not a failure: continue polling, and do not repeat a write."""
 
 
 class ServerBusy(ModbusExceptionReply):
-    """Code 06: the request was not accepted because the server is busy. Back off, then repeat it; there is no value."""
+    """Code 06: the request was not accepted because the server is busy. Repeat it after a pause."""
 
 
 class IllegalAddress(ModbusExceptionReply):
-    """Code 02: at least one of the addresses does not exist. A merged read that gets it may be split."""
+    """Code 02: at least one of the addresses does not exist. A read that covers several values may then be split."""
 
 
 class GatewayRefusal(ModbusExceptionReply):
-    """Codes 0A and 0B: a gateway on the way has no path to the unit (0A), or got no answer from it (0B).
+    """Codes 0A and 0B, which a gateway between client and unit sends.
 
-    The unit itself never saw the request (0A), or may have executed it (0B).
+    0A: the gateway has no path to the unit, which never received the request. 0B: the unit did not answer, but may have executed
+    the request.
     """
 
 

@@ -32,7 +32,10 @@ class WriteReply(Reply):
 
 
 class RegistersReply(Reply, msgspec.Struct, frozen=True, gc=False):
-    """Registers; `raw` is their 2 x n bytes, high byte first (AP 4.2). A struct: one is made with nearly every exchange."""
+    """Registers.
+
+    `raw` is their 2 x n bytes, high byte first (AP 4.2). This is a struct because nearly every exchange creates one.
+    """
 
     raw: bytes
     t_ns: int
@@ -74,7 +77,7 @@ class DiagnosticsReply(Reply):
 class ServerIdReply(Reply):
     """The content of a reply to function 11h (AP 6.13): everything after the byte count.
 
-    The device defines how it divides into ID, run indicator and additional data, so it is not divided here.
+    The device defines how the content divides into ID, run indicator and additional data, so it is not divided here.
     """
 
     raw: bytes

@@ -60,11 +60,11 @@ class Request(ABC, Generic[R_co]):
         """Decode a normal reply PDU, complete at `t_ns`. Raises `Desync`, or `VerifyFailed` for a write."""
 
     def nominal_length(self) -> int:
-        """Return the number of bytes of the reply PDU if it follows from the request alone, else `NEED_MORE`."""
+        """Return the number of bytes of the reply PDU if the request determines it, else `NEED_MORE`."""
         return NEED_MORE
 
     def heard_out(self) -> None:
-        """Note that the line has been silent since the last byte: a reply of unknown length ends here (SL 2.5.1.1)."""
+        """Note that the line has been silent since the last byte, which ends a reply of unknown length (SL 2.5.1.1)."""
 
     def unanswered(self, t_ns: int) -> R_co:
         """Return the result of a broadcast of this request. Raises `UsageError` if the request reads data (SL 2.1)."""
@@ -76,8 +76,8 @@ class Request(ABC, Generic[R_co]):
 def parse_reply(request: Request[R], pdu: bytes, t_ns: int) -> R:
     """Check a whole reply PDU against its request, and return the decoded reply.
 
-    Raises `ModbusExceptionReply` (any code, raw; types in `refusals`), `Desync` for a reply that does not answer this
-    request, or `VerifyFailed`.
+    Raises `ModbusExceptionReply` for an exception reply (some codes have their own types, see `refusals`), `Desync` for a reply
+    that does not answer this request, or `VerifyFailed`.
     """
     function = request.function
     if not pdu:

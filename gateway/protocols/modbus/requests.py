@@ -1,6 +1,6 @@
 """The data requests: coils, discrete inputs and registers (AP 6.1 to 6.6, 6.11, 6.12, 6.16, 6.17).
 
-Addresses are those of the PDU, 0 to 65535 (not 40001). Limits are those of the standard; a device's own are in its
+Addresses are those of the PDU, 0 to 65535 (not 40001). Limits are those of the standard; the limits of a device are in its
 profile.
 """
 
@@ -113,7 +113,7 @@ class ReadBits(Request[BitsReply]):
 
 
 class _Write(Request[WriteReply]):
-    """A write. Its reply repeats the beginning of the request, and all of that is verified (case MB-019)."""
+    """A write. Its reply repeats the beginning of the request, and all repeated bytes are verified (case MB-019)."""
 
     __slots__ = ()
     _ECHOED = 5

@@ -1,9 +1,9 @@
 """Modbus RTU: a reply is recognised by its expected length and its check sum, never by silence alone.
 
-Received bytes are read from the front. The awaited reply is taken. A frame of another device is skipped *as a whole*,
-so that nothing inside it can be mistaken for a reply; a frame of the requested unit that answers a different request is
-an error. Any other byte is noise and dropped. A foreign frame that is incomplete is waited for until the line has been
-silent for `gap_ns`: silence decides only where length and check sum cannot.
+The framer parses received bytes from the front. A frame of another device is skipped *as a whole*, so that nothing inside it can
+be mistaken for the awaited reply. A frame of the requested unit that answers a different request is an error. Any other byte is
+noise and dropped. The framer waits for the rest of an incomplete foreign frame until the line has been silent for `gap_ns`:
+silence decides only if length and check sum cannot.
 
 This module knows no ports. `char_time_ns` is only for the two silences of SL 2.5.1.1.
 """
@@ -35,10 +35,10 @@ _LAST_UNIT = 247
 class RtuFramer(Framer):
     """RTU framing of one serial line.
 
-    `echo` says that sent bytes are received first (two-wire adapters); they are removed, and a damaged echo is a
-    collision, `Desync`. `strict` discards the bytes before a pause of more than 1.5 characters, and a frame that
-    follows a foreign frame after less than 3.5 characters (SL 2.5.1.1). Use it only if the time stamps of received
-    bytes are accurate. Without `strict`, such frames are accepted.
+    `echo` says that the adapter returns the sent bytes first (two-wire adapters). They are removed; a damaged echo means a
+    collision and raises `Desync`. `strict` discards the bytes before a pause of more than 1.5 characters, and a frame that
+    follows a foreign frame after less than 3.5 characters (SL 2.5.1.1). Use it only if the time stamps of received bytes are
+    accurate. Without `strict`, such frames are accepted.
     """
 
     has_broadcast = True
@@ -146,7 +146,7 @@ class RtuFramer(Framer):
         return None
 
     def _starts_our_reply(self, request: Request[Any]) -> bool:
-        """Return whether unit ID and function are as requested and, for a normal reply, the following bytes can belong to one."""
+        """Return whether the buffer may start with our reply: unit ID, function and, for a normal reply, the next bytes match."""
         buffer = self._buffer
         if buffer[0] != self._unit:
             return False
@@ -157,7 +157,7 @@ class RtuFramer(Framer):
         return buffer[1] == request.function and request.reply_length(bytes(buffer[1:])) != IMPOSSIBLE
 
     def _take_reply(self, request: Request[Any]) -> bytes | None:
-        """Take the reply PDU from the front; None while it is incomplete. Raises if it is damaged."""
+        """Take the reply PDU from the front; return None while it is incomplete. Raises `CrcError` if it is damaged."""
         buffer = self._buffer
         if len(buffer) < 2:
             return None
@@ -183,7 +183,7 @@ class RtuFramer(Framer):
         return frame[1:-2]
 
     def _step_over(self, request: Request[Any], settled: bool) -> bool:
-        """Drop a foreign frame or a byte of noise from the front; False if that has to wait for more bytes."""
+        """Drop a foreign frame or a byte of noise from the front; return False if more bytes are needed to decide."""
         buffer = self._buffer
         if len(buffer) >= 2:
             lengths, more = self._candidates(request)
@@ -207,8 +207,9 @@ class RtuFramer(Framer):
         return True
 
     def _candidates(self, request: Request[Any]) -> tuple[list[int], bool]:
-        """Return the lengths that the frame at the front may have, including the awaited one if unit ID and function
-        are as requested.
+        """Return the possible lengths of the frame at the front.
+
+        They include the length of the awaited reply if unit ID and function are as requested.
         """
         lengths, more = frame_lengths(self._buffer)
         nominal = request.nominal_length()
@@ -238,7 +239,7 @@ class RtuFramer(Framer):
         raise Desync(other, expected=expected, got=short_hex(frame), hint=hint)
 
     def _strip_echo(self) -> bool:
-        """Remove the echo of the request from the front; False while it is incomplete."""
+        """Remove the echo of the request from the front; return False while the echo is incomplete."""
         while self._buffer and self._buffer[0] in _IDLE_NOISE and not self._sent.startswith(self._buffer[:1]):
             self._skip(1)
         size = min(len(self._buffer), len(self._sent))

@@ -1,8 +1,8 @@
-"""Analyse requests for the gateway's own servers: function, addresses, and whether the request changes anything.
+"""Analyse requests to the gateway's own servers: function, addresses, and whether the request changes anything.
 
-Pure arithmetic on a request PDU (AP 6). Quantities are checked before addresses, 03 before 02 (case MB-038), so a valid
-request can be sent to a unit, checked against an allow-list, or answered. This module must not know who sent the
-request, and holds no registers. It shares nothing with the emulators' server.
+Pure arithmetic on a request PDU (AP 6). Quantities (exception 03) are checked before addresses (02) (case MB-038). A request that
+passes can be sent to a unit, checked against an allow-list, or answered. This module must not know the sender of the request, and
+holds no registers. It shares no code with the emulators' server.
 """
 
 from __future__ import annotations
@@ -50,8 +50,7 @@ class Access:
 
 @dataclass(frozen=True, slots=True)
 class ServerRequest:
-    """A well-formed request. `reply_bytes` is the size of its normal reply PDU, 0 if it does not follow from the
-    request.
+    """A well-formed request. `reply_bytes` is the size of its normal reply PDU, or 0 if the request does not determine it.
 
     `changes` says whether it may change the unit; it is true for every unknown function. `accesses` are in the order in
     which the unit performs them.
@@ -71,7 +70,7 @@ def exception_pdu(error: ModbusExceptionReply) -> bytes:
 def examine(pdu: bytes) -> ServerRequest:
     """Read a request PDU. Raises `ModbusExceptionReply` with the code that the server has to answer: 01, 02 or 03.
 
-    A function code of 0, or from 80h on, is refused with 01 (case MB-035: one fixed choice).
+    A function code of 0, or from 80h on, is refused with 01 (case MB-035: the standard leaves the choice open).
     """
     if not pdu or not 1 <= pdu[0] <= 0x7F:
         raise refusal(pdu[0] if pdu else 0, ILLEGAL_FUNCTION)

@@ -1,7 +1,7 @@
 """A forwarded request: the PDU of a gateway's client as a `Request`, its reply returned byte for byte.
 
-The request determines the form of the reply, so a late or foreign reply is refused here as it is for the gateway's own
-requests. This module must not know who sent the request, nor a transaction ID.
+The request determines the form of the reply, so a late or foreign reply is refused as it is for the gateway's own requests. This
+module must not know the sender of the request or a transaction ID.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ class ForwardedReply(Reply):
 
 
 class Forwarded(Request[ForwardedReply]):
-    """The request `pdu` for `unit`, where `asked` is the analysis of `pdu`. Made for one exchange.
+    """The request `pdu` for `unit`, used for one exchange. `asked` is the analysis of `pdu`.
 
-    `on_line` says that the link is RTU. The reply to an unknown function then ends where the line becomes silent and
-    the check sum is right; otherwise the framing determines the end. The check sum alone would cut one reply in 256
-    short: a reply that ends in 00 looks like a shorter one followed by 00.
+    `on_line` says that the link is RTU. The reply to an unknown function then ends where the line becomes silent and the check
+    sum is right; on other links the framing determines the end. The check sum alone would cut off one reply in 256: a reply whose
+    last byte is 00 looks like a shorter reply with a 00 after it.
     """
 
     __slots__ = ("_asked", "_heard_out", "_length", "_on_line", "_pdu", "_unit")
@@ -92,7 +92,7 @@ class Forwarded(Request[ForwardedReply]):
         self._heard_out = True
 
     def _open_length(self, head: bytes) -> int:
-        """Return the length for a user-defined function: on RTU, all bytes before a silence, if their check sum is right."""
+        """Return the reply length of a user-defined function: on RTU, all bytes before a silence, if their check sum is right."""
         if not self._on_line:
             return len(head)
         if not self._heard_out or len(head) < 3 or crc16(bytes([self._unit]) + head) != 0:

@@ -1,8 +1,8 @@
-"""Modbus RTU requests, received by a server on a line that it may share: bytes and times in, requests out.
+"""Modbus RTU requests, received by a server on a line that it may share with other servers: bytes and times in, requests out.
 
-A frame is recognised by length and check sum; requests to and replies of other servers are skipped as a whole. Any
-other byte is dropped, at the latest when the line has been silent for `gap_ns` (cases MB-004, MB-030, MB-034). In
-continuous noise, only requests to the units of interest are looked for. This module knows no ports.
+A frame is recognised by length and check sum. Requests to other servers and their replies are skipped as a whole. Any other byte
+is dropped, at the latest when the line has been silent for `gap_ns` (cases MB-004, MB-030, MB-034). In continuous noise, the
+search is only for requests to the units of interest. This module knows no ports.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _USB_LATENCY_NS = 20 * NS_PER_MS  # adapters delay bytes by up to 16 ms (case MB
 
 @dataclass(frozen=True, slots=True)
 class LineRequest:
-    """A frame with a right check sum: a request, or the reply of another server, which looks the same."""
+    """A frame with a right check sum: a request, or the reply of another server, which may look like a request."""
 
     unit: int
     pdu: bytes
@@ -39,7 +39,7 @@ class LineRequest:
 
 
 class RtuRequests:
-    """The frames on a line whose characters take `char_time_ns`. Never keeps more than `MAX_FRAME` bytes for long.
+    """The receiver of frames on a line whose characters take `char_time_ns`. Its buffer is limited to about `MAX_FRAME` bytes.
 
     `units` are the unit IDs whose requests are of interest. Other frames are also returned, except in continuous noise.
     """
@@ -64,7 +64,7 @@ class RtuRequests:
         return bool(self._buffer) or bool(self._since_pause)
 
     def feed(self, data: bytes) -> list[LineRequest]:
-        """Take the bytes that arrived; return the whole frames in them, in order."""
+        """Take the bytes that arrived; return the frames that are now complete, in order."""
         self._buffer += data
         return self._scan(silent=False)
 
@@ -110,7 +110,7 @@ class RtuRequests:
         return found
 
     def _find_ours(self, silent: bool) -> bool:
-        """Drop the bytes before the next place where a request of interest may begin; False if there is no such place."""
+        """Drop the bytes before the next position where a request of interest may begin; return False if there is none."""
         match = self._ours.search(self._buffer) if self._ours is not None else None
         if match is not None:
             self._drop(match.start())

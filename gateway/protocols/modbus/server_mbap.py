@@ -1,8 +1,8 @@
-"""Modbus TCP requests, the server's side of the MBAP header (TG 3.1.3): bytes in, requests out; replies to bytes.
+"""The server's side of the MBAP header (TG 3.1.3): parses Modbus TCP requests and encodes replies.
 
-There is one object per client. An ADU of another protocol is dropped, and the stream continues. After an invalid length
-the boundaries of ADUs are unknown, so the stream is given up (`desync`) and its owner closes it. This module knows no
-sockets, units or registers.
+Each client has one object. An ADU of another protocol is dropped, and the stream continues. After an invalid length the
+boundaries of ADUs are unknown, so the stream is given up (`desync`) and its owner closes it. This module knows no sockets, units
+or registers.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class TcpRequest:
 
 
 class MbapRequests:
-    """The requests in a client's stream. Keeps less than one ADU between calls."""
+    """The parser of the requests in a client's stream. Between calls it keeps less than one ADU."""
 
     def __init__(self) -> None:
         self._buffer = bytearray()
@@ -47,7 +47,7 @@ class MbapRequests:
         return bool(self._buffer)
 
     def feed(self, data: bytes) -> list[TcpRequest]:
-        """Take the bytes that arrived; return the whole requests in them, in order."""
+        """Take the bytes that arrived; return the requests that are now complete, in order."""
         if self.desync:
             return []
         buffer = self._buffer

@@ -18,10 +18,10 @@ R = TypeVar("R", bound=Reply)
 
 
 class Transaction(Generic[R]):
-    """`request` to `unit` over `framer`; the reply is due `timeout_ns` after the last character was sent.
+    """One exchange: `request` to `unit` over `framer`. The reply is due `timeout_ns` after the last character was sent.
 
-    `char_time_ns` is the transmission time of one character, 0 if it does not matter (TCP). If the number of characters
-    of the reply follows from the request, their transmission time is added to the timeout.
+    `char_time_ns` is the transmission time of one character, 0 if it does not matter (TCP). If the request determines the length
+    of the reply, its transmission time is added to the timeout.
     """
 
     def __init__(
@@ -46,7 +46,7 @@ class Transaction(Generic[R]):
 
     @property
     def wake_ns(self) -> int:
-        """Return when `poll` has to be called if nothing arrives before."""
+        """Return the time (ns) at which `poll` has to be called if nothing arrives before."""
         if self._settled or not self._framer.gap_ns:
             return self.deadline_ns
         return min(self.deadline_ns, self._heard_ns + self._framer.gap_ns)

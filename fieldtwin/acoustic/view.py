@@ -160,13 +160,13 @@ def _states(session: RunSession) -> str:
 
 def _outputs(session: RunSession) -> str:
     """Return the values that the control logic commands."""
-    outputs = (session.gateway_status or {}).get("outputs", [])
-    return " ".join(f"{o['tag'].partition('.')[2]} {o['wanted']:g}" for o in outputs if o["wanted"] is not None)
+    outputs = session.gateway_status.outputs if session.gateway_status is not None else []
+    return " ".join(f"{o.tag.partition('.')[2]} {o.wanted:g}" for o in outputs if o.wanted is not None)
 
 
 def _devices(session: RunSession) -> str:
-    devices = (session.gateway_status or {}).get("devices", {})
-    bad = [name for name, device in devices.items() if not device["online"]]
+    devices = session.gateway_status.devices if session.gateway_status is not None else {}
+    bad = [name for name, device in devices.items() if not device.online]
     return f"{', '.join(bad)} bad" if bad else f"{len(devices)} good" if devices else ""
 
 

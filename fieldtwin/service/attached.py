@@ -61,8 +61,8 @@ def short(seen: Snapshot) -> str:
     """Return one line for `systemctl status`."""
     if seen.gateway is None or seen.plc is None:
         return f"{seen.system}: the {'gateway' if seen.gateway is None else 'PLC'} does not answer"
-    devices = seen.gateway["devices"]
-    away = [name for name, device in devices.items() if not device["online"]]
+    devices = seen.gateway.devices
+    away = [name for name, device in devices.items() if not device.online]
     text = f"{seen.system}: PLC {seen.plc.state}, {len(devices) - len(away)} of {len(devices)} devices answer"
     return text + (f"; not {', '.join(away[:5])}{'...' if len(away) > 5 else ''}" if away else "")
 

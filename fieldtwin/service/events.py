@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any
 
+from fieldtwin.gateway.runtime.gateway_status import BusStatus, DeviceStatus, GatewayStatus
 from fieldtwin.plc.status import PlcStatus
 from fieldtwin.service.metrics import Snapshot
 
@@ -39,8 +40,8 @@ def changes(before: Snapshot | None, now: Snapshot) -> list[Event]:
     """Yield the events between two snapshots. Without an earlier snapshot, everything that is not well is an event."""
     return [
         *_children(before, now),
-        *_buses(_part(before, "buses"), _part(now, "buses")),
-        *_devices(_part(before, "devices"), _part(now, "devices")),
+        *_buses(_buses_of(before), _buses_of(now)),
+        *_devices(_devices_of(before), _devices_of(now)),
         *_plc(before.plc if before else None, now.plc),
         *_reloaded(before.gateway if before else None, now.gateway),
         *_thread(before.thread if before else None, now.thread),
@@ -49,8 +50,12 @@ def changes(before: Snapshot | None, now: Snapshot) -> list[Event]:
     ]
 
 
-def _part(seen: Snapshot | None, name: str) -> Mapping[str, Status]:
-    return (seen.gateway or {}).get(name, {}) if seen is not None else {}
+def _buses_of(seen: Snapshot | None) -> Mapping[str, BusStatus]:
+    return seen.gateway.buses if seen is not None and seen.gateway is not None else {}
+
+
+def _devices_of(seen: Snapshot | None) -> Mapping[str, DeviceStatus]:
+    return seen.gateway.devices if seen is not None and seen.gateway is not None else {}
 
 
 def _children(before: Snapshot | None, now: Snapshot) -> list[Event]:
@@ -61,34 +66,30 @@ def _children(before: Snapshot | None, now: Snapshot) -> list[Event]:
     return found
 
 
-def _buses(before: Mapping[str, Status], now: Mapping[str, Status]) -> list[Event]:
+def _buses(before: Mapping[str, BusStatus], now: Mapping[str, BusStatus]) -> list[Event]:
     found = []
     for name, bus in now.items():
         was = before.get(name)
-        if bus["connected"] and (was is None or not was["connected"]):
+        if bus.connected and (was is None or not was.connected):
             found.append(Event(Priority.INFO, "bus_open", f"{name}: open", {"bus": name}))
-        elif bus["error"] and (was is None or was["error"] != bus["error"]):
-            text = f"{name}: {bus['error']}"
-            found.append(Event(Priority.ERROR, "bus_closed", text, {"bus": name, "error": bus["error"]}))
+        elif bus.error and (was is None or was.error != bus.error):
+            text = f"{name}: {bus.error}"
+            found.append(Event(Priority.ERROR, "bus_closed", text, {"bus": name, "error": bus.error}))
     return found
 
 
-def _devices(before: Mapping[str, Status], now: Mapping[str, Status]) -> list[Event]:
+def _devices(before: Mapping[str, DeviceStatus], now: Mapping[str, DeviceStatus]) -> list[Event]:
     found = []
     for name, device in now.items():
         was = before.get(name)
-        fields = {"device": name, "bus": device["bus"]}
-        if device["online"] and (was is None or not was["online"]):
+        fields = {"device": name, "bus": device.bus}
+        if device.online and (was is None or not was.online):
             found.append(Event(Priority.NOTICE, "device_online", f"{name}: answers", fields))
-        elif (
-            not device["online"]
-            and device["error"]
-            and (was is None or was["online"] or was["error"] != device["error"])
-        ):
-            named = {**fields, "error": device["error"]}
-            found.append(Event(Priority.WARNING, "device_offline", f"{name}: {device['error']}", named))
-        codes = device.get("emcy", [])
-        if codes and codes != (was or {}).get("emcy", []):
+        elif not device.online and device.error and (was is None or was.online or was.error != device.error):
+            named = {**fields, "error": device.error}
+            found.append(Event(Priority.WARNING, "device_offline", f"{name}: {device.error}", named))
+        codes = device.emcy or []
+        if codes and codes != ((was.emcy if was is not None else None) or []):
             named = {**fields, "emcy": " ".join(codes)}
             found.append(Event(Priority.WARNING, "device_emcy", f"{name}: emergency {' '.join(codes)}", named))
     return found
@@ -106,12 +107,14 @@ def _plc(before: PlcStatus | None, now: PlcStatus | None) -> list[Event]:
     return [Event(priority, "plc_state", text, {"state": now.state, "error": now.error})]
 
 
-def _reloaded(before: Status | None, now: Status | None) -> list[Event]:
+def _reloaded(before: GatewayStatus | None, now: GatewayStatus | None) -> list[Event]:
     """Return the event of a reload, regardless of its origin."""
-    if before is None or now is None or before["config"]["reloads"] == now["config"]["reloads"]:
+    if before is None or now is None or not before.config or not now.config:
         return []
-    text = "reloaded: " + "; ".join(now["config"]["changed"])
-    return [Event(Priority.NOTICE, "reloaded", text, {"hash": now["config"]["hash"]})]
+    if before.config.reloads == now.config.reloads:
+        return []
+    text = "reloaded: " + "; ".join(now.config.changed)
+    return [Event(Priority.NOTICE, "reloaded", text, {"hash": now.config.hash})]
 
 
 def _thread(before: Status | None, now: Status | None) -> list[Event]:
@@ -125,11 +128,11 @@ def _thread(before: Status | None, now: Status | None) -> list[Event]:
     return found
 
 
-def _refused(before: Status | None, now: Status | None) -> list[Event]:
+def _refused(before: GatewayStatus | None, now: GatewayStatus | None) -> list[Event]:
     """Yield writes that did not reach their device. As everywhere here, the fields contain no value."""
-    last = max((e["number"] for e in (before or {}).get("refusals", {}).get("entries", [])), default=0)
+    last = max((e["number"] for e in (before.refusals.entries if before is not None else [])), default=0)
     found = []
-    for entry in (now or {}).get("refusals", {}).get("entries", []):
+    for entry in now.refusals.entries if now is not None else []:
         if entry["number"] > last:
             priority = Priority.WARNING if entry["fault"] else Priority.NOTICE
             named = {"tag": entry["tag"], "cause": entry["cause"], "by": entry["by"], "place": entry["place"]}
@@ -138,14 +141,14 @@ def _refused(before: Status | None, now: Status | None) -> list[Event]:
     return found
 
 
-def _dropped(before: Status | None, now: Status | None) -> list[Event]:
+def _dropped(before: GatewayStatus | None, now: GatewayStatus | None) -> list[Event]:
     if now is None:
         return []
-    lost = now["log_dropped"] - (before or {}).get("log_dropped", 0)
+    lost = now.log_dropped - (before.log_dropped if before is not None else 0)
     found = []
     if lost > 0:
         text = f"the exchange log lost {lost} entries"
         found.append(Event(Priority.WARNING, "log_dropped", text, {"count": lost}))
-    if now["writes"]["safe"] and not (before or {}).get("writes", {}).get("safe", False):
+    if now.writes.safe and not (before is not None and before.writes.safe):
         found.append(Event(Priority.WARNING, "outputs_safe", "outputs are at their safe values"))
     return found

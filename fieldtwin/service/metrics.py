@@ -13,10 +13,13 @@ from dataclasses import asdict, dataclass
 from itertools import islice
 from typing import Any
 
+from msgspec import UnsetType
+
 from fieldtwin.__about__ import __version__
 from fieldtwin.gateway.core.values import Quality
 from fieldtwin.gateway.protocols.canopen.sdo_channel import Counters as CanopenCounters
 from fieldtwin.gateway.protocols.modbus.client import ClientCounters
+from fieldtwin.gateway.runtime.gateway_status import GatewayStatus
 from fieldtwin.plc.status import PlcStatus, ScanStatus, Spread
 from fieldtwin.service.exposition import Family
 
@@ -42,7 +45,7 @@ class Snapshot:
     system: str
     mode: str
     uptime_s: float
-    gateway: Status | None
+    gateway: GatewayStatus | None
     plc: PlcStatus | None
     children: Mapping[str, bool]
     asked_ago_s: float
@@ -90,7 +93,7 @@ def families(seen: Snapshot) -> list[Family]:
     return list(page.families.values())
 
 
-def _buses(page: Page, gateway: Status) -> None:
+def _buses(page: Page, gateway: GatewayStatus) -> None:
     connected = page.gauge("bus_connected", "Whether the bus's connection is open.")
     opens = page.counter(
         "bus_opens", "How often the connection was opened; more than once means that it was lost and recovered."
@@ -103,19 +106,19 @@ def _buses(page: Page, gateway: Status) -> None:
         "bus_latency_seconds", "Response times: from request to reply (Modbus), and whole SDO transfers (CANopen)."
     )
     late = page.counter("bus_not_produced", "SYNC, TIME and repeated RPDOs that could not be sent in their period.")
-    for name, bus in _some(gateway["buses"]):
-        connected.add(int(bus["connected"]), bus=name)
-        opens.add(bus["opens"], bus=name)
-        zeros = dict.fromkeys(ALWAYS["canopen" if "not_produced" in bus else "modbus"], 0)
-        for event, count in (zeros | bus["counters"]).items():
+    for name, bus in _some(gateway.buses):
+        connected.add(int(bus.connected), bus=name)
+        opens.add(bus.opens, bus=name)
+        is_can = not isinstance(bus.not_produced, UnsetType)
+        for event, count in (dict.fromkeys(ALWAYS["canopen" if is_can else "modbus"], 0) | bus.counters).items():
             events.add(count, bus=name, event=event)
-        if shape := bus.get("latency"):
+        if shape := bus.latency:
             bounds = [ms / 1000 for ms in shape["bounds_ms"]]
             latency.add_histogram(bounds, shape["counts"], shape["total_s"], bus=name)
-        late.add(bus.get("not_produced"), bus=name)
+        late.add(_set(bus.not_produced), bus=name)
 
 
-def _devices(page: Page, gateway: Status) -> None:
+def _devices(page: Page, gateway: GatewayStatus) -> None:
     online = page.gauge("device_online", "Whether a device answers and has the expected identity.")
     wrong = page.gauge("device_wrong", "Whether the device that answers differs from the one in the system file.")
     polls = page.counter("device_polls", "Polls of a device.")
@@ -125,79 +128,78 @@ def _devices(page: Page, gateway: Status) -> None:
     )
     emcys = page.counter("device_emcys", "Emergency messages of a CANopen node.")
     pdos = page.counter("device_pdos", "Process data frames, by direction from the gateway's view.")
-    devices = gateway["devices"]
+    devices = gateway.devices
     for name, device in islice(devices.items(), MOST_DEVICES):
-        labels = {"device": name, "bus": device["bus"]}
-        online.add(int(device["online"]), **labels)
-        wrong.add(int(bool(device["identity_error"])), **labels)
-        polls.add(device["polls"], **labels)
-        errors.add(device["errors"], **labels)
-        boots.add(device.get("boots"), **labels)
-        emcys.add(device.get("emcys"), **labels)
-        if "tpdos" in device:
-            pdos.add(sum(t["frames"] for t in device["tpdos"].values()), **labels, direction="in")
-            pdos.add(device["rpdos_sent"], **labels, direction="out")
+        labels = {"device": name, "bus": device.bus}
+        online.add(int(device.online), **labels)
+        wrong.add(int(bool(device.identity_error)), **labels)
+        polls.add(device.polls, **labels)
+        errors.add(device.errors, **labels)
+        boots.add(_set(device.boots), **labels)
+        emcys.add(_set(device.emcys), **labels)
+        if not isinstance(device.tpdos, UnsetType):
+            pdos.add(sum(t["frames"] for t in device.tpdos.values()), **labels, direction="in")
+            pdos.add(_set(device.rpdos_sent), **labels, direction="out")
     page.gauge("devices", "Devices of the system.").add(len(devices))
-    page.gauge("devices_online", "Devices that answer.").add(sum(bool(d["online"]) for d in devices.values()))
+    page.gauge("devices_online", "Devices that answer.").add(sum(d.online for d in devices.values()))
     page.gauge("devices_left_out", "Devices above the limit, which have no series.").add(
         max(0, len(devices) - MOST_DEVICES)
     )
 
 
-def _tags(page: Page, gateway: Status) -> None:
-    qualities = Counter(tag["quality"] for tag in gateway["tags"].values())
+def _tags(page: Page, gateway: GatewayStatus) -> None:
+    qualities = Counter(tag.quality for tag in gateway.tags.values())
     counted = page.gauge("tags", "Tags by their present quality.")
     for quality in Quality:
         counted.add(qualities[str(quality)], quality=str(quality))
-    ages = [tag["age_s"] for tag in gateway["tags"].values() if tag.get("age_s") is not None]
+    ages = [tag.age_s for tag in gateway.tags.values() if tag.age_s is not None]
     page.gauge("tags_oldest_seconds", "Age of the oldest value.").add(max(ages, default=None))
-    page.counter("published", "Values published.").add(gateway["published"])
-    page.counter("logged", "Entries of the exchange log.").add(gateway["logged"])
-    page.counter("log_dropped", "Entries that the exchange log lost.").add(gateway["log_dropped"])
-    page.counter("reloads", "Times that a changed configuration was applied.").add(gateway["config"]["reloads"])
-    page.gauge("store_ok", "Whether the last write of the log to disk succeeded.").add(
-        int(not gateway.get("store_error"))
-    )
+    page.counter("published", "Values published.").add(gateway.published)
+    page.counter("logged", "Entries of the exchange log.").add(gateway.logged)
+    page.counter("log_dropped", "Entries that the exchange log lost.").add(gateway.log_dropped)
+    if not isinstance(gateway.config, UnsetType):
+        page.counter("reloads", "Times that a changed configuration was applied.").add(gateway.config.reloads)
+    page.gauge("store_ok", "Whether the last write of the log to disk succeeded.").add(int(not gateway.store_error))
 
 
-def _writes(page: Page, gateway: Status) -> None:
-    writes = gateway["writes"]
-    page.gauge("writes_allowed", "Whether this run may write.").add(int(writes["allowed"]))
+def _writes(page: Page, gateway: GatewayStatus) -> None:
+    writes = gateway.writes
+    page.gauge("writes_allowed", "Whether this run may write.").add(int(writes.allowed))
     page.gauge("outputs_safe", "Whether the outputs are at their safe values because the PLC was lost.").add(
-        int(writes["safe"])
+        int(writes.safe)
     )
     counted = page.counter("writes", "Writes of outputs, by result; `repeated` ones are periodic repetitions.")
     for result in ("done", "failed", "refused", "repeated"):
-        counted.add(writes[result], result=result)
-    held = [o for o in gateway["outputs"] if o["wanted"] is not None and o["wanted"] != o["held"]]
+        counted.add(getattr(writes, result), result=result)
+    held = [o for o in gateway.outputs if o.wanted is not None and o.wanted != o.held]
     page.gauge("outputs_pending", "Outputs whose device does not hold the commanded value yet.").add(len(held))
-    page.gauge("plc_alive", "Whether the gateway receives the PLC's heartbeat.").add(int(gateway["plc"]["alive"]))
-    page.counter("plc_losses", "How often the gateway lost the PLC.").add(gateway["plc"]["losses"])
+    page.gauge("plc_alive", "Whether the gateway receives the PLC's heartbeat.").add(int(gateway.plc.alive))
+    page.counter("plc_losses", "How often the gateway lost the PLC.").add(gateway.plc.losses)
 
 
-def _mailboxes(page: Page, gateway: Status) -> None:
+def _mailboxes(page: Page, gateway: GatewayStatus) -> None:
     queued = page.gauge("mailbox_queued", "Queued messages of a transmitter.")
     counted = page.counter("mailbox_messages", "Messages of a transmitter, by result.")
-    for name, box in _some(gateway["mailboxes"]):
-        queued.add(box["queued"], device=name)
+    for name, box in _some(gateway.mailboxes):
+        queued.add(box.queued, device=name)
         for what in ("received", "sent", "taken", "dropped", "waits", "commands_refused"):
-            counted.add(box[what], device=name, what=what)
+            counted.add(getattr(box, what), device=name, what=what)
 
 
-def _masters(page: Page, gateway: Status) -> None:
+def _masters(page: Page, gateway: GatewayStatus) -> None:
     """Add the clients' requests: servers and bridges."""
     counted = page.counter("server_events", "Counters of a server or bridge, by event.")
-    for kind in ("serve", "bridge"):
-        for name, server in _some(gateway[kind]):
+    for kind, servers in (("serve", gateway.serve), ("bridge", gateway.bridge)):
+        for name, server in _some(servers):
             for event, count in server.items():
                 if isinstance(count, int) and not isinstance(count, bool) and event != "unit":
                     counted.add(count, kind=kind, name=name, event=event)
 
 
-def _watchers(page: Page, gateway: Status) -> None:
+def _watchers(page: Page, gateway: GatewayStatus) -> None:
     """Count devices by their problem, so that an alert needs no text matching."""
     page.gauge("devices_wrong", "Devices that differ from those in the system file.").add(
-        sum(bool(d["identity_error"]) for d in gateway["devices"].values())
+        sum(bool(d.identity_error) for d in gateway.devices.values())
     )
 
 
@@ -244,3 +246,8 @@ def _plc(page: Page, plc: PlcStatus) -> None:
 
 def _some(named: Mapping[str, Any]) -> list[tuple[str, Any]]:
     return list(islice(named.items(), MOST_NAMED))
+
+
+def _set(number: int | UnsetType) -> int | None:
+    """Return a field that some devices and buses do not have, as a sample that is left out."""
+    return None if isinstance(number, UnsetType) else number

@@ -188,7 +188,7 @@ def _encode(request_id: Any, answer: dict[str, Any]) -> bytes:
 
 
 def _jsonable(value: object) -> object:
-    return msgspec.structs.asdict(value) if isinstance(value, msgspec.Struct) else str(value)
+    return msgspec.to_builtins(value) if isinstance(value, msgspec.Struct) else str(value)
 
 
 async def _refuse_if_alive(path: Path) -> None:

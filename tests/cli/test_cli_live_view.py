@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from io import StringIO
-from typing import Any
 
 import pytest
 from msgspec import structs
 from rich.console import Console
+from statuses import gateway_status
 
 from fieldtwin.cli.run.live_view import age_text, interference, line, render, troubles, value_text
 from fieldtwin.plc.status import PlcStatus, Spread
@@ -23,27 +23,26 @@ def session() -> RunSession:
     """A run that was not started, with constructed answers of its gateway and PLC."""
     made = RunSession(RunOptions("observatory", prototype=False, duration_s=20))
     made.started_ns = made.clock.monotonic_ns()
-    online: dict[str, Any] = {"online": True, "error": "", "errors": 0}
-    made.gateway_status = {
-        "devices": {
-            "ctd": {**online, "bus": "line1", "address": 1, "online": False, "error": NOBODY},
-            "inclinometer": {**online, "bus": "can0", "address": 5},
-            "modem": {**online, "bus": "lan", "address": 1, "online": False, "error": SILENT},
+    made.gateway_status = gateway_status(
+        devices={
+            "ctd": {"bus": "line1", "online": False, "error": NOBODY},
+            "inclinometer": {"bus": "can0", "address": 5},
+            "modem": {"bus": "lan", "online": False, "error": SILENT},
         },
-        "buses": {
-            "line1": {"error": NOBODY, "counters": {}},
-            "can0": {"error": "", "counters": {"sdo_requests": 18, "sdo_replies": 17}},
-            "lan": {"error": "", "counters": {"requests": 123456, "replies": 123455}},
+        buses={
+            "line1": {"error": NOBODY},
+            "can0": {"counters": {"sdo_requests": 18, "sdo_replies": 17}},
+            "lan": {"counters": {"requests": 123456, "replies": 123455}},
         },
-        "tags": {
+        tags={
             f"{d.name}.{t.name}": {"value": 1.0 / 3, "quality": "uncertain", "reason": "not sampling", "age_s": 99.5}
             for d in made.system.devices.values()
             for t in d.profile.tags.values()
         },
-        "mailboxes": {"modem": {"received": 1, "sent": 2, "taken": 1, "queued": 0}},
-        "plc": {"alive": False},
-        "logged": 5,
-    }
+        mailboxes={"modem": {"received": 1, "sent": 2, "taken": 1, "queued": 0}},
+        plc={"alive": False},
+        logged=5,
+    )
     late: Spread = {"p50": 70.0, "p99": 2060.0, "max": 21270.0}
     made.plc_status = PlcStatus(cycle_ms=10.0, scans=707, missed_periods=2, state="running", lateness_us=late)
     return made

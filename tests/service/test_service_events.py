@@ -12,7 +12,8 @@ from typing import Any
 
 import pytest
 from msgspec import structs
-from test_service_metrics import gateway_status, plc_status, seen
+from statuses import changed
+from test_service_metrics import busy_gateway, plc_status, seen
 
 from fieldtwin.service.events import Event, Priority, changes
 from fieldtwin.service.journal import EventLog, datagram
@@ -23,11 +24,9 @@ def names(events: list[Event]) -> list[str]:
     return [event.name for event in events]
 
 
-def quiet(**changed: Any) -> Any:
-    gateway = gateway_status()
-    gateway["writes"]["safe"] = False
-    gateway["log_dropped"] = 0
-    return seen(gateway=gateway, plc=plc_status(), **changed)
+def quiet(**others: Any) -> Any:
+    gateway = changed(busy_gateway(), writes={"safe": False}, log_dropped=0)
+    return seen(gateway=gateway, plc=plc_status(), **others)
 
 
 def test_no_change_gives_no_event() -> None:
@@ -38,13 +37,15 @@ def test_a_change_is_reported_once() -> None:
     before, after = quiet(), quiet()
     assert after.gateway is not None
     assert after.plc is not None
-    after.gateway["devices"]["ctd0"].update(online=False, error="no reply")
-    after.gateway["devices"]["tilt"].update(online=True, emcy=["8130h"])
-    after.gateway["buses"]["line1"].update(connected=False, error="no such device")
-    after.gateway["writes"]["safe"] = True
-    after.gateway["log_dropped"] = 4
-    after.gateway["config"] = {**after.gateway["config"], "reloads": 4}
-    after = replace(after, plc=structs.replace(after.plc, state="stopped", error="division by zero"))
+    gateway = changed(
+        after.gateway,
+        devices={"ctd0": {"online": False, "error": "no reply"}, "tilt": {"online": True, "emcy": ["8130h"]}},
+        buses={"line1": {"connected": False, "error": "no such device"}},
+        writes={"safe": True},
+        log_dropped=4,
+        config={"reloads": 4},
+    )
+    after = replace(after, gateway=gateway, plc=structs.replace(after.plc, state="stopped", error="division by zero"))
     told = changes(before, after)
     assert names(told) == [
         "bus_closed",

@@ -10,47 +10,46 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from prometheus_client.parser import text_string_to_metric_families
+from statuses import gateway_status
 from support import run
 
 from fieldtwin.gateway.core.errors import EndpointBusy, UsageError
 from fieldtwin.gateway.core.histogram import RESPONSE_MS, response_times
+from fieldtwin.gateway.runtime.gateway_status import GatewayStatus
 from fieldtwin.plc.status import PlcStatus, Spread, TaskStatus
 from fieldtwin.service.exposition import CONTENT_TYPE, Family, render
 from fieldtwin.service.metrics import MOST_DEVICES, Snapshot, families
 from fieldtwin.service.metrics_server import MOST_CLIENTS, MetricsServer, parse_place
 
 
-def device(bus: str, online: bool = True, **more: Any) -> dict[str, Any]:
-    status = {"bus": bus, "address": 1, "online": online, "error": "", "identity_error": "", "polls": 7, "errors": 2}
-    return {**status, **more}
-
-
-def gateway_status(devices: int = 1) -> dict[str, Any]:
+def busy_gateway(devices: int = 1) -> GatewayStatus:
     latency = response_times()
     latency.record(3_000_000)
     latency.record(9_000_000_000)
-    return {
-        "devices": {
-            **{f"ctd{i}": device("line1") for i in range(devices)},
-            "tilt": device("can0", False, boots=3, emcys=1, tpdos={"1": {"frames": 5}}, rpdos_sent=4),
+    counted = {"polls": 7, "errors": 2}
+    node = {"boots": 3, "emcys": 1, "tpdos": {"1": {"frames": 5}}, "rpdos_sent": 4}
+    return gateway_status(
+        devices={
+            **{f"ctd{i}": counted for i in range(devices)},
+            "tilt": {**counted, **node, "bus": "can0", "online": False},
         },
-        "buses": {
-            "line1": {
-                "connected": True,
-                "opens": 2,
-                "error": "",
-                "counters": {"requests": 9, "timeouts": 1},
-                "latency": latency.describe(),
+        buses={
+            "line1": {"opens": 2, "counters": {"requests": 9, "timeouts": 1}, "latency": latency.describe()},
+            "can0": {
+                "connected": False,
+                "error": "down",
+                "counters": {"pdos": 5},
+                "not_produced": 6,
+                "sync_producers": "",
             },
-            "can0": {"connected": False, "opens": 1, "error": "down", "counters": {"pdos": 5}, "not_produced": 6},
         },
-        "tags": {
-            "ctd.pressure": {"value": 31337.25, "quality": "good", "age_s": 0.5},
-            "ctd.secret": {"value": "geheim", "quality": "bad", "age_s": None},
+        tags={
+            "ctd.pressure": {"value": 31337.25, "age_s": 0.5},
+            "ctd.secret": {"value": "geheim", "quality": "bad"},
         },
-        "outputs": [{"tag": "ctd.period", "wanted": 2, "held": 1}],
-        "writes": {"allowed": False, "done": 1, "failed": 2, "refused": 3, "repeated": 4, "safe": True},
-        "mailboxes": {
+        outputs=[{"tag": "ctd.period", "wanted": 2, "held": 1}],
+        writes={"done": 1, "failed": 2, "refused": 3, "repeated": 4, "safe": True},
+        mailboxes={
             "modem": {
                 "received": 1,
                 "sent": 2,
@@ -61,15 +60,18 @@ def gateway_status(devices: int = 1) -> dict[str, Any]:
                 "commands_refused": 7,
             }
         },
-        "plc": {"alive": True, "losses": 1},
-        "serve": {"hmi": {"listening": "tcp://x:1", "requests": 11, "clients": [], "unit": 1}},
-        "bridge": {},
-        "published": 83,
-        "logged": 2,
-        "log_dropped": 1,
-        "config": {"hash": "ab12", "reloads": 3, "changed": ["devices.ctd0.poll.values.every_ms: 500 -> 250"]},
-        "store_error": "",
-    }
+        plc={"losses": 1},
+        serve={"hmi": {"listening": "tcp://x:1", "requests": 11, "clients": [], "unit": 1}},
+        published=83,
+        logged=2,
+        log_dropped=1,
+        config={
+            "system": "observatory",
+            "hash": "ab12",
+            "reloads": 3,
+            "changed": ["devices.ctd0.poll.values.every_ms: 500 -> 250"],
+        },
+    )
 
 
 def plc_status() -> PlcStatus:
@@ -82,7 +84,7 @@ def plc_status() -> PlcStatus:
 
 
 def seen(**changed: Any) -> Snapshot:
-    whole = Snapshot("observatory", "plant", 12.5, gateway_status(), plc_status(), {"gateway": True, "plc": True}, 0.1)
+    whole = Snapshot("observatory", "plant", 12.5, busy_gateway(), plc_status(), {"gateway": True, "plc": True}, 0.1)
     return replace(whole, **changed)
 
 
@@ -215,7 +217,7 @@ def test_a_process_that_does_not_answer_is_down_and_has_no_metrics() -> None:
 
 
 def test_series_are_bounded() -> None:
-    got = scraped(render(families(seen(gateway=gateway_status(MOST_DEVICES + 4)))))
+    got = scraped(render(families(seen(gateway=busy_gateway(MOST_DEVICES + 4)))))
     assert sum(name == "fieldtwin_device_online" for name, _ in got) == MOST_DEVICES
     assert value(got, "devices_left_out") == 5
     assert value(got, "devices") == MOST_DEVICES + 5

@@ -28,6 +28,7 @@ from fieldtwin.gateway.core.errors import Unreachable, UsageError
 from fieldtwin.gateway.devices.register_device import RegisterDriver
 from fieldtwin.gateway.runtime.audit_log import AuditLog
 from fieldtwin.gateway.runtime.buses.learnt_gaps import LearntFile, describe_learnt
+from fieldtwin.gateway.runtime.gateway_status import ConfigStatus, GatewayStatus
 from fieldtwin.gateway.runtime.mailboxes.acked_commands import AckedCommandStore
 from fieldtwin.gateway.runtime.reconfigure import reconfigure
 from fieldtwin.gateway.runtime.status import describe
@@ -189,21 +190,18 @@ class GatewayProcess:
     async def _ready(self, args: dict[str, Any]) -> dict[str, Any]:
         return {"ready": True, "pid": os.getpid()}
 
-    async def _get(self, args: dict[str, Any]) -> dict[str, Any]:
+    async def _get(self, args: dict[str, Any]) -> GatewayStatus:
         return self._status()
 
-    def _status(self) -> dict[str, Any]:
-        return {
-            **describe(self._gateway, self._clock.monotonic_ns()),
-            "learnt": describe_learnt(self._gateway.drivers.values()),
-            "store_error": self._store_error,
-            "config": {
-                "system": self._system.name,
-                "hash": self._system.hash,
-                "reloads": self._reloads,
-                "changed": self._changed,
-            },
-        }
+    def _status(self) -> GatewayStatus:
+        return msgspec.structs.replace(
+            describe(self._gateway, self._clock.monotonic_ns()),
+            learnt=describe_learnt(self._gateway.drivers.values()),
+            store_error=self._store_error,
+            config=ConfigStatus(
+                system=self._system.name, hash=self._system.hash, reloads=self._reloads, changed=self._changed
+            ),
+        )
 
     async def _published(self, args: dict[str, Any]) -> dict[str, Any]:
         """Return at most `PUBLISHED_AT_ONCE` entries, the oldest first; a caller that needs more asks again."""
@@ -286,7 +284,7 @@ class GatewayProcess:
             self._learnt.save()
         status = self._status()
         asyncio.get_running_loop().call_later(0.05, self._stop.set)
-        return {"safe": safe, "status": status}
+        return {"safe": safe, "status": msgspec.to_builtins(status)}
 
 
 def _plain(value: object) -> object:

@@ -6,6 +6,7 @@ Everything comes from the session's statuses; this module only formats text.
 from __future__ import annotations
 
 import asyncio
+from itertools import islice
 from types import TracebackType
 from typing import Any
 
@@ -17,6 +18,7 @@ from rich.text import Text
 
 from fieldtwin.cli.run.plc_views import acts_text, waiting_texts, without_texts
 from fieldtwin.console import stderr, stdout
+from fieldtwin.gateway.runtime.gateway_status import BusStatus, GatewayStatus
 from fieldtwin.plc.status import PlcStatus
 from fieldtwin.results.trace import refusal_text
 from fieldtwin.run.live.session import RunSession
@@ -125,12 +127,18 @@ class LiveView:
 
 def ports(session: RunSession) -> list[str]:
     """Return where the gateway serves tags and lets clients reach units."""
-    gateway = session.gateway_status or {}
+    return [f"{kind} {name}  ←  {front['listening']}" for kind, name, front in _fronts(session) if front["listening"]]
+
+
+def _fronts(session: RunSession) -> list[tuple[str, str, dict[str, Any]]]:
+    """Return kind, name and status of each server and bridge."""
+    gateway = session.gateway_status
+    if gateway is None:
+        return []
     return [
-        f"{kind} {name}  ←  {front['listening']}"
-        for kind in ("serve", "bridge")
-        for name, front in gateway.get(kind, {}).items()
-        if front["listening"]
+        (kind, name, front)
+        for kind, fronts in (("serve", gateway.serve), ("bridge", gateway.bridge))
+        for name, front in fronts.items()
     ]
 
 
@@ -143,31 +151,31 @@ def troubles(session: RunSession) -> list[str]:
     They are errors of the run, buses that cannot be opened, devices that do not answer, and what stopped the PLC, the digital
     thread's carrier or its store.
     """
-    gateway = session.gateway_status or {}
+    gateway = session.gateway_status
     found = list(session.errors)
     if session.field_return is not None and (trouble := session.field_return.trouble):
         found.append(trouble)
-    closed = {name: bus["error"] for name, bus in gateway.get("buses", {}).items() if bus["error"]}
+    closed = {name: bus.error for name, bus in (gateway.buses if gateway else {}).items() if bus.error}
     found += [f"{name}: {error}" for name, error in closed.items()]
-    for kind in ("serve", "bridge"):
-        found += [f"{kind} {name}: {front['error']}" for name, front in gateway.get(kind, {}).items() if front["error"]]
-    for name, device in gateway.get("devices", {}).items():
-        if device["error"] and device["error"] != closed.get(device["bus"]):
-            found.append(f"{name}: {device['error']}")
+    found += [f"{kind} {name}: {front['error']}" for kind, name, front in _fronts(session) if front["error"]]
+    for name, device in (gateway.devices if gateway else {}).items():
+        if device.error and device.error != closed.get(device.bus):
+            found.append(f"{name}: {device.error}")
     if session.plc_status is not None and session.plc_status.error:
         found.append(f"PLC: {session.plc_status.error}")
-    found += refused(gateway)
+    if gateway is not None:
+        found += refused(gateway)
     thread = session.thread_status or {}
     found += [f"{what}: {text}" for what, key in THREAD_TROUBLES if (text := thread.get(key))]
     return found
 
 
-def refused(gateway: dict[str, Any]) -> list[str]:
+def refused(gateway: GatewayStatus) -> list[str]:
     """Return the refused outputs, each with its value, the reason and the program's line.
 
     In a read-only plant one line stands for all outputs that are not written by design.
     """
-    entries = [e for e in gateway.get("refusals", {}).get("entries", []) if e["standing"]]
+    entries = [e for e in gateway.refusals.entries if e["standing"]]
     by_design = {e["tag"] for e in entries if e["cause"] == READ_ONLY}
     found = [refusal_text(e["tag"], e) for e in entries if e["cause"] != READ_ONLY]
     if by_design:
@@ -205,15 +213,14 @@ def forces_text(forces: dict[str, Any]) -> str:
 
 def line(session: RunSession) -> str:
     """Return the state of the run as one line."""
-    gateway, plc = session.gateway_status or {}, session.plc_status
+    gateway, plc = session.gateway_status, session.plc_status
     parts = [f"t={session.elapsed_s:.0f}s"]
     parts += [f"{program}={state}" for program, state in session.states.current.items()]
-    for name, device in gateway.get("devices", {}).items():
-        parts.append(f"{name}={'good' if device['online'] else 'bad'}")
-    tags = gateway.get("tags", {})
-    parts.append(f"tags_good={sum(t['quality'] == 'good' for t in tags.values())}/{len(tags)}")
-    requests = sum(_requests(bus) for bus in gateway.get("buses", {}).values())
-    parts.append(f"requests={requests}")
+    if gateway is not None:
+        parts += [f"{name}={'good' if device.online else 'bad'}" for name, device in gateway.devices.items()]
+    tags = gateway.tags if gateway is not None else {}
+    parts.append(f"tags_good={sum(t.quality == 'good' for t in tags.values())}/{len(tags)}")
+    parts.append(f"requests={sum(map(_requests, gateway.buses.values())) if gateway is not None else 0}")
     if plc is not None and session.system.plc.programs:
         parts.append(f"scans={plc.scans} late_p99_us={_p99(plc)}")
     parts.append(f"errors={len(session.errors)}")
@@ -223,13 +230,13 @@ def line(session: RunSession) -> str:
         parts.append(f"PLC WAITING={','.join(plc.waiting)}")
     if plc is not None and plc.forces:
         parts.append(f"FORCED={','.join(plc.forces)}")
-    if not gateway.get("plc", {}).get("alive", True):
+    if gateway is not None and not gateway.plc.alive:
         parts.append("PLC LOST")
     return " ".join(parts)
 
 
-def _requests(bus: dict[str, Any]) -> int:
-    return int(bus["counters"].get("requests", 0) or bus["counters"].get("sdo_requests", 0))
+def _requests(bus: BusStatus) -> int:
+    return bus.counters.get("requests", 0) or bus.counters.get("sdo_requests", 0)
 
 
 def _p99(plc: PlcStatus) -> str:
@@ -269,18 +276,17 @@ def _devices(session: RunSession) -> Table:
         ("errors", "right"),
     ):
         table.add_column(column, justify=justify, no_wrap=True)  # type: ignore[arg-type]
-    gateway = session.gateway_status or {}
-    buses = gateway.get("buses", {})
-    for name, device in gateway.get("devices", {}).items():
-        counters = buses.get(device["bus"], {}).get("counters", {})
-        good = device["online"]
+    gateway = session.gateway_status
+    for name, device in (gateway.devices if gateway is not None else {}).items():
+        counters = gateway.buses[device.bus].counters if gateway is not None else {}
+        good = device.online
         table.add_row(
             name,
             Text("good", "green") if good else Text("bad", "red"),  # the reason is shown below, where there is room
-            f"{device['bus']}:{device['address']}",
+            f"{device.bus}:{device.address}",
             str(counters.get("requests", counters.get("sdo_requests", 0))),
             str(counters.get("replies", counters.get("sdo_replies", 0))),
-            str(device["errors"]),
+            str(device.errors),
         )
     return table
 
@@ -296,14 +302,15 @@ def _tags(session: RunSession) -> Table:
         f"{d.name}.{t.name}" for d in session.system.devices.values() for t in d.profile.tags.values() if t.secret
     }
     units = {f"{d.name}.{t.name}": t.unit for d in session.system.devices.values() for t in d.profile.tags.values()}
-    for name, tag in list((session.gateway_status or {}).get("tags", {}).items())[:MAX_TAGS]:
-        quality = tag["quality"] + (f" ({tag['reason']})" if tag["reason"] != "none" else "")
+    tags = session.gateway_status.tags if session.gateway_status is not None else {}
+    for name, tag in islice(tags.items(), MAX_TAGS):
+        quality = tag.quality + (f" ({tag.reason})" if tag.reason != "none" else "")
         table.add_row(
             name,
-            "(secret)" if name in secrets else value_text(tag["value"]),
+            "(secret)" if name in secrets else value_text(tag.value),
             units.get(name, ""),
-            Text(quality, COLOUR.get(tag["quality"], "")),
-            age_text(tag["age_s"]),
+            Text(quality, COLOUR.get(tag.quality, "")),
+            age_text(tag.age_s),
         )
     return table
 
@@ -320,7 +327,7 @@ def age_text(age_s: float | None) -> str:
 
 
 def _foot(session: RunSession) -> Text:
-    gateway, plc = session.gateway_status or {}, session.plc_status
+    gateway, plc = session.gateway_status, session.plc_status
     text = Text()
     if plc is not None and session.system.plc.programs:
         late = plc.lateness_us
@@ -330,11 +337,11 @@ def _foot(session: RunSession) -> Text:
         text.append(f"  missed {plc.missed_periods}  {plc.state}")
     elif plc is None and session.children.get("plc"):
         text.append("PLC: no answer", "bold red")
-    for name, box in gateway.get("mailboxes", {}).items():
+    for name, box in (gateway.mailboxes if gateway is not None else {}).items():
         text.append(f"\n{name} ", "dim")
-        text.append(f"received {box['received']}  sent {box['sent']}  taken {box['taken']}  waiting {box['queued']}")
+        text.append(f"received {box.received}  sent {box.sent}  taken {box.taken}  waiting {box.queued}")
     text.append("\nlogged ", "dim")
-    text.append(f"{gateway.get('logged', 0)}")
+    text.append(f"{gateway.logged if gateway is not None else 0}")
     if session.options.prototype:
         oracle = session.oracle.describe()
         text.append(f"   published values checked {oracle['checked']}, wrong {oracle['wrong']}")

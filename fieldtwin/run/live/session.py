@@ -23,6 +23,7 @@ from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.control import ControlClient, OtherVersion
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import FieldtwinError, ReplyTimeout, Unreachable, UsageError
+from fieldtwin.gateway.runtime.gateway_status import GatewayStatus
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.plc.status import PlcStatus
 from fieldtwin.results.trace import Trace
@@ -116,7 +117,7 @@ class RunSession(AsyncResource):
         self._judging: asyncio.Task[None] | None = None
         self.states = StateWatch(self.system)
         self.shore: TopsideController | None = None
-        self.gateway_status: dict[str, Any] | None = None
+        self.gateway_status: GatewayStatus | None = None
         self.plc_status: PlcStatus | None = None
         self.field_status: FieldStatus | None = None
         self.outputs_confirmed_safe: bool | None = None
@@ -444,7 +445,9 @@ class RunSession(AsyncResource):
 
     async def refresh(self) -> None:
         """Ask every process for its status."""
-        self.gateway_status = await self._get(self._clients.get("gateway"), "gateway")
+        self.gateway_status = await self._answer(
+            self._clients.get("gateway"), "gateway", lambda c: c.ask("get", GatewayStatus, ANSWERS_WITHIN_S)
+        )
         self.plc_status = await self._answer(
             self._clients.get("plc"), "plc", lambda c: c.ask("get", PlcStatus, ANSWERS_WITHIN_S, brief=True)
         )
@@ -549,7 +552,8 @@ class RunSession(AsyncResource):
         if gateway is not None:
             try:
                 answer = await gateway.call("stop", timeout_s=2.0)
-                self.outputs_confirmed_safe, self.gateway_status = answer["safe"], answer["status"]
+                self.outputs_confirmed_safe = answer["safe"]
+                self.gateway_status = msgspec.convert(answer["status"], GatewayStatus)
             except FieldtwinError as e:
                 self.note_error(f"the gateway did not stop in order: {e}")
         self.field_status = await self._ask_field("") or self.field_status

@@ -10,6 +10,7 @@ import msgspec
 
 from fieldtwin.__about__ import __version__
 from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.runtime.gateway_status import BusStatus, GatewayStatus, RefusalsStatus
 from fieldtwin.plc.status import PlcStatus
 from fieldtwin.plc.task import StopReason
 from fieldtwin.results.trace import refusal_text
@@ -35,7 +36,7 @@ class RunFacts:
     """There were no faults, or the last one has been over for long enough that the system must have recovered."""
     errors: Sequence[str]
     """The errors that the run noted while it ran."""
-    gateway: Mapping[str, Any] | None
+    gateway: GatewayStatus | None
     """The last status of the gateway; None if it did not answer at the end. `plc` and `field` likewise."""
     plc: PlcStatus | None
     field: FieldStatus | None
@@ -75,19 +76,18 @@ NOT_CALM = "whether devices and outputs were good at the end, because faults wer
 
 def summarise(run: RunFacts) -> dict[str, Any]:
     """Return plain data for `--json` and for printing. `ok` is False when any check failed; `errors` lists the reasons."""
-    gateway, plc, field = run.gateway or {}, run.plc, run.field
+    gateway, plc, field = run.gateway, run.plc, run.field
     exchanges = _exchanges(run)
-    checks = [*_plc_checks(plc), *_loss_checks(gateway)]
-    if run.gateway is None:
-        checks.append(GATEWAY_GONE)
+    checks = [*_plc_checks(plc), *(_loss_checks(gateway) if gateway is not None else [GATEWAY_GONE])]
     disturbed = run.prototype and run.disturbed
-    if run.calm:
+    if run.calm and gateway is not None:
         checks = [*_device_checks(gateway, disturbed), *_output_checks(gateway), *checks]
     if run.prototype:
         checks += _published_checks(run) + ([] if run.disturbed else exchange_checks(exchanges) + _state_checks(run))
     told = msgspec.to_builtins(plc) if plc is not None else {}
-    refusals = gateway.get("refusals", {})
-    checks += _refusal_checks(refusals, run.may_refuse, disturbed=disturbed)
+    if gateway is not None:
+        checks += _refusal_checks(gateway.refusals, run.may_refuse, disturbed=disturbed)
+    seen = msgspec.to_builtins(gateway) if gateway is not None else {}
     errors = [*run.errors, *run.invariant_errors, *checks]
     return {
         "fieldtwin": __version__,
@@ -103,15 +103,15 @@ def summarise(run: RunFacts) -> dict[str, Any]:
         "transitions": {p: [[round(t, 3), s] for t, s in seen] for p, seen in run.states.transitions.items()},
         "exchanges": exchanges,
         "faults": field.struck if field is not None else [],
-        "published": {"values": gateway.get("published"), **run.published},
-        "mailboxes": gateway.get("mailboxes", {}),
+        "published": {"values": seen.get("published"), **run.published},
+        "mailboxes": seen.get("mailboxes", {}),
         "far_end": run.topside,
         "field": run.field_contact,
         "thread": run.thread,
-        "learnt": gateway.get("learnt", {}),
-        "logged": gateway.get("logged", 0),
-        "writes": gateway.get("writes", {}),
-        "refused": refusals.get("entries", []),
+        "learnt": seen.get("learnt", {}),
+        "logged": seen.get("logged", 0),
+        "writes": seen.get("writes", {}),
+        "refused": gateway.refusals.entries if gateway is not None else [],
         "invariants": list(run.invariants),
         "outputs_safe": run.outputs_confirmed_safe,
         "plc": {
@@ -133,30 +133,30 @@ def summarise(run: RunFacts) -> dict[str, Any]:
             )
             if told.get(k) is not None
         },
-        "tags": gateway.get("tags", {}),
+        "tags": seen.get("tags", {}),
         "errors": errors,
         "not_judged": [] if run.calm else [NOT_CALM],
         "ok": not errors,
     }
 
 
-def _devices(gateway: Mapping[str, Any], field: FieldStatus | None) -> dict[str, Any]:
+def _devices(gateway: GatewayStatus | None, field: FieldStatus | None) -> dict[str, Any]:
     """Return the state of each device, and the model or recording that replaced it, if any."""
     emulated = field.devices if field is not None else {}
     return {
-        name: {"state": "good" if d["online"] else "bad", "error": d["error"]}
+        name: {"state": "good" if d.online else "bad", "error": d.error}
         | ({"plays": emulated[name].plays} if name in emulated else {})
-        for name, d in gateway.get("devices", {}).items()
+        for name, d in (gateway.devices if gateway is not None else {}).items()
     }
 
 
 def _exchanges(run: RunFacts) -> dict[str, Any]:
     """Return the requests and replies per bus, as counted by the gateway and by its emulators."""
-    gateway, field = run.gateway or {}, run.field
+    field = run.field
     emulated = field.devices if field is not None else {}
     out: dict[str, Any] = {}
-    for name, bus in gateway.get("buses", {}).items():
-        counters = bus["counters"]
+    for name, bus in (run.gateway.buses if run.gateway is not None else {}).items():
+        counters = bus.counters
         can = run.system.buses[name].endpoint.is_can
         prefix = "sdo_" if can else ""
         row: dict[str, Any] = {
@@ -205,7 +205,7 @@ def unanswered_at_stop(row: dict[str, Any], devices: int) -> int:
 
 
 def _others(
-    bus: Mapping[str, Any], clients: Mapping[str, Mapping[str, int]], before: Mapping[str, Mapping[str, int]]
+    bus: BusStatus, clients: Mapping[str, Mapping[str, int]], before: Mapping[str, Mapping[str, int]]
 ) -> dict[str, int]:
     """Return the traffic of third parties with the emulators of a bus: that of clients whose address is not the gateway's.
 
@@ -213,9 +213,9 @@ def _others(
     If no client has an address of the gateway, addresses are translated on the way and the clients cannot be
     distinguished.
     """
-    ours = set(bus.get("local", ()))
+    ours = set(bus.local)
     if not clients:
-        number = bus["counters"].get("foreign_sdo_requests", 0)
+        number = bus.counters.get("foreign_sdo_requests", 0)
         return {"requests": number, "replies": number}
     if not ours & clients.keys():
         return {"requests": 0, "replies": 0}
@@ -250,32 +250,29 @@ def exchange_checks(exchanges: dict[str, Any]) -> list[str]:
     return failed
 
 
-def _device_checks(gateway: Mapping[str, Any], disturbed: bool) -> list[str]:
+def _device_checks(gateway: GatewayStatus, disturbed: bool) -> list[str]:
     """Return the errors of devices.
 
     A fault that doubles frames looks like two nodes with one ID, so this is not an error when the run is `disturbed`.
     """
     return [
-        f"{name}: {d['error']}"
-        for name, d in gateway.get("devices", {}).items()
-        if not d["online"] or (d["error"] and not (disturbed and d["error"] == d.get("conflict")))
+        f"{name}: {d.error}"
+        for name, d in gateway.devices.items()
+        if not d.online or (d.error and not (disturbed and d.error == d.conflict))
     ]
 
 
-def _output_checks(gateway: Mapping[str, Any]) -> list[str]:
+def _output_checks(gateway: GatewayStatus) -> list[str]:
     """Return the outputs that an online device does not hold at the end, although they may be written."""
-    devices = gateway.get("devices", {})
+    online = {name for name, device in gateway.devices.items() if device.online}
     return [
-        f"{o['tag']}: {o['wanted']:g} was commanded by {o['by']}, but the device has a different value"
-        for o in gateway.get("outputs", [])
-        if o["wanted"] is not None
-        and o["held"] != o["wanted"]
-        and not o["refused"]
-        and devices.get(o["tag"].partition(".")[0], {}).get("online")
+        f"{o.tag}: {o.wanted:g} was commanded by {o.by}, but the device has a different value"
+        for o in gateway.outputs
+        if o.wanted is not None and o.held != o.wanted and not o.refused and o.tag.partition(".")[0] in online
     ]
 
 
-def _refusal_checks(refusals: Mapping[str, Any], expected: Collection[str], *, disturbed: bool) -> list[str]:
+def _refusal_checks(refusals: RefusalsStatus, expected: Collection[str], *, disturbed: bool) -> list[str]:
     """Return the errors of refused outputs of programs.
 
     A refusal counts if the program or the configuration is wrong, and, in a run without faults, if the device refused.
@@ -283,13 +280,13 @@ def _refusal_checks(refusals: Mapping[str, Any], expected: Collection[str], *, d
     """
     found: dict[tuple[str, str, str], str] = {}
     faults = ("program",) if disturbed else ("program", "device")
-    for entry in refusals.get("entries", []):
+    for entry in refusals.entries:
         if entry["fault"] in faults and entry["tag"] not in expected:
             found[entry["tag"], entry["cause"], entry["place"]] = refusal_text(entry["tag"], entry)
     told = list(found.values())
     if len(told) > MOST_REFUSED:
         told[MOST_REFUSED:] = [f"{len(told) - MOST_REFUSED} more outputs were refused"]
-    if not found and not expected and any(refusals.get("faults", {}).get(fault) for fault in faults):
+    if not found and not expected and any(refusals.faults.get(fault) for fault in faults):
         told = ["so many outputs of programs were refused that the first are no longer listed: see the audit log"]
     return told
 
@@ -311,16 +308,13 @@ def _plc_checks(plc: PlcStatus | None) -> list[str]:
     return [f"PLC: {error}", *failed] if error and not told else failed
 
 
-def _loss_checks(gateway: Mapping[str, Any]) -> list[str]:
-    failed = [
-        f"{n}: {m['dropped']} messages were dropped" for n, m in gateway.get("mailboxes", {}).items() if m["dropped"]
-    ]
-    if gateway.get("log_dropped"):
-        failed.append(f"{gateway['log_dropped']} entries of the exchange log were dropped")
-    if gateway.get("store_error"):
-        failed.append(gateway["store_error"])
-    buses = gateway.get("buses", {}).items()
-    return failed + [f"{name}: {bus['sync_producers']}" for name, bus in buses if bus.get("sync_producers")]
+def _loss_checks(gateway: GatewayStatus) -> list[str]:
+    failed = [f"{n}: {m.dropped} messages were dropped" for n, m in gateway.mailboxes.items() if m.dropped]
+    if gateway.log_dropped:
+        failed.append(f"{gateway.log_dropped} entries of the exchange log were dropped")
+    if gateway.store_error:
+        failed.append(gateway.store_error)
+    return failed + [f"{name}: {bus.sync_producers}" for name, bus in gateway.buses.items() if bus.sync_producers]
 
 
 def _published_checks(run: RunFacts) -> list[str]:

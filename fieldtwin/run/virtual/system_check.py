@@ -10,6 +10,8 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from msgspec.structs import replace
+
 from fieldtwin.emulators.faults.schema import seconds
 from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
@@ -18,6 +20,7 @@ from fieldtwin.gateway.core.statemachine import encode_period
 from fieldtwin.gateway.core.values import Quality, TagValue
 from fieldtwin.gateway.runtime.buses.learnt_gaps import describe_learnt
 from fieldtwin.gateway.runtime.gateway import stale_limits
+from fieldtwin.gateway.runtime.gateway_status import GatewayStatus, OutputStatus
 from fieldtwin.gateway.runtime.status import describe
 from fieldtwin.plc.status import PlcStatus
 from fieldtwin.results.trace import Event, Kind
@@ -71,7 +74,7 @@ class SystemCheck:
         """Compares the commands that reached the gateway through a mailbox with those that the remote client sent."""
         self.invariants: InvariantWatch | None = None
         """The invariants that this run checks; a scenario checks the invariants itself."""
-        self.gateway_status: dict[str, Any] | None = None
+        self.gateway_status: GatewayStatus | None = None
         self.plc_status: PlcStatus | None = None
         self.field_status: FieldStatus | None = None
         self.outputs_confirmed_safe: bool | None = None
@@ -116,7 +119,7 @@ class SystemCheck:
     async def finish(self, bench: VirtualBench) -> None:
         """Stop the gateway in order and take the last figures; then `summary`."""
         self.outputs_confirmed_safe = await bench.run.stop_gateway()
-        outputs = describe(bench.run.gateway, bench.loop.now_ns)["outputs"]  # a stopped node has no certain values
+        outputs = describe(bench.run.gateway, bench.loop.now_ns).outputs  # a stopped node has no certain values
         await bench.sleep_until_s(bench.now_s() + LAST_REPLIES_S)
         self._judge(bench.run.field)
         if self.shore is not None:
@@ -207,15 +210,11 @@ class SystemCheck:
                 self._numbers[name] = held.number
         self.oracle.judge(self._emulated)
 
-    def _take_status(self, bench: VirtualBench, outputs: list[dict[str, Any]]) -> None:
+    def _take_status(self, bench: VirtualBench, outputs: list[OutputStatus]) -> None:
         now_ns = bench.loop.now_ns
         gateway, plc = bench.run.gateway, bench.run.plc
-        self.gateway_status = {
-            **describe(gateway, now_ns),
-            "outputs": outputs,
-            "learnt": describe_learnt(gateway.drivers.values()),
-            "store_error": "",
-        }
+        learnt = describe_learnt(gateway.drivers.values())
+        self.gateway_status = replace(describe(gateway, now_ns), outputs=outputs, learnt=learnt)
         self.plc_status = plc.status()
         self.field_status = bench.run.field.status()
 

@@ -15,6 +15,7 @@ from fieldtwin.gateway.core.histogram import Histogram
 from fieldtwin.gateway.core.values import COMMAND
 from fieldtwin.gateway.devices.config import BusConfig
 from fieldtwin.gateway.runtime.buses.pending_config import PendingConfig
+from fieldtwin.gateway.runtime.gateway_status import BusStatus, DeviceStatus
 
 Ended = Callable[[str, FieldtwinError | None], None]
 """Called once for each tag with the result of its write: None, or the error; `HeldBack` for a tag that was not sent."""
@@ -75,6 +76,14 @@ class Bus(Protocol):
         """Return counters over all connections so far."""
         ...
 
+    def status(self) -> BusStatus:
+        """Return the bus's part of the gateway's status."""
+        ...
+
+    def device_statuses(self, now_ns: int) -> dict[str, DeviceStatus]:
+        """Return the same of its devices, by name."""
+        ...
+
     async def run(self) -> None:
         """Open the connection, serve, and open it again, until cancelled."""
         ...
@@ -82,3 +91,16 @@ class Bus(Protocol):
     async def halt(self, timeout_s: float) -> None:
         """Stop sending, and put devices that the gateway started back, in at most `timeout_s` seconds for each."""
         ...
+
+
+def status_of(bus: Bus) -> BusStatus:
+    """Return what all kinds of buses report."""
+    return BusStatus(
+        endpoint=str(bus.config.endpoint),
+        connected=bus.connected,
+        opens=bus.opens,
+        local=sorted({address for address in bus.locals if address}),
+        error=bus.error,
+        counters=dict(bus.totals()),
+        latency=bus.latency.describe(),
+    )

@@ -15,6 +15,8 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 
+from msgspec.structs import replace
+
 from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S, Clock
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.connection import Connector
@@ -43,12 +45,13 @@ from fieldtwin.gateway.protocols.canopen.sync import Producer, SyncProducer, Tim
 from fieldtwin.gateway.protocols.canopen.sync_watch import SyncWatch
 from fieldtwin.gateway.runtime.audit_log import AuditLog
 from fieldtwin.gateway.runtime.buses.backoff import Backoff
-from fieldtwin.gateway.runtime.buses.bus import Ended
+from fieldtwin.gateway.runtime.buses.bus import Ended, status_of
 from fieldtwin.gateway.runtime.buses.bus_turns import rates_of
 from fieldtwin.gateway.runtime.buses.modbus_bus import MOST_LOCALS, reason_of
 from fieldtwin.gateway.runtime.buses.node_writes import Done, InOrder, NodeWrites
 from fieldtwin.gateway.runtime.buses.pending_config import PendingConfig
 from fieldtwin.gateway.runtime.buses.poll_schedule import PollSchedule
+from fieldtwin.gateway.runtime.gateway_status import BusStatus, DeviceStatus
 from fieldtwin.gateway.runtime.tags import TagTable
 
 SETTLE_NS = 100 * NS_PER_MS
@@ -226,6 +229,36 @@ class CanopenBus:
     def totals(self) -> Counter[str]:
         """Return counters over all connections so far."""
         return self._past + Counter(asdict(self._master.counters)) if self._master else Counter(self._past)
+
+    def status(self) -> BusStatus:
+        return replace(status_of(self), not_produced=self.not_produced, sync_producers=self.sync_watch.verdict)
+
+    def device_statuses(self, now_ns: int) -> dict[str, DeviceStatus]:
+        return {
+            node.driver.config.name: DeviceStatus(
+                bus=self.config.name,
+                address=node.driver.node,
+                online=node.online,
+                error=node.error or node.conflict,
+                conflicts=node.conflicts,
+                conflict=node.conflict,
+                identity_error=node.driver.identity_error,
+                boots=node.boots,
+                bring_ups=node.bring_ups,
+                emcys=node.emcys,
+                emcy=[f"{code:04X}h" for code in node.emcy_log.active],
+                emcy_log=node.emcy_log.describe(now_ns),
+                errors=node.driver.malformed_pdos + node.poll_errors,
+                polls=node.polls,
+                tpdos={
+                    str(t.number): {"cob_id": f"{t.cob_id:03X}h", "tags": list(t.tags), "frames": t.frames}
+                    for t in node.driver.tpdos
+                },
+                rpdos={str(r.number): [tag for tag in r.tags if tag] for r in node.driver.rpdos},
+                rpdos_sent=node.writes.frames,
+            )
+            for node in self.nodes.values()
+        }
 
     # -- running --------------------------------------------------------------------------------------------------------
 

@@ -42,10 +42,11 @@ from fieldtwin.gateway.protocols.modbus.refusals import Acknowledged, GatewayRef
 from fieldtwin.gateway.protocols.modbus.server import NO_RESPONSE
 from fieldtwin.gateway.runtime.buses.backoff import Backoff
 from fieldtwin.gateway.runtime.buses.bridge_queue import BridgeQueue
-from fieldtwin.gateway.runtime.buses.bus import Ended, not_sent
+from fieldtwin.gateway.runtime.buses.bus import Ended, not_sent, status_of
 from fieldtwin.gateway.runtime.buses.bus_turns import DeviceState, Turns, rates_of, restate, states_of
 from fieldtwin.gateway.runtime.buses.pending_config import PendingConfig
 from fieldtwin.gateway.runtime.buses.unanswered import MOST_UNANSWERED, Unanswered
+from fieldtwin.gateway.runtime.gateway_status import BusStatus, DeviceStatus
 from fieldtwin.gateway.runtime.tags import TagTable
 
 T = TypeVar("T")
@@ -227,6 +228,25 @@ class ModbusBus:
         totals = self._past + Counter(asdict(self._client.counters)) if self._client else Counter(self._past)
         totals["missed_polls"] = sum(sum(d.schedule.missed.values()) for d in self.devices)
         return totals
+
+    def status(self) -> BusStatus:
+        return status_of(self)
+
+    def device_statuses(self, now_ns: int) -> dict[str, DeviceStatus]:
+        return {
+            state.driver.config.name: DeviceStatus(
+                bus=self.config.name,
+                address=state.driver.config.address,
+                online=state.online,
+                error=state.error,
+                identity_error=state.driver.identity_error,
+                polls=state.polls,
+                errors=state.poll_errors,
+                samples_missed=state.driver.samples_missed,
+                mailbox=isinstance(state.driver, TransmitterDriver),
+            )
+            for state in self.devices
+        }
 
     async def halt(self, timeout_s: float) -> None:
         """Stop sending: return when the request under way has ended, or after `timeout_s` seconds."""

@@ -252,8 +252,8 @@ def test_a_prototype_of_a_device_without_a_recording(tmp_path: Path) -> None:
     assert summary["published"]["checked"] > 100
     assert summary["published"]["wrong"] == 0
     assert run.checks[""].gateway_status is not None
-    tags = run.checks[""].gateway_status["tags"]
-    assert {name.removeprefix("tank."): tag["value"] for name, tag in tags.items()} == {
+    tags = run.checks[""].gateway_status.tags
+    assert {name.removeprefix("tank."): tag.value for name, tag in tags.items()} == {
         "level": 1.5,
         "total": 1000,
         "reset": 0,

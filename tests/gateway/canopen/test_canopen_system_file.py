@@ -10,8 +10,9 @@ import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
+import msgspec
 import pytest
 
 from fieldtwin import scan_can_bus
@@ -103,8 +104,8 @@ class Rig:
 
     @property
     def status(self) -> dict[str, Any]:
-        found: dict[str, Any] = describe(self.run.gateway, self.run.loop.now_ns)["devices"]["winch"]
-        return found
+        found = describe(self.run.gateway, self.run.loop.now_ns).devices["winch"]
+        return cast(dict[str, Any], msgspec.to_builtins(found))
 
     def holds(self) -> dict[tuple[int, int], int]:
         return {key: self.node.data.number(*key) for key in CONFIGURED}

@@ -1,0 +1,165 @@
+"""The status of a gateway on the control channel: the answer to `get`, for sender and receivers.
+
+The fields are the keys of the JSON object, in this order. Fields that apply to some buses or devices only are absent
+where they do not (`msgspec.UNSET`). This module declares data; `fieldtwin.gateway.runtime.status` fills it.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+from msgspec import UNSET, UnsetType
+
+Counts = dict[str, int]
+
+
+class DeviceStatus(msgspec.Struct, frozen=True, kw_only=True):
+    """A device as its driver sees it. Counters begin with the gateway."""
+
+    bus: str
+    address: int
+    """Unit ID or node ID."""
+    online: bool
+    """Whether it answers and is the expected device."""
+    error: str
+    """Why it is not online, or what is wrong with it; empty if nothing is."""
+    identity_error: str
+    """In what it differs from the device of the system file; empty if it does not."""
+    polls: int
+    errors: int
+    """Polls that failed, and PDOs that were malformed."""
+    samples_missed: int | UnsetType = UNSET
+    """Of a Modbus device that samples: samples between two polls that were never read."""
+    mailbox: bool | UnsetType = UNSET
+    conflicts: int | UnsetType = UNSET
+    """Of a CANopen node: replies from a second node with the same ID."""
+    conflict: str | UnsetType = UNSET
+    boots: int | UnsetType = UNSET
+    bring_ups: int | UnsetType = UNSET
+    emcys: int | UnsetType = UNSET
+    emcy: list[str] | UnsetType = UNSET
+    """Error codes that the node has sent and not reset, such as ``8130h``."""
+    emcy_log: list[dict[str, Any]] | UnsetType = UNSET
+    tpdos: dict[str, dict[str, Any]] | UnsetType = UNSET
+    rpdos: dict[str, list[str]] | UnsetType = UNSET
+    rpdos_sent: int | UnsetType = UNSET
+
+
+class BusStatus(msgspec.Struct, frozen=True, kw_only=True):
+    """A bus and its connection."""
+
+    endpoint: str
+    connected: bool
+    opens: int
+    """How many connections were opened so far."""
+    local: list[str]
+    """Local addresses of the connections so far."""
+    error: str
+    """Why the bus is not connected; empty while it is."""
+    counters: Counts
+    latency: dict[str, Any]
+    """Response times (`Histogram.describe`)."""
+    not_produced: int | UnsetType = UNSET
+    """Of a CAN bus: SYNC, TIME and repeated RPDOs that could not be sent in their period."""
+    sync_producers: str | UnsetType = UNSET
+    """Of a CAN bus: what is wrong with the producers of SYNC; empty if nothing is."""
+
+
+class TagStatus(msgspec.Struct, frozen=True, kw_only=True):
+    """A tag's value (bytes as hex) with quality and reason. `age_s` is None if there has been no value."""
+
+    value: bool | int | float | str | None
+    quality: str
+    reason: str
+    age_s: float | None
+    text: str | UnsetType = UNSET
+    """The name that the profile gives to the present value."""
+
+
+class OutputStatus(msgspec.Struct, frozen=True, kw_only=True):
+    """A tag that programs write. `wanted` is the command of `by`, None without one; `held` is what the device has."""
+
+    tag: str
+    wanted: int | float | None
+    held: int | float | None
+    by: str
+    refused: bool
+
+
+class WritesStatus(msgspec.Struct, frozen=True, kw_only=True):
+    """Counters of writes. `safe`: whether the outputs have their safe values because the PLC was lost."""
+
+    allowed: bool
+    done: int
+    failed: int
+    refused: int
+    repeated: int
+    superseded: int
+    safe: bool
+
+
+class RefusalsStatus(msgspec.Struct, frozen=True, kw_only=True):
+    """The journal of writes that did not reach their device (`fieldtwin.gateway.runtime.outputs.refusals`)."""
+
+    total: int
+    entries_made: int
+    unrecorded: int
+    faults: Counts
+    """Refusals that are a fault of the program, and of the device."""
+    counts: Counts
+    entries: list[dict[str, Any]]
+    """The entries that are kept (`Refusal.describe`)."""
+
+
+class MailboxStatus(msgspec.Struct, frozen=True, kw_only=True):
+    """Counters of the messages of a transmitter."""
+
+    received: int
+    sent: int
+    taken: int
+    waits: int
+    queued: int
+    dropped: int
+    commands_refused: int
+
+
+class PlcSeen(msgspec.Struct, frozen=True, kw_only=True):
+    """The PLC as the gateway sees it in the process image. `age_ms` is None if it has never published."""
+
+    alive: bool
+    age_ms: float | None
+    losses: int
+    stopped: bool
+
+
+class ConfigStatus(msgspec.Struct, frozen=True, kw_only=True):
+    """The files that the gateway has applied: name and hash of the system, number of reloads, changes of the last one."""
+
+    system: str
+    hash: str
+    reloads: int
+    changed: list[str]
+
+
+class GatewayStatus(msgspec.Struct, frozen=True, kw_only=True):
+    """A whole gateway."""
+
+    devices: dict[str, DeviceStatus]
+    buses: dict[str, BusStatus]
+    tags: dict[str, TagStatus]
+    outputs: list[OutputStatus]
+    writes: WritesStatus
+    refusals: RefusalsStatus
+    mailboxes: dict[str, MailboxStatus]
+    plc: PlcSeen
+    serve: dict[str, dict[str, Any]]
+    """By server: its address (`listening`), `error`, and counters."""
+    bridge: dict[str, dict[str, Any]]
+    published: int
+    logged: int
+    log_dropped: int
+    learnt: dict[str, Any] = {}
+    """By device: gaps and limits that the gateway has found."""
+    store_error: str = ""
+    config: ConfigStatus | UnsetType = UNSET

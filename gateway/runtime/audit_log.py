@@ -1,8 +1,8 @@
 """The audit log: every write, NMT command and refusal, as one JSON line each, appended and never rewritten.
 
-An entry holds the source (the PLC, the safe-state logic, the start-up configuration), the action, the old and the new
-value, and the result. A secret tag's values are not written down. If the log cannot be written, the plant is not
-written either: no action is taken without a record.
+An entry holds the source (the PLC, the safe-state logic, the start-up configuration), the action, the old and the new value, and
+the result. The values of a secret tag are not recorded. If the log cannot be written, nothing is written to the plant: no action
+is taken without a record.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from fieldtwin.gateway.core.errors import Unreachable
 
 
 class AuditLog:
-    """Appends to `path`, which only its owner may read. Each entry is written to the file before `note` returns."""
+    """An audit log at `path`, which only its owner may read. Each entry is written to the file before `note` returns."""
 
     def __init__(self, path: Path, clock: Clock) -> None:
         self._clock = clock

@@ -1,7 +1,7 @@
 """The gateway: buses, drivers, tags, outputs and the process image, assembled and run.
 
-It is given a Connector, a clock and an image, and cannot distinguish a plant from its prototype. Its status is plain
-data for the control channel; nothing in it is formatted for a screen.
+The gateway is given a Connector, a clock and an image, and cannot distinguish a plant from its prototype. Its status is plain
+data for the control channel, not formatted for display.
 """
 
 from __future__ import annotations
@@ -40,8 +40,10 @@ _NUMBERS = (int, float)
 
 @dataclass(frozen=True)
 class GatewayConfig:
-    """The configuration of a gateway. `plc_lost_ms` is the greatest age of the PLC's last scan at which its outputs are
-    followed."""
+    """The configuration of a gateway.
+
+    When the PLC's last scan is older than `plc_lost_ms`, the gateway no longer follows its outputs.
+    """
 
     buses: dict[str, BusConfig]
     devices: dict[str, DeviceConfig]
@@ -175,7 +177,7 @@ class Gateway:
         return output
 
     def complete_outputs(self, driver: RegisterDriver | CanopenDriver) -> None:
-        """Add the tags that have a safe value only after a new configuration of a driver's device as outputs."""
+        """Add as outputs the tags that got a safe value from a new configuration of a driver's device."""
         known = {output.tag for output in self.outputs.outputs}
         tags = [f"{driver.config.name}.{local}" for local in driver.config.safe]
         if not isinstance(driver, TransmitterDriver):
@@ -223,7 +225,7 @@ class Gateway:
             await self.clock.sleep_until_ns(next_ns)
 
     def tick(self, now_ns: int) -> None:
-        """Exchange data with the PLC once and act on it. Never waits."""
+        """Exchange data with the PLC once, and act on its outputs. Never waits."""
         for pump in self.pumps:
             pump.refuse_when_local()
             self.exchange.undelivered[pump.driver.outbox_tag] = pump.undelivered

@@ -1,5 +1,4 @@
-"""The gateway's side of the process image: tags and messages in, outputs and messages out, and whether the PLC is
-alive.
+"""The gateway's side of the process image: it publishes inputs, reads outputs, and checks whether the PLC is alive.
 
 `exchange` runs once per PLC cycle. It never waits: it reads the newest complete publication of the PLC and publishes
 one of its own.
@@ -29,7 +28,7 @@ _BAD = Quality.BAD  # a local name, because looking up an Enum's members is slow
 
 
 class ImageExchange:
-    """Publishes INPUTS from the tag table and the message queues, and reads OUTPUTS.
+    """The exchange with the PLC: publishes INPUTS from the tag table and the message queues, and reads OUTPUTS.
 
     `sources` are the queues of input messages by tag. The caller reads `outputs` (values by tag) and `new_messages` (by
     tag, in order) after each `exchange`, and sets `undelivered` to how many of the output messages it has not handled yet.
@@ -63,7 +62,7 @@ class ImageExchange:
         self._resume(image)
 
     def _resume(self, image: Image) -> None:
-        """Continue after the last message that a previous gateway process reported as taken."""
+        """Continue after the last message that an earlier gateway process reported as taken."""
         before = image.reader(INPUTS).snapshot()
         for tag in self._message_outputs:
             taken = before.value(taken_name(tag)).value
@@ -140,11 +139,10 @@ class ImageExchange:
 
 
 class _Columns:
-    """INPUTS as the tag table has them: only values that are new, or that may have become stale, are looked up
-    again."""
+    """The columns of INPUTS. Only values that are new, or that may have become stale, are looked up again in the tag table."""
 
     def __init__(self, specs: Sequence[TagSpec], tags: TagTable, others: Container[int]) -> None:
-        """`others`: the positions that the exchange itself writes."""
+        """Create the columns. `others` are the positions that the exchange itself writes."""
         self._tags = tags
         self._index = {s.name: at for at, s in enumerate(specs) if s.kind is not TagKind.MESSAGE and at not in others}
         self.values: list[Scalar | None] = [0 if s.kind is TagKind.MESSAGE else None for s in specs]
@@ -157,7 +155,7 @@ class _Columns:
         """No tag becomes stale before this time; it may be earlier than the first one that does."""
 
     def refresh(self, now_ns: int) -> None:
-        """Take over what is new in the table, and what became stale by `now_ns`."""
+        """Take over the table's new values, and those that became stale by `now_ns`."""
         news = self._tags.take_changes()
         if now_ns > self._earliest_ns:
             self._earliest_ns = FOREVER_NS

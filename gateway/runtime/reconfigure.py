@@ -1,5 +1,6 @@
-"""Apply a new configuration to a running gateway: timing, limits, scaling and safe values. It is applied between two
-polls, and no poll is lost or doubled. The plant's switch is applied at once.
+"""Apply a new configuration to a running gateway: timing, limits, scaling and safe values.
+
+It takes effect between two polls, and no poll is lost or doubled. The plant's switch takes effect at once.
 
 Buses, devices, addresses, tags and their bindings must be unchanged: the caller has compared the files
 (`fieldtwin.twin.plant.reloading`). A device has either its old configuration or its new one, never a mixture; stored
@@ -23,7 +24,7 @@ OF_DECODING = frozenset({Reason.NONE, Reason.OUT_OF_RANGE, Reason.NOT_A_NUMBER, 
 
 
 async def reconfigure(gateway: Gateway, config: GatewayConfig) -> None:
-    """Apply `config`. Returns when every device has it; if a long group is being read, that is at the group's end."""
+    """Apply `config`. Return when every device has it, which may be after a long group has been read."""
     gateway.config = replace(gateway.config, buses=config.buses, devices=config.devices, remote=config.remote)
     for pump in gateway.pumps:
         pump.remote = config.remote
@@ -37,7 +38,7 @@ async def reconfigure(gateway: Gateway, config: GatewayConfig) -> None:
 
 
 class _Taking:
-    """Applies the consequences in the gateway when a driver has its new configuration, all of them in one step."""
+    """The follow-up of a driver's new configuration in the gateway. All its consequences take effect in one step."""
 
     def __init__(self, gateway: Gateway, devices: Iterable[str]) -> None:
         drivers = [gateway.drivers[name] for name in devices]
@@ -56,8 +57,10 @@ class _Taking:
         gateway.complete_outputs(driver)
 
     def _understand(self, driver: AnyDriver, before: DeviceProfile) -> None:
-        """Decode the last values of the device with the new profile. Their age stays, and so does a bad quality for
-        another reason."""
+        """Decode the last values of the device again with the new profile.
+
+        Their age, and a bad quality for another reason, stay.
+        """
         tags, name = self._gateway.tags, driver.config.name
         changed = {n for n, tag in driver.profile.tags.items() if tag != before.tags[n] and tag.readable}
         for n in changed | {n for n, t in driver.profile.tags.items() if t.scale_by in changed}:

@@ -56,8 +56,10 @@ QUALITY_TABLE: Mapping[ServedTable, ServedTable] = {
 
 @dataclass(frozen=True, slots=True)
 class ServedTag:
-    """A tag and its position. `quality_at`: the address of its quality register, in the table given by
-    `QUALITY_TABLE`."""
+    """A served tag and its address.
+
+    `quality_at` is the address of its quality register, in the table given by `QUALITY_TABLE`.
+    """
 
     tag: str
     table: ServedTable
@@ -69,7 +71,7 @@ class ServedTag:
 
     @property
     def count(self) -> int:
-        """How many registers or bits it occupies."""
+        """Return the number of registers or bits that the tag occupies."""
         return 1 if self.table in BIT_TABLES else REGISTERS[self.type]
 
 
@@ -77,9 +79,8 @@ class ServedTag:
 class ServeConfig:
     """One server. `if_bad` "nan" is for floats; other types have no bit pattern that cannot be a value.
 
-    Clients whose certificate has one of `roles` (MBTLS 8.4) may read, and those with one of `write_roles` may also
-    write; None: every client, also without a certificate. `idle_s`: a client that is silent for this long is closed; 0:
-    never.
+    Clients whose certificate has one of `roles` (MBTLS 8.4) may read, and those with one of `write_roles` may also write; None:
+    every client, also without a certificate. A client that is silent for `idle_s` is disconnected; 0: never.
     """
 
     name: str
@@ -95,16 +96,16 @@ class ServeConfig:
 
 
 class Writer(Protocol):
-    """Carries out writes: the output writer."""
+    """The interface that carries out writes: the output writer."""
 
     def request(self, tag: str, value: float, by: str, done: Callable[[FieldtwinError | None], None]) -> None:
-        """Write once; `done` is called with the result."""
+        """Write a tag once; `done` is called with the result."""
         ...
 
 
 @dataclass
 class ServeCounters:
-    """Reads answered; reads refused because of a bad tag; requests refused for another reason; writes carried out."""
+    """Counters: answered reads, reads refused because of a bad tag, requests refused for another reason, and completed writes."""
 
     reads: int = 0
     bad: int = 0
@@ -114,7 +115,7 @@ class ServeCounters:
 
 @dataclass(frozen=True, slots=True)
 class _Cell:
-    """What begins at an address: a tag's value, or its quality register."""
+    """The content at an address: a tag's value, or its quality register."""
 
     served: ServedTag
     is_quality: bool
@@ -125,7 +126,7 @@ class _Cell:
 
 
 class TagServer:
-    """Serves tags on one port, until cancelled."""
+    """A server of tags on one port, which runs until cancelled."""
 
     def __init__(
         self,
@@ -136,7 +137,10 @@ class TagServer:
         listen: Listen = TcpListener.open,
         audit: AuditLog | None = None,
     ) -> None:
-        """`audit` receives the writes that are refused before they reach `writer`, which records its own refusals."""
+        """Create the server.
+
+        `audit` records the writes that are refused before they reach `writer`, which records its own refusals.
+        """
         self.config = config
         self.counters = ServeCounters()
         self._record = WriteRecord(audit, clock) if audit is not None else None
@@ -170,8 +174,7 @@ class TagServer:
     # -- one request ------------------------------------------------------------------------------------------------
 
     def ask(self, caller: Caller, unit: int, pdu: bytes) -> Answer:
-        """Answer a request PDU. A unit ID that is not served gets exception 0A: no answer would only hide a wrong
-        setting."""
+        """Answer a request PDU. A unit ID that is not served gets exception 0A, because silence would hide a wrong setting."""
         try:
             if unit != self.config.unit and unit not in DIRECT_UNITS:
                 raise refusal(pdu[0], NO_PATH)
@@ -213,7 +216,10 @@ class TagServer:
         return bytes(packed)
 
     def _covered(self, function: int, access: Access) -> list[_Cell]:
-        """Return the whole cells of a range; a gap or part of a value is exception 02 (cases MB-048, MB-049)."""
+        """Return the cells of a range.
+
+        A gap in the range, or only a part of a value, gets exception 02 (cases MB-048, MB-049).
+        """
         cells, at, end = self._cells[access.table], access.address, access.address + access.count
         found = []
         while at < end:

@@ -24,8 +24,7 @@ _GOOD, _BAD = Quality.GOOD, Quality.BAD  # local names, because looking up an En
 
 
 class Published(msgspec.Struct, frozen=True, gc=False):
-    """A good value as it was published: number (from 1), tag, bytes that the device sent, engineering value, source
-    time."""
+    """A good value that was published: number (from 1), tag, bytes that the device sent, engineering value, source time."""
 
     number: int
     tag: str
@@ -48,7 +47,7 @@ class Held:
 
     @property
     def fresh_until_ns(self) -> int:
-        """See `TagTable.fresh_until_ns`."""
+        """Return the time after which the value is stale, see `TagTable.fresh_until_ns`."""
         return FOREVER_NS if self.limit_ns is None else self.refreshed_ns + self.limit_ns
 
 
@@ -85,15 +84,19 @@ class TagTable:
         return held
 
     def declare(self, names: list[str], stale_after_ms: int | None) -> None:
-        """Add tags. A value not refreshed for `stale_after_ms` is bad; None is for values that do not age (an
-        identity)."""
+        """Add tags.
+
+        A value that is not refreshed for `stale_after_ms` becomes bad; None is for values that do not age (an identity).
+        """
         for name in names:
             held = self._news[name] = self._of(name)
             held.limit_ns = None if stale_after_ms is None else stale_after_ms * NS_PER_MS
 
     def restate(self, name: str, stale_after_ms: int | None) -> None:
-        """Set a new limit for a tag. The change does not make a fresh value stale: the value counts as refreshed now,
-        once."""
+        """Set a new age limit for a tag.
+
+        A fresh value counts as refreshed now, so that the change itself does not make it stale.
+        """
         now_ns = self._clock.monotonic_ns()
         limit = None if stale_after_ms is None else stale_after_ms * NS_PER_MS
         held = self._of(name)
@@ -170,13 +173,12 @@ class TagTable:
         return NEVER if held is None else held.value
 
     def fresh_until_ns(self, name: str) -> int:
-        """Return the time after which `current` returns STALE unless the tag is refreshed; `FOREVER_NS` if it never
-        does."""
+        """Return the time after which the tag is stale unless it is refreshed; `FOREVER_NS` if it never becomes stale."""
         held = self._held.get(name)
         return FOREVER_NS if held is None else held.fresh_until_ns
 
     def take_changes(self) -> Collection[Held]:
-        """Return the tags that were stored since the last call, for the one reader that mirrors the table."""
+        """Return the tags that were stored since the last call. Only one reader, which mirrors the table, may call this."""
         if not self._news:
             return ()
         news, self._news = self._news, {}
@@ -184,11 +186,11 @@ class TagTable:
 
     @property
     def journal_dropped(self) -> int:
-        """How many entries were dropped from the journal."""
+        """Return the number of entries that were dropped from the journal."""
         return self.published - len(self._journal)
 
     def journal_since(self, number: int) -> list[Published]:
-        """Return the values that were published as good after entry `number`, as far as they are still kept."""
+        """Return the journal's entries after `number` that are still kept."""
         newer: list[Published] = []
         for at, (name, value) in zip(range(self.published, number, -1), reversed(self._journal), strict=False):
             newer.append(Published(at, name, value.raw, value.value, value.t_ns))

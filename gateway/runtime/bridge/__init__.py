@@ -1,1 +1,1 @@
-"""The bridge: Modbus clients of the gateway reach units on its buses."""
+"""The bridge, through which Modbus clients of the gateway reach units on its buses."""

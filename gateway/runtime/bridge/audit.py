@@ -1,8 +1,7 @@
 """Audit records of bridged writes and refusals: client, target, request and result.
 
-A write is recorded before it is sent, and is not carried out if it cannot be recorded. A client that is refused again
-and again would fill the disk. So at most one refusal per second and client is recorded, with the number of refusals
-since.
+A write is recorded before it is sent, and is not carried out if it cannot be recorded. Refusals of each client are recorded at
+most once per second, with the number of refusals since the last record, so that a client cannot fill the disk.
 """
 
 from __future__ import annotations

@@ -1,10 +1,9 @@
-"""The bridge: it forwards a client's request to the unit that the request is for, and returns that unit's answer.
+"""The bridge: it forwards a client's request to the addressed unit, and returns that unit's answer.
 
-Modbus TCP clients reach units on serial lines; a client on a serial line reaches units on TCP. A unit ID without a
-route gets exception 0A, a unit that does not answer gets 0B, each once (TG 4.4.2.5). The request goes through the
-target bus's own queue, after the PLC's writes and alternating with its polls. A unit that does not answer is left alone
-with growing pauses, during which its clients get 0B at once and the bus is not used (case MB-062). Every write is
-recorded in the audit log before it is sent.
+Modbus TCP clients reach units on serial lines; a client on a serial line reaches units on TCP. A unit ID without a route gets
+exception 0A, a unit that does not answer gets 0B, each once (TG 4.4.2.5). The request goes through the target bus's own queue,
+after the PLC's writes and alternating with its polls. After a unit did not answer, the bridge does not ask it for a growing time,
+in which its clients get 0B at once (case MB-062). Every write is recorded in the audit log before it is sent.
 """
 
 from __future__ import annotations
@@ -71,11 +70,11 @@ class BridgeConfig:
     """One bridge. `listen` is ``tcp://HOST:PORT`` or ``tls://HOST:PORT`` for clients, or a serial line whose client
     sends requests to us.
 
-    `routes` are searched first; a unit ID that is not in them keeps its ID on the bus `to`, if that is given.
-    `broadcast`: unit ID 0 is forwarded to every serial line that the bridge reaches, and no unit answers; with
-    `answer_broadcast` the bridge answers once the broadcast was sent. `queue` limits the requests that wait for one
-    bus, `in_flight` those that one client may have under way. `cache_ms` 0: no cache. `idle_s`: a client that is silent
-    for this long is closed; 0: never.
+    `routes` are searched first; a unit ID that is not in them keeps its ID on the bus `to`, if that is given. With `broadcast`,
+    unit ID 0 is forwarded to every serial line that the bridge reaches, and no unit answers; with `answer_broadcast` the bridge
+    answers when the broadcast was sent. `queue` limits the requests that wait for one bus, `in_flight` the unanswered requests of
+    one client. `cache_ms` is the longest age of a cached reply; 0: no cache. A client that is silent for `idle_s` is
+    disconnected; 0: never.
     """
 
     name: str
@@ -95,14 +94,18 @@ class BridgeConfig:
 
     @property
     def buses(self) -> set[str]:
-        """The buses that the bridge forwards to."""
+        """Return the names of the buses to which the bridge forwards."""
         return {r.bus for r in self.routes.values()} | ({self.to} if self.to else set())
 
 
 @dataclass
 class BridgeCounters:
-    """The outcomes of requests: `no_path` and `refused` were not forwarded; `spared` and `full` were answered without
-    using the bus; `silent` had no answer; `unread` were answered after the client had gone."""
+    """Counters of the outcomes of requests.
+
+    Requests in `no_path` and `refused` were not forwarded. Those in `spared` and `full` were answered without using the bus,
+    because the unit was away or the queue was full. Those in `silent` got no answer from the unit, and those in `unread` were
+    answered after the client had disconnected.
+    """
 
     requests: int = 0
     no_path: int = 0
@@ -116,15 +119,16 @@ class BridgeCounters:
 
 @dataclass
 class _Away:
-    """A unit that did not answer."""
+    """A unit that did not answer, and its back-off time."""
 
     backoff: Backoff = field(default_factory=lambda: Backoff(0.5, 10.0))
     until_ns: int = 0
 
 
 class Bridge:
-    """One bridge, which runs until cancelled. `buses` are the gateway's own; `blocked` returns why a unit must not be
-    written to, or ""."""
+    """One bridge, which runs until cancelled.
+
+    `buses` are those of the gateway. `blocked` returns the reason why a unit must not be written to, or ""."""
 
     def __init__(
         self,
@@ -173,7 +177,7 @@ class Bridge:
             )
 
     async def run(self) -> None:
-        """Serve clients until cancelled. The buses have to run as well."""
+        """Serve clients until cancelled. The buses have to be running."""
         await self.front.run()
 
     def describe(self) -> dict[str, Any]:
@@ -235,8 +239,9 @@ class Bridge:
         return framing_of(self._buses[bus].config.endpoint) in ("rtu", "ascii")
 
     def _is_ours(self, unit: int) -> bool:
-        """Return whether we answer for a unit ID on a shared line: only for those with a route; the others belong to
-        other devices (case MB-029)."""
+        """Return whether the gateway answers for a unit ID on a shared line.
+
+        It does so only for unit IDs with a route; the others belong to other devices (case MB-029)."""
         return self._route(unit) is not None or (unit == 0 and self.config.broadcast)
 
     def _place(self, unit: int, route: Route | None) -> str:
@@ -302,7 +307,7 @@ class Bridge:
     def _response(
         self, route: Route, pdu: bytes, asked: ServerRequest, result: ForwardedReply | FieldtwinError
     ) -> bytes | None:
-        """Return the response PDU, and note what the result shows about the unit."""
+        """Return the response PDU for a result, and note whether the unit answered."""
         if isinstance(result, ForwardedReply):
             self._away.pop(route, None)
             self.cache.put(route.bus, route.unit, pdu, result.raw, result.t_ns)
@@ -317,9 +322,12 @@ class Bridge:
         return exception_pdu(refusal(asked.function, code))
 
     def _code_of(self, error: FieldtwinError, route: Route) -> int:
-        """Return the exception code for the client: the unit's own exception unchanged, 0B if there was no (valid)
-        answer, 06 if a queue was full, 0A if our own connection is down. If the connection is TCP, it belongs to the
-        unit, so the code is 0B. Any other error is our own failure, 04."""
+        """Return the exception code for the client.
+
+        The unit's own exception is passed on unchanged. The code is 0B if there was no valid answer, 06 if a queue was full, 0A
+        if the connection of the bus is down (0B if it is TCP, because then it belongs to the unit), and 04 for any other error,
+        which is a failure of the gateway.
+        """
         match error:
             case ModbusExceptionReply():
                 return error.code
@@ -333,8 +341,7 @@ class Bridge:
                 return SERVER_FAILURE
 
     def _broadcast(self, caller: Caller, pdu: bytes, asked: ServerRequest) -> list[asyncio.Future[bytes | None]]:
-        """Send a broadcast to every serial line, once, without a retry; units do not answer it (case MB-028). Return a
-        future for each line."""
+        """Send a broadcast once to every serial line; units do not answer it (case MB-028). Return a future for each line."""
         sent = []
         for name, bus in self._buses.items():
             if not self._is_line(name) or bus.down is not None:

@@ -17,8 +17,7 @@ _REPEATED = {0x05: 5, 0x06: 5, 0x0F: 5, 0x10: 5, 0x16: 7}
 
 
 def when_all_are_out(pdu: bytes, lines: Iterable[asyncio.Future[bytes | None]]) -> asyncio.Future[bytes | None]:
-    """Return the normal reply to `pdu` once every line has finished with it and it was sent on at least one; else
-    exception 0A.
+    """Wait until every line has finished with `pdu`; return the normal reply if it was sent on a line, else exception 0A.
 
     `lines` hold the result of each line: an exception response if the broadcast was not sent.
     """

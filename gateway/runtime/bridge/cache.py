@@ -1,7 +1,7 @@
-"""A short-lived cache of read replies, so that ten screens load the bus as much as one.
+"""A short-lived cache of read replies, so that ten screens cause no more traffic on the bus than one.
 
-The cache is limited in size. A reply older than `age_ms` is never returned, and a write to a unit deletes what was read
-from it. Pure.
+The cache is limited in size. A reply older than `age_ms` is never returned, and a write to a unit deletes the replies of that
+unit. Pure.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ CACHED_FUNCTIONS = frozenset({0x01, 0x02, 0x03, 0x04})
 
 
 class ReplyCache:
-    """Reply PDUs by bus, unit and request PDU. With `age_ms` 0 it keeps nothing."""
+    """A cache of reply PDUs by bus, unit and request PDU. If `age_ms` is 0, it keeps nothing."""
 
     def __init__(self, age_ms: int) -> None:
         self._age_ns = age_ms * NS_PER_MS

@@ -1,8 +1,8 @@
 """A Modbus RTU client on a serial line that sends requests to the gateway: the gateway acts as one or more servers on
 it.
 
-A reply on a serial line does not identify its request. So when the client sends anything else before it has its answer,
-it has given up, and that answer is never sent: the client would take it for the answer to the next request.
+A reply on a serial line does not identify its request. A client that sends something else before it has its answer has given up
+waiting. The answer is then never sent, because the client would take it for the answer to the next request.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from fieldtwin.gateway.runtime.buses.backoff import Backoff
 
 @dataclass
 class LineCounters:
-    """All frames; requests to our units; answers that came too late; bytes that were not part of a frame."""
+    """Counters: all frames, requests to our units, answers that came too late, and bytes that were not part of a frame."""
 
     frames: int = 0
     requests: int = 0
@@ -33,8 +33,10 @@ class LineCounters:
 
 
 class LineFront:
-    """A serial line, which runs until cancelled; a lost port is opened again. `ours` tells for which units we
-    answer."""
+    """A serial line, which runs until cancelled; a lost port is opened again.
+
+    `ours` returns whether the gateway answers for a unit.
+    """
 
     def __init__(
         self, endpoint: Endpoint, connector: Connector, ask: Ask, ours: Callable[[int], bool], clock: Clock
@@ -52,7 +54,7 @@ class LineFront:
 
     @property
     def bound(self) -> Endpoint | None:
-        """The serial line, while it is open."""
+        """Return the serial line while it is open, else None."""
         return self.endpoint if self.connected else None
 
     def describe(self) -> dict[str, Any]:
@@ -98,7 +100,7 @@ class LineFront:
                     self._answering = asyncio.get_running_loop().create_task(reply, name="answer to a line")
 
     async def _next(self, connection: ByteConnection, line: RtuRequests) -> bytes:
-        """Return the bytes that come next; empty after a silence that ends an unfinished frame."""
+        """Return the next bytes, or b"" after a silence that ends an unfinished frame."""
         if not line.pending:
             return await connection.read()
         try:
@@ -122,7 +124,7 @@ class LineFront:
             pass  # the task that reads the line gets the same error
 
     async def _give_up(self) -> None:
-        """Cancel an answer that is still under way, because the client has given up on it."""
+        """Cancel a pending answer, because the client has given up waiting for it."""
         task, self._answering = self._answering, None
         if task is None or task.done():
             return

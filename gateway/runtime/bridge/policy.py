@@ -53,11 +53,11 @@ def within(peer: str, networks: tuple[Network, ...]) -> bool:
 
 @dataclass(frozen=True)
 class AllowRule:
-    """A rule for the requests of clients in `networks`. `units` as the client sends them; None: every unit.
+    """A rule for the requests of clients in `networks`.
 
-    `addresses` holds first and last address by table; None: every address. If it is given, a table that it does not
-    name is not allowed, and neither is a function without register addresses. `roles` are roles in clients'
-    certificates (MBTLS 8.4), for a rule that applies to some clients only; None: every client, with or without a
+    `units` are unit IDs as the client sends them; None: every unit. `addresses` holds first and last address by table; None:
+    every address. If it is given, a table that it does not name is not allowed, nor is a function without register addresses.
+    `roles` limits the rule to clients whose certificate has one of these roles (MBTLS 8.4); None: every client, with or without a
     certificate.
     """
 

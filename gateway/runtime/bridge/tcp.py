@@ -1,10 +1,10 @@
 """Modbus TCP clients of the gateway, with or without TLS: their connections, and answers in the order of the requests.
 
-This module does not know what answers a request: `ask` is given a request and returns its answer, or a promise of one.
-A client may have a limited number of requests under way (more get exception 06, case MB-053). While a client does not
-read its answers, its requests are not read either. When its connection is lost, its promises are cancelled, because
-their answers are no longer needed (case MB-060). A client that only closes its own direction (FIN after its last
-request) gets its answers before the connection is closed.
+This module does not know how a request is answered: the caller's `ask` takes a request and returns its answer or a future. A
+client may have a limited number of unanswered requests (further ones get exception 06, case MB-053). While a client does not read
+its answers, its requests are not read either. When its connection is lost, the pending futures are cancelled, because the answers
+are no longer needed (case MB-060). A client that only closes its own direction (FIN after its last request) gets its answers
+before the connection is closed.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Caller:
 
     @property
     def on_record(self) -> str:
-        """The name in audit logs."""
+        """Return the client's name for audit logs."""
         return f"{self.name} ({self.role})" if self.role else self.name
 
 
@@ -58,8 +58,9 @@ Ask = Callable[[Caller, int, bytes], Answer]
 
 @dataclass
 class FrontCounters:
-    """Requests accepted; requests refused because too many were under way; ADUs of other protocols; streams that could
-    not be parsed; clients whose request was not complete in time."""
+    """Counters: accepted requests, requests refused because too many were unanswered, ADUs of other protocols, streams that could
+    not be parsed, and clients whose request was not complete in time.
+    """
 
     requests: int = 0
     busy: int = 0
@@ -69,8 +70,11 @@ class FrontCounters:
 
 
 class TcpFront:
-    """A listening port, which runs until cancelled. A port that cannot be opened is tried again, and the status shows
-    it; with `insist` False this ends the server (`EndpointBusy`, `Unreachable`)."""
+    """A listening port, which runs until cancelled.
+
+    A port that cannot be opened is tried again, and the status shows this; if `insist` is False, the error ends the server
+    (`EndpointBusy`, `Unreachable`).
+    """
 
     def __init__(
         self,
@@ -100,7 +104,7 @@ class TcpFront:
 
     @property
     def bound(self) -> Endpoint | None:
-        """The address on which the server listens, with the actual port; None while it does not listen."""
+        """Return the endpoint on which the server listens, with the actual port; None while it does not listen."""
         return self.listener.bound if self.listener is not None else None
 
     async def run(self) -> None:
@@ -148,7 +152,7 @@ class TcpFront:
 
 
 class _Session:
-    """One client."""
+    """The session of one client."""
 
     def __init__(self, connection: Client, ask: Ask, in_flight: int, counters: FrontCounters, clock: Clock) -> None:
         self._connection = connection
@@ -162,8 +166,9 @@ class _Session:
         self._room = asyncio.Event()
 
     async def run(self) -> None:
-        """Serve until the client goes (`ConnectionLost`), its stream cannot be parsed, or a request takes too long to
-        arrive."""
+        """Serve until the client disconnects (`ConnectionLost`), its stream cannot be parsed, or a request takes too long to
+        arrive.
+        """
         stream = MbapRequests()
         try:
             async with Nursery() as nursery:
@@ -193,7 +198,7 @@ class _Session:
                     answer.cancel()
 
     async def _read(self, begun_ns: int | None) -> bytes | None:
-        """Return what the client sends next; None if the request that began at `begun_ns` is not complete in time."""
+        """Return the next bytes of the client; None if the request that began at `begun_ns` is not complete in time."""
         if begun_ns is None:
             return await self._connection.read()
         while (left_s := REQUEST_WITHIN_S - (self._clock.monotonic_ns() - begun_ns) / NS_PER_S) > 0:
@@ -202,11 +207,10 @@ class _Session:
         return None
 
     async def _answer_the_rest(self, writer: asyncio.Task[None]) -> None:
-        """Send the outstanding answers after the client stopped sending. If it only closed its own direction, it still
-        waits for them.
+        """Send the outstanding answers to a client that closed its own direction and may still wait for them.
 
-        A client that closed both directions looks the same until something is sent to it. So at most the request under
-        way and the next one are carried out without a client that reads the answer.
+        A client that closed both directions looks the same until something is sent to it. So at most the present request and the
+        next one are carried out although no client reads their answers.
         """
         while self._waiting and self._connection.lost is None and not writer.done():
             self._room.clear()

@@ -1,10 +1,10 @@
-"""The delay before the next try of a device that did not answer: doubling, with an upper limit."""
+"""The delay before the next request to a device that did not answer. It doubles with each failure, up to a limit."""
 
 from __future__ import annotations
 
 
 class Backoff:
-    """Delays in seconds: `first_s`, twice that, and so on up to `limit_s`; `reset` after a success."""
+    """A series of delays in seconds: `first_s`, twice that, and so on up to `limit_s`. Call `reset` after a success."""
 
     def __init__(self, first_s: float = 0.5, limit_s: float = 10.0) -> None:
         self._first_s = first_s

@@ -1,8 +1,7 @@
-"""Requests of bridge clients that wait for a bus: limited in number, fair between clients, dropped when the client has
-gone.
+"""The queue of bridge clients' requests that wait for a bus: limited in number and fair between clients.
 
-The bus takes one request at a time, after the PLC's writes, and never two between two polls that are due. This module
-must not know where a request came from or what answers it.
+The requests of a client that disconnected are dropped. The bus takes one request at a time, after the PLC's writes, and never two
+between two polls that are due. This module must not know the source of a request or the device that answers it.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ MAX_WAIT_NS = 10_000_000_000
 class BridgeRequest:
     """A request for `unit`. `attempts` is the number of attempts left; each attempt waits for its own turn.
 
-    `done` is called once, with the reply or the error, unless `wanted` returns False: then the client has gone.
+    `done` is called once, with the reply or the error, unless `wanted` returns False because the client has disconnected.
     """
 
     client: str
@@ -42,8 +41,9 @@ class BridgeRequest:
 
 @dataclass
 class BridgeCounters:
-    """The outcomes of the requests on one bus. `full`: no room; `gone`: the client had gone; `stale`: waited too
-    long."""
+    """Counters of requests that were not carried out on one bus.
+
+    `full`: the queue was full; `gone`: the client had disconnected; `stale`: the request had waited too long."""
 
     carried: int = 0
     full: int = 0
@@ -53,7 +53,7 @@ class BridgeCounters:
 
 @dataclass
 class BridgeQueue:
-    """At most `limit` requests of all clients together; clients take turns. `on_put` wakes the bus."""
+    """A queue of at most `limit` requests of all clients together. Clients take turns. `on_put` wakes the bus."""
 
     limit: int = 64
     on_put: Callable[[], None] = lambda: None
@@ -120,7 +120,7 @@ class BridgeQueue:
             guest.done(reply)
 
     def fail_all(self, error: FieldtwinError) -> None:
-        """End all requests with `error`, because the bus is down for a longer time."""
+        """End all requests with `error`, because the bus is down for some time."""
         while self._waiting:
             _, line = self._waiting.popitem()
             for guest in line:
@@ -128,7 +128,7 @@ class BridgeQueue:
         self.size = 0
 
     def _drop_gone(self) -> None:
-        """Make room by dropping the requests of clients that have gone."""
+        """Make room by dropping the requests of clients that have disconnected."""
         for client, line in list(self._waiting.items()):
             kept = deque(guest for guest in line if guest.wanted())
             self.counters.gone += len(line) - len(kept)

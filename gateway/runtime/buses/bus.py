@@ -1,7 +1,7 @@
 """The interface of a bus to the gateway and its outputs, the same for each protocol.
 
 Devices and tags are named as in the system file (``speed`` of ``drive``), so that a caller needs no driver of a certain
-protocol. This module must not know a protocol; what only one of them has (jobs, LSS) is a method of its bus.
+protocol. This module must not know a protocol: services that only one protocol has (jobs, LSS) are methods of its bus class.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ Ended = Callable[[str, FieldtwinError | None], None]
 
 
 class HeldBack(NotAllowed):
-    """A member of a group was not sent because of another member."""
+    """A member of a group was not written, because another member of the group could not be written."""
 
 
 def not_sent(where: str) -> HeldBack:
-    """Return the error of a tag of `where` that was not sent after the write of another tag failed."""
+    """Return the error for a tag that was not sent because the write of another tag failed. `where` locates it."""
     return HeldBack("not sent: the write of another member of its group failed", where=where)
 
 
@@ -48,12 +48,13 @@ class Bus(Protocol):
         ...
 
     def frame_of(self, device: str, tag: str) -> object | None:
-        """Return the frame in which this tag is sent together with others: the same object for all tags of the frame,
-        None for a tag that is sent by itself."""
+        """Return the frame in which this tag is sent together with others, or None for a tag that is sent by itself.
+
+        All tags of one frame get the same object."""
         ...
 
     def settle_ns(self, device: str, tag: str) -> int:
-        """Return for how many nanoseconds after a write the device may still report the value before it."""
+        """Return how long after a write the device may still report the previous value, in ns."""
         ...
 
     def unrequested(self, device: str, tag: str) -> bool:
@@ -61,10 +62,10 @@ class Bus(Protocol):
         ...
 
     def write(self, device: str, writes: Sequence[tuple[str, COMMAND]], ended: Ended) -> None:
-        """Start to write tags of one device, each with its command, in this order and as close together as the protocol
-        allows. If a write fails, the tags that were not sent yet are not sent.
+        """Start to write tags of one device, each with its command, in this order and with the fewest messages.
 
-        `ended` is called once for each tag, at once if the bus cannot send it.
+        After a failed write, the remaining tags are not sent. `ended` is called once for each tag, immediately if the bus cannot
+        send it.
         """
         ...
 
@@ -89,7 +90,9 @@ class Bus(Protocol):
         ...
 
     async def halt(self, timeout_s: float) -> None:
-        """Stop sending, and put devices that the gateway started back, in at most `timeout_s` seconds for each."""
+        """Stop sending, and put devices that the gateway started back into their earlier state; each may take `timeout_s`
+        seconds.
+        """
         ...
 
 

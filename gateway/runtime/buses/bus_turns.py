@@ -1,4 +1,4 @@
-"""The order of polls on a Modbus bus: the state of its devices, and the poll that goes next.
+"""The order of polls on a Modbus bus: the state of its devices, and the choice of the next poll.
 
 Pure: times are monotonic nanoseconds, passed in. This module must not know a connection or what a poll does.
 """
@@ -21,8 +21,11 @@ FOREVER_NS = 2**62
 
 @dataclass
 class DeviceState:
-    """The bus's record of one of its devices. `tried`: it was asked since the connection was opened. `polls`
-    counts the groups that were read, and the tries while it was away."""
+    """The bus's record of one of its devices.
+
+    `tried` says that the device was asked since the connection was opened. `polls` counts the groups that were read, and the
+    attempts while the device did not answer.
+    """
 
     driver: RegisterDriver
     schedule: PollSchedule
@@ -58,8 +61,7 @@ class DeviceState:
 
     @property
     def retries_left(self) -> bool:
-        """Whether a request without a reply is worth repeating: not while the device may be absent and other devices
-        wait."""
+        """Return whether to repeat a request without a reply: not while the device may be absent and other devices wait."""
         return self.online or (self.alone and not self.backoff.failures)
 
 
@@ -93,7 +95,7 @@ def _state(driver: RegisterDriver, rates: dict[str, Rate], alone: bool) -> Devic
 
 
 def restate(device: DeviceState, config: DeviceConfig, rates: dict[str, Rate], now_ns: int) -> None:
-    """Apply a new configuration to a device of which nothing is being read."""
+    """Apply a new configuration to a device while no group of it is being read."""
     device.driver.reconfigure(config)
     device.backoff.restate(config.backoff_first_s, config.backoff_limit_s)
     device.schedule.restate(rates, config.phase, now_ns, there=device.online)
@@ -101,8 +103,7 @@ def restate(device: DeviceState, config: DeviceConfig, rates: dict[str, Rate], n
 
 
 class Turns:
-    """The order of polls among `devices`, and the tries that `Probing` grants to devices that are away. For `share` see
-    there."""
+    """The order of polls among `devices`, and of the probes of devices that are away. `Probing` describes `share`."""
 
     def __init__(self, devices: list[DeviceState], share: float, t35_ns: int = 0) -> None:
         self._devices = devices
@@ -114,11 +115,11 @@ class Turns:
     def next(
         self, spaced_ns: Callable[[int], int], now_ns: int, seen_ns: int = 0, bus_timeout_s: float = 1.0
     ) -> tuple[DeviceState | None, str, int]:
-        """Return the most overdue poll of those that may start now, else the one that may start first; and its time.
+        """Return the next poll and its time: the most overdue poll that may start now, else the poll that may start first.
 
-        `spaced_ns` returns the end of a unit's pause; `seen_ns` is the longest latency seen lately. A device that is
-        away has only its next try (group ""), for which its `timeout_ns` is set. A group that is partly read is
-        continued before another group of its device begins.
+        `spaced_ns` returns the end of a unit's pause; `seen_ns` is the longest recent latency. A device that is away has only its
+        next probe (group ""), for which its `timeout_ns` is set. A group that is partly read is completed before another group of
+        its device begins.
         """
         best: tuple[int, int, int, int] | None = None
         found: tuple[DeviceState | None, str] = None, ""  # a bus without polls only carries jobs
@@ -150,12 +151,13 @@ class Turns:
         return *found, best[0] if best is not None else now_ns + NS_PER_S
 
     def restate(self, share: float) -> None:
-        """Set a new share, from the next try on."""
+        """Set a new share, from the next probe on."""
         self._probing.restate(share)
 
     def _free_until_ns(self, poll_ns: int | None, now_ns: int) -> int | None:
-        """Return until when the devices that answer do not need the bus; `now_ns` while a poll is due. None: no device
-        answers."""
+        """Return the time until which the devices that answer do not need the bus: `now_ns` while a poll is due.
+
+        Return None if no device answers."""
         online = [device for device in self._devices if device.online]
         if not online:
             return None
@@ -172,9 +174,10 @@ class Turns:
         seen_ns: int,
         bus_timeout_s: float,
     ) -> tuple[tuple[int, int], DeviceState]:
-        """Return the device to ask first of those that are away, with the time of the try, and since when it waits.
+        """Return the next device to probe of those that are away, the time of the probe, and the time since when the device
+        waits.
 
-        Devices that were not asked yet come first; among them, the one that was asked least recently.
+        Devices that were never asked come first, then the device that was asked least recently.
         """
         untried = [entry for entry in away if not entry[1].tried]
         best: tuple[tuple[int, int, int, int], DeviceState] | None = None
@@ -197,7 +200,7 @@ class Turns:
         seen_ns: int,
         bus_timeout_s: float,
     ) -> int:
-        """Return when `device` may be asked, not before `ready_ns`. Sets the timeout of that try."""
+        """Return the time from which `device` may be probed, not before `ready_ns`, and set the timeout of that probe."""
         own_ns = _own_ns(device, bus_timeout_s)
         probing, failures, late_ns = self._probing, device.backoff.failures, device.late_ns
         device.fits = True

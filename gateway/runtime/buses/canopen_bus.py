@@ -1,10 +1,10 @@
 """One CAN bus: its connection, the CANopen master on it, and the boot-up procedure of its nodes.
 
-Every node is brought up separately, and again whenever it restarts or was lost: identity, configuration, start, in the
-order of CiA 302-2. If no node has an expected node ID, the master assigns it over LSS where the system file gives the
-node's LSS address. A node that is up is polled over SDO for the values that no TPDO brings, and receives its outputs
-(`node_writes`). Configuring, starting, SYNC, TIME, LSS and outputs are writes: on a plant where writing is not allowed,
-the gateway only listens to the nodes and reads.
+Every node is brought up separately, and again whenever it restarts or was lost: identity, configuration, start, in the order of
+CiA 302-2. If no node has an expected node ID, the master assigns it over LSS, provided that the system file gives the node's LSS
+address. A node that is up is polled over SDO for the values that no TPDO carries, and receives its outputs (`node_writes`).
+Configuring, starting, SYNC, TIME, LSS and outputs are writes: on a plant where writing is not allowed, the gateway only listens
+and reads.
 """
 
 from __future__ import annotations
@@ -183,8 +183,9 @@ class CanopenBus:
 
     @property
     def not_produced(self) -> int:
-        """SYNC, TIME and repeated RPDO messages that were not sent because the bus did not take them in time, or
-        because their time passed while the gateway did not run."""
+        """Return the number of SYNC, TIME and repeated RPDO messages that were not sent.
+
+        The bus did not take them in time, or their time passed while the gateway did not run."""
         return self._not_produced + sum(status.writes.not_sent for status in self.nodes.values())
 
     def takes(self, device: str, tag: str) -> bool:
@@ -203,18 +204,18 @@ class CanopenBus:
         return self._by_name[device].driver.rpdo_of(tag)
 
     def settle_ns(self, device: str, tag: str) -> int:
-        """Return for how many nanoseconds after a write the node may still report the value before it."""
+        """Return how long after a write the node may still report the previous value, in ns."""
         rpdo = self.frame_of(device, tag)
         if rpdo is None:
             return SETTLE_NS
         return SETTLE_NS + (2 * self.config.canopen.sync_ms * NS_PER_MS if rpdo.synchronous else 0)
 
     def unrequested(self, device: str, tag: str) -> bool:
-        """Return whether a TPDO of the node brings this tag."""
+        """Return whether a TPDO of the node carries this tag."""
         return f"{device}.{tag}" in self._by_name[device].driver.pdo_tags
 
     def write(self, device: str, writes: Sequence[tuple[str, COMMAND]], ended: Ended) -> None:
-        """Start to write tags of one node: those of one RPDO with one frame; see `Bus`."""
+        """Start to write tags of one node. Tags of one RPDO are sent in one frame; see `Bus`."""
         driver = self._by_name[device].driver
         InOrder(driver, writes, self._write, ended).next()
 
@@ -328,7 +329,7 @@ class CanopenBus:
                 await connection.aclose()
 
     def _producers(self) -> list[Producer]:
-        """Return the SYNC and TIME producers that the system file asks for, if writing is allowed."""
+        """Return the SYNC and TIME producers that the system file configures, if writing is allowed."""
         wanted, now_ns = self.config.canopen, self._clock.monotonic_ns()
         made: list[Producer] = []
         if wanted.sync_ms and self._allow_writes:
@@ -362,8 +363,7 @@ class CanopenBus:
             self._tags.put_bad(status.driver.tag_names, Reason.UNREACHABLE)
 
     def _offline(self, status: NodeStatus, error: FieldtwinError) -> None:
-        """Mark a node as away, or as no longer configured as it was brought up. Writes on their way to it fail with
-        `error`."""
+        """Mark a node as away, or as having lost its configuration. Pending writes to it fail with `error`."""
         status.online, status.error = False, str(error)
         status.up.clear()
         status.schedule.stop()
@@ -382,7 +382,7 @@ class CanopenBus:
         status.up.set()
 
     async def _keep_up(self, status: NodeStatus) -> None:
-        """Bring the node up now, and again each time that this is requested."""
+        """Bring the node up now, and again at each request."""
         while True:
             await status.wanted.wait()
             status.wanted.clear()
@@ -402,7 +402,7 @@ class CanopenBus:
                     self._online(status)
 
     async def _rest(self, status: NodeStatus) -> None:
-        """Leave a node that did not answer alone for the back-off time, or until its boot-up message arrives."""
+        """Wait for the back-off time after a node did not answer, or until its boot-up message arrives."""
         with suppress(TimeoutError):
             async with asyncio.timeout(status.backoff.next_s()):
                 await status.booted.wait()
@@ -426,7 +426,7 @@ class CanopenBus:
                 self._taken_over()
 
     async def _poll_unmapped(self, status: NodeStatus) -> None:
-        """Read tags of an unwritten `tpdo1` over SDO while the node is up: on a read-only plant no TPDO may ever bring them."""
+        """Read over SDO the tags of a `tpdo1` that was not written, because on a read-only plant no TPDO may carry them."""
         driver = status.driver
         while True:
             await status.up.wait()
@@ -463,7 +463,7 @@ class CanopenBus:
         status.wanted.set()
 
     async def _assign(self, driver: CanopenDriver, error: FieldtwinError) -> FieldtwinError:
-        """Assign the node ID, which no node answered to, over LSS to the node that is to have it.
+        """Assign the expected node ID, which no node has, over LSS to the node with the configured LSS address.
 
         Return the error of a failed assignment, otherwise `error`.
         """
@@ -539,11 +539,10 @@ class CanopenBus:
             status.emcy_log.add(parse_emcy(event.data), event.t_ns)
 
     def _start_again(self, status: NodeStatus) -> None:
-        """Start a node again that left OPERATIONAL by itself, as object 1029h prescribes after an error (CiA 301,
-        7.5.2.32).
+        """Start a node again that left OPERATIONAL by itself, as object 1029h prescribes after an error (CiA 301, 7.5.2.32).
 
-        The node is brought up anew after `START_AGAIN_S`, so that a node with a lasting error is not started without
-        pause, and only if it is still PRE-OPERATIONAL then.
+        The node is brought up again after `START_AGAIN_S` if it is still PRE-OPERATIONAL then. The delay prevents continuous
+        restarts of a node with a lasting error.
         """
         master, node = self._master, status.driver.node
 
@@ -560,8 +559,9 @@ class CanopenBus:
             status.start_again = asyncio.get_running_loop().call_later(START_AGAIN_S, again)
 
     async def halt(self, timeout_s: float) -> None:
-        """Put the nodes that the gateway started back to PRE-OPERATIONAL when it stops, so that they send no process
-        data. A node may take `timeout_s` seconds."""
+        """Put the nodes that the gateway started back to PRE-OPERATIONAL, so that they send no process data.
+
+        Each node may take `timeout_s` seconds."""
         self._stopping = True
         if self._master is None or not self._allow_writes:
             return

@@ -1,4 +1,4 @@
-"""The gaps that were learnt about devices, kept between runs, and reported so that they can go into their profiles.
+"""The gaps that were learnt about devices. They are kept between runs, and reported so that users can add them to profiles.
 
 They are in one JSON file in the run directory. An entry is used only for the device from which it was learnt: same
 profile (by its hash), same endpoint, same unit ID. A file that cannot be read, or that has any other content, is
@@ -26,8 +26,11 @@ MOST_BYTES = 4_000_000
 
 
 class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One device. `gaps` as in a profile; `borders`, which have no registers, by the address of the first register
-    after them."""
+    """The file's entry for one device.
+
+    `gaps` have the form of a profile. `borders`, which have no registers, are given by the address of the first register after
+    them.
+    """
 
     profile: str
     endpoint: str
@@ -38,7 +41,10 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class LearntFile:
-    """The file at `path`, for `drivers` on `buses`. Call `load` before they are used, and `save` from time to time."""
+    """The file of learnt gaps at `path`, for `drivers` on `buses`.
+
+    Call `load` before the drivers are used, and `save` repeatedly.
+    """
 
     def __init__(self, path: Path, drivers: Iterable[RegisterDriver], buses: Mapping[str, BusConfig]) -> None:
         self._path = path
@@ -47,7 +53,7 @@ class LearntFile:
         self._saved = 0
 
     def load(self) -> None:
-        """Give every driver what was learnt about its device before."""
+        """Pass to every driver what earlier runs learnt about its device."""
         try:
             with self._path.open("rb") as file:
                 entries = msgspec.json.decode(file.read(MOST_BYTES), type=dict[str, Entry])
@@ -62,7 +68,7 @@ class LearntFile:
                     driver.know(learnt)
 
     def save(self) -> None:
-        """Write the file if something was learnt since. Raises `Unreachable` if the disk refuses."""
+        """Write the file if something was learnt since the last call. Raises `Unreachable` if the write fails."""
         changes = sum(driver.learnt.changes for driver in self._drivers)
         if changes == self._saved:
             return
@@ -96,7 +102,7 @@ class LearntFile:
 
 
 def _learnt(driver: RegisterDriver, entry: Entry) -> Learnt | None:
-    """Return what an entry contains; None if it is invalid."""
+    """Return the content of an entry, or None if it is invalid."""
     try:
         gaps = [resolve_gap(text, "sent") for text in entry.gaps]
         borders = [resolve_gap(text, "sent") for text in entry.borders]
@@ -109,8 +115,9 @@ def _learnt(driver: RegisterDriver, entry: Entry) -> Learnt | None:
 
 
 def describe_learnt(drivers: Iterable[object]) -> dict[str, Any]:
-    """Return what was learnt, for every device with an entry: `gaps`, `borders`, `missing` tags, and `line`, which
-    replaces the `gaps` in its profile ("" if nothing belongs there)."""
+    """Return, for every device with an entry, the learnt `gaps`, `borders` and `missing` tags, and a `line` for its profile.
+
+    The `line` replaces the `gaps` in the profile; it is "" if there is nothing to state."""
     found: dict[str, Any] = {}
     for driver in drivers:
         if isinstance(driver, RegisterDriver) and (driver.learnt.gaps or driver.learnt.missing):

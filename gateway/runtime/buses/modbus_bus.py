@@ -1,12 +1,12 @@
 """One Modbus bus: its connection, its queue and the polls of its devices.
 
-The bus carries one transaction at a time. Writes go first; polls that are due and the requests of bridge clients
-alternate after them. While one unit ID has its pause after a transaction, the bus serves other units.
+The bus carries one transaction at a time. Writes go first; then polls that are due and the requests of bridge clients alternate.
+While one unit ID has its pause after a transaction, the bus serves other units.
 
-A device that does not answer costs the other devices its own timeouts once. After that it is asked once per try, after
-growing pauses, and all such tries together get no more than a configured share of the bus's time while other devices
-answer (case 62 of the test-case list). This module opens connections only through the `Connector`. A connection that
-ends is opened again without limit, with back-off; until then the devices' tags are bad and carry the reason.
+A device that does not answer delays the other devices by its full timeouts only once. After that it is probed with single
+requests, after growing pauses. While other devices answer, all probes together get at most a configured share of the bus's time
+(case 62 of the test-case list). This module opens connections only through the `Connector`. A lost connection is opened again
+without limit, with back-off; until then the devices' tags are bad and carry the reason.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ MAX_JOBS = 256
 
 
 def reason_of(error: FieldtwinError) -> Reason:
-    """Return the reason that a tag's quality carries after `error`."""
+    """Return the reason code for the bad quality of a tag after `error`."""
     if isinstance(error, WrongDevice):
         return Reason.WRONG_DEVICE
     if isinstance(error, GatewayRefusal):
@@ -181,7 +181,7 @@ class ModbusBus:
         self.submit(Job(driver, partial(driver.write_together, commands, progress), done))
 
     def submit(self, job: Job) -> None:
-        """Queue a job, ahead of every poll. If the queue is full or there is no connection, the job fails at once."""
+        """Queue a job ahead of all polls. If the queue is full or there is no connection, the job fails immediately."""
         if not self.connected:
             job.done(Unreachable(f"not connected: {self.error}", where=f"{self.config.name} {self.config.endpoint}"))
         elif len(self._jobs) >= MAX_JOBS:
@@ -249,7 +249,7 @@ class ModbusBus:
         }
 
     async def halt(self, timeout_s: float) -> None:
-        """Stop sending: return when the request under way has ended, or after `timeout_s` seconds."""
+        """Stop sending. Return when the present request has ended, or after `timeout_s` seconds."""
         self._halted = True
         self._wake()
         if self._client is not None:
@@ -359,7 +359,7 @@ class ModbusBus:
                 await self._sleep(min(at_ns, wake_ns))
 
     def _next_job(self, client: ModbusClient, now_ns: int) -> tuple[Job | None, int]:
-        """Return the first queued job whose unit has had its pause, or None, and the time at which to look again."""
+        """Return the first queued job whose unit needs no more pause, or None, and the time at which to check again."""
         wake_ns = now_ns + NS_PER_S
         for place, job in enumerate(self._jobs):
             ready_ns = client.spaced_ns(job.driver.config.address)
@@ -370,7 +370,7 @@ class ModbusBus:
         return None, wake_ns
 
     async def _carry_guest(self) -> bool:
-        """Carry out one request of a bridge client, if one waits. Return whether one did."""
+        """Carry out one waiting request of a bridge client. Return False if there was none."""
         client = self._client
         guest = self.guests.take(self._clock.monotonic_ns()) if client is not None else None
         if guest is None or client is None:
@@ -428,7 +428,7 @@ class ModbusBus:
                 client.relax(unit)
 
     def _patience_s(self, device: DeviceState, now_ns: int) -> float:
-        """Return how long, in seconds, to wait for a device that answers, when other devices also need the bus."""
+        """Return the timeout in seconds for a device that is online, while other devices also need the bus."""
         if now_ns < self._alarm_until_ns:
             return self._turns.short_s(device, self.latency.recent_longest_ns, self.config.timeout_s)
         return self._own_s(device)
@@ -440,12 +440,11 @@ class ModbusBus:
     def _silent(
         self, client: ModbusClient, device: DeviceState, error: ReplyTimeout, begun_ns: int, probed: bool
     ) -> None:
-        """Handle a device that did not answer. A device that answered before keeps its turn while it has repetitions
-        left; the other devices are polled meanwhile.
+        """Handle a device that did not answer. If it answered before, its request is repeated while repetitions are left.
 
-        Several devices often stop answering together, because of a cut cable. So for a while the other devices are
-        polled with shortened timeouts too. Otherwise each of them would cost its whole timeout, while the devices that
-        still answer wait.
+        The other devices are polled meanwhile. Several devices often stop answering together, because of a cut cable. So for a
+        while the other devices are also polled with shortened timeouts. Otherwise each absent device would cost its whole
+        timeout, while the devices that still answer wait.
         """
         if not probed and not device.alone:
             shortened = self._patience_s(device, begun_ns) < self._own_s(device)
@@ -464,7 +463,7 @@ class ModbusBus:
     def _failed(
         self, client: ModbusClient, device: DeviceState, error: FieldtwinError, begun_ns: int, probed: bool
     ) -> None:
-        """Record that a device is away, or still away, and charge the time that this try took."""
+        """Record that a device is away, and charge the duration of the attempt to the budget of probes."""
         device.poll_errors += 1
         self._offline(device, error)
         now_ns = self._clock.monotonic_ns()
@@ -475,8 +474,9 @@ class ModbusBus:
         self._turns.failed(device, begun_ns, now_ns, clear_ns)
 
     def _heard_late(self, client: ModbusClient) -> None:
-        """Handle devices that answered after their shortened timeout but within their own: they are present, so they
-        are asked again at once, with more time."""
+        """Handle devices that answered after their shortened timeout but within their own.
+
+        They are present, so they are asked again at once, with more time."""
         for device in self.devices:
             late_ns = client.late_ns.get(device.driver.config.address)
             if late_ns is not None and late_ns <= self._own_s(device) * NS_PER_S:
@@ -484,10 +484,10 @@ class ModbusBus:
         client.late_ns.clear()
 
     async def _bring_online(self, device: DeviceState) -> str:
-        """Make first contact, or contact again: check the device's identity and where its mailboxes stand. Return the
-        group to read first.
+        """Contact a device for the first time, or again after a loss, and return the group to read first.
 
-        Where the configuration states no identity to check, the device is online once it answers.
+        This checks the device's identity and reads the state of its mailboxes. If no identity is configured, the device is online
+        once it answers.
         """
         driver = device.driver
         if driver.learnt.missing:
@@ -505,7 +505,7 @@ class ModbusBus:
         return group if device.alone else min(device.schedule.due_ns, key=driver.cost)
 
     async def _turn(self, device: DeviceState, group: str) -> None:
-        """Carry out the next transaction of `group`: its trigger, its first read or a further read."""
+        """Carry out the next transaction of `group`: its trigger, its first read, or a later read."""
         if not group:
             return
         driver, reading = device.driver, device.reading
@@ -522,8 +522,9 @@ class ModbusBus:
             driver.finish(reading)
 
     async def _trigger(self, device: DeviceState, group: str, now_ns: int) -> bool:
-        """Trigger a device that measures on request, and return True if its values have to be read later. The bus
-        serves other devices meanwhile."""
+        """Trigger a device that measures on request. Return True if its values have to be read later.
+
+        The bus serves other devices meanwhile."""
         driver = device.driver
         wait_ms = driver.trigger_wait_ms(group)
         if not wait_ms or group in device.triggered:
@@ -539,12 +540,12 @@ class ModbusBus:
         return True
 
     def _refused(self, device: DeviceState, group: str, error: DeviceRefused) -> None:
-        """Handle a device that answers but refuses this group; its other groups go on.
+        """Handle a device that answers but refuses this group. Its other groups are still read.
 
-        Busy (06) and acknowledge (05: the request takes long) mean "later": the last value stays valid until it is
-        stale and is never replaced by 0, and the device is given time (MB-023, MB-024). That time belongs to the
-        device: other groups that are refused with "later" before it is over wait until the same moment. Only a refusal
-        after that moment makes the next pause longer.
+        Busy (06) and acknowledge (05: the request takes long) mean "later": the last value stays valid until it is stale and is
+        never replaced by 0, and the device gets a pause (MB-023, MB-024). The pause is one for the whole device: other groups
+        that are refused with "later" before it is over wait until the same moment. Only a refusal after that moment makes the
+        next pause longer.
         """
         device.poll_errors += 1
         device.reading = None
@@ -594,10 +595,10 @@ class ModbusBus:
     async def _attempts(
         self, device: DeviceState | None, what: Callable[[], Awaitable[T]], *, later: bool = False
     ) -> T:
-        """Try up to `1 + retries` times while the error is on the bus. A request that the device refuses is not
-        repeated, and a device that was away is asked only once.
+        """Send a request up to `1 + retries` times, as long as it fails with a communication error.
 
-        With `later`, a timeout is raised without a repetition if other devices wait for the bus.
+        A request that the device refuses is not repeated, and a device that was away is asked only once. With `later`, a timeout
+        is raised without a repetition if other devices wait for the bus.
         """
         retries = self.config.retries
         if device is not None:

@@ -1,8 +1,8 @@
 """Pending writes to one CANopen node: RPDOs with their newest values, and a queue of SDO downloads.
 
-Values that are offered together go in one frame. Process data is never queued: a newer value replaces an older one, and
-both callers get the result of the same frame. This module must not know which values are wanted or safe, nor whether
-writing is allowed at all.
+Values that are written together go in one frame. Process data is never queued: a newer value replaces an older one, and both
+callers get the result of the same frame. This module must not know which values are wanted or safe, or whether writing is allowed
+at all.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ class _Staged:
 
 
 class NodeWrites:
-    """Writes to the node of `driver`. `timeout_s` is how long the bus may take to accept a frame.
+    """The pending writes to the node of `driver`. `timeout_s` limits the time for the bus to accept a frame.
 
-    At most one write of a tag is under way, which the caller ensures. So there are never more pending writes than the
-    node has tags.
+    The caller starts a write of a tag only when the previous write of that tag has ended. So there are never more pending writes
+    than the node has tags.
     """
 
     def __init__(self, driver: CanopenDriver, clock: Clock, timeout_s: float) -> None:
@@ -161,8 +161,9 @@ class NodeWrites:
 
 
 class InOrder:
-    """Writes tags of one node one after another, and those that share an RPDO together. After a failed write the other
-    tags are not sent; their error is `HeldBack`. `write` starts one write."""
+    """A sequence of writes to one node: tags that share an RPDO are written together, the others one after another.
+
+    After a failed write the remaining tags are not sent; their error is `HeldBack`. `write` starts one write."""
 
     def __init__(
         self, driver: CanopenDriver, writes: Sequence[tuple[str, COMMAND]], write: Write, ended: Ended

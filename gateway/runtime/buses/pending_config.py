@@ -1,4 +1,4 @@
-"""A new configuration that a running bus is to take over, each device between two of its polls."""
+"""A new configuration for a running bus, which takes over each device's part between two of its polls."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ AnyDriver = RegisterDriver | CanopenDriver
 
 @dataclass
 class PendingConfig:
-    """`bus` and `devices`, all on that bus, by name: the same buses and devices as before, at the same addresses.
+    """The new configuration of a bus and its devices, by name. Buses, devices and addresses are the same as before.
 
     `taken` is called with each driver as soon as it has its new configuration; `done` is set when all have.
     """

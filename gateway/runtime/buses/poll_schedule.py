@@ -1,8 +1,8 @@
-"""When a device's poll groups are due: each with its own period, and at its own phase in that period.
+"""The schedule of a device's poll groups: each group has its own period and its own phase in that period.
 
-Groups of one period are spread over it in the file's order, so that a bus does not get all requests at the same time.
-All times are on a grid that begins with the bus: a missed period is counted and skipped, and not made up for later.
-Pure: times are monotonic nanoseconds, passed in.
+Groups with the same period are spread over it in the file's order, so that a bus does not get all requests at the same time. All
+times are on a grid that begins when the bus starts. A missed period is counted and skipped; the read is not made up for. Pure:
+times are monotonic nanoseconds, passed in.
 """
 
 from __future__ import annotations
@@ -46,10 +46,10 @@ def spread(
 
 
 class PollSchedule:
-    """One device's groups: `rates` of those read cyclically, and `once` those read after connecting.
+    """The schedule of one device: `rates` of the groups read cyclically, and `once` for those read only after connecting.
 
-    `due_ns` holds the groups to be read and since when each is due; it is empty while the device is away. `missed`
-    counts, group by group, the periods in which an online device was not read.
+    `due_ns` holds for each group the time at which it is due; it is empty while the device is away. `missed` counts for each
+    group the periods in which the device was online but not read.
     """
 
     def __init__(self, rates: Mapping[str, Rate], once: Sequence[str]) -> None:
@@ -69,11 +69,11 @@ class PollSchedule:
         """Use `rates` from now on; it holds all groups that are read cyclically. `stated` are those with a configured
         phase.
 
-        A group whose period changed is due one new period after its last slot, or now: no interval is shorter than the
-        shorter of both periods, and none is longer than the longer. From there a group moves to its new phase in small
-        steps, always earlier: until it is there, an interval is up to an eighth shorter than its period, and none is
-        longer. A group with a configured phase moves there in one step, by at most half a period earlier or later. An
-        overdue group stays overdue. A new group is read now if the device is online (`there`).
+        A group whose period changed is due one new period after its last slot, or now: no interval is shorter than the shorter of
+        both periods, and none is longer than the longer. From there a group moves to its new phase in small steps, always
+        earlier: until then, its intervals are up to an eighth shorter than its period, and never longer. A group with a
+        configured phase moves there in one step, by at most half a period earlier or later. An overdue group stays overdue. A new
+        group is read now if the device is online (`there`).
         """
         kept, self._rates = self._rates, dict(rates)
         self._goal_ns.clear()
@@ -104,7 +104,7 @@ class PollSchedule:
         return start_ns + ((after_ns - start_ns) // rate.period_ns + 1) * rate.period_ns
 
     def start(self, now_ns: int) -> None:
-        """Start polling an online device: every group is read once now, and then at its slots on the grid."""
+        """Start polling an online device: every group is due once now, and later at its slots on the grid."""
         for group, phase_ns in self._goal_ns.items():
             self._rates[group] = self._rates[group]._replace(phase_ns=phase_ns)
         self._goal_ns.clear()
@@ -140,12 +140,13 @@ class PollSchedule:
         self._rates[group] = Rate(rate.period_ns, (rate.phase_ns - step_ns) % rate.period_ns)
 
     def free_until_ns(self) -> int | None:
-        """Return until when another task may use the bus without a period being missed: the middle of the period of the
-        group that is due first. None if no group is read cyclically."""
+        """Return the time until which another task may use the bus without making a group miss its period.
+
+        That is the middle of the period of the group that is due first; None if no group is read cyclically."""
         return min(
             (due + self._rates[g].period_ns // 2 for g, due in self.due_ns.items() if g in self._rates), default=None
         )
 
     def defer(self, group: str, until_ns: int) -> None:
-        """Make `group` due at `until_ns`, whatever its grid: the device asked for time."""
+        """Make `group` due at `until_ns` instead of its slot on the grid, because the device asked for time."""
         self.due_ns[group] = until_ns

@@ -1,6 +1,6 @@
-"""How devices that do not answer are asked while others do: with shortened timeouts, and within a budget.
+"""The probing of devices that do not answer: with shortened timeouts, and within a budget, while other devices answer.
 
-A *probe* is one try of a device that is away, its first contact included. While another device of the bus answers,
+A *probe* is one request to a device that is away or was never contacted. While another device of the bus answers,
 
 * a probe waits no longer than four times the longest of the latest replies on the bus, at least `LEAST_NS` and twice the
   silence of 3.5 characters, at most the device's own timeout. A device whose reply came too late once gets twice the time
@@ -10,9 +10,9 @@ A *probe* is one try of a device that is away, its first contact included. While
 * a probe that cannot end that soon takes at most `share` / `LONG_PART`. Such probes give a device its own timeout, after
   three that were shortened.
 
-While no device answers, the timeout doubles from failure to failure until it is the device's own, so that the devices
-that do answer are found soon. A device alone on its bus is asked with its own timeout. Pure: times are monotonic
-nanoseconds, passed in.
+While no device answers, the timeout doubles with each failure until it is the device's own, so that devices that can answer are
+found soon. A device that is alone on its bus is always asked with its own timeout. Pure: times are monotonic nanoseconds, passed
+in.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class Probing:
         return min(own_ns, self.short_ns(own_ns, seen_ns, late_ns) << min(failures, 20))
 
     def long_may_go(self, failures: int, now_ns: int) -> bool:
-        """Return whether a device that failed this often is due for its own timeout."""
+        """Return whether a device with this number of failures should be asked with its own, long timeout."""
         return failures >= SHORT_TRIES and now_ns >= self._long_ns
 
     def fits(self, cost_ns: int, now_ns: int, free_until_ns: int) -> bool:
@@ -71,13 +71,15 @@ class Probing:
         return now_ns + cost_ns <= free_until_ns
 
     def may_go_ns(self, fits: bool, now_ns: int) -> int:
-        """Return when a probe may start: now, or when the budget allows it."""
+        """Return the time at which a probe may start: now, or when the budget allows it."""
         paid_ns = self._spent_until_ns - int(BURST_NS / self._share)
         return max(now_ns, paid_ns, 0 if fits else self._long_ns)
 
     def took(self, begun_ns: int, end_ns: int, fitted: bool) -> None:
-        """Note that a device used the bus without success from `begun_ns` to `end_ns`; `fitted`: no group missed its
-        period."""
+        """Charge a failed use of the bus from `begun_ns` to `end_ns` to the budget.
+
+        `fitted` says that no group missed its period.
+        """
         spent_ns = end_ns - begun_ns
         self._spent_until_ns = max(self._spent_until_ns, begun_ns) + int(spent_ns / self._share)
         if not fitted:

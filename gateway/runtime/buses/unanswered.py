@@ -15,9 +15,9 @@ MOST_UNANSWERED = 5
 class Unanswered:
     """The timeouts of `client` since its latest reply.
 
-    The timeouts of polls and probes, which hurry their units, count only while no device is online. Devices that are
-    away are asked often while another device is rarely polled, and their silence shows nothing about the connection. A
-    shortened timeout counts as a fraction: its part of the unit's own timeout.
+    Timeouts of requests with a shortened timeout (`ModbusClient.hurry`) count only while no device is online: devices that are
+    away may be asked often while an online device is rarely polled, and their silence shows nothing about the connection. A
+    shortened timeout counts as the fraction that it is of the unit's own timeout.
     """
 
     def __init__(self, client: ModbusClient) -> None:
@@ -27,7 +27,10 @@ class Unanswered:
         self._waited = 0.0
 
     def too_many(self, any_online: bool) -> bool:
-        """Return whether the connection should be opened anew. `any_online`: whether a device counts as online."""
+        """Return whether the connection should be closed and opened again.
+
+        `any_online` says whether at least one device is online.
+        """
         client, counters = self._client, self._client.counters
         answered = counters.replies + counters.exceptions
         others, waited = counters.timeouts - client.hurried_timeouts, counters.timeouts - client.not_waited

@@ -1,9 +1,9 @@
-"""Messages that were taken from a mailbox and are not acknowledged yet, kept when the gateway process dies.
+"""Messages that were taken from a mailbox and are not acknowledged yet, kept in a file in case the gateway process dies.
 
-Its successor acknowledges them and does not deliver them a second time. They are in one JSON file in the run directory:
-for each transmitter the whole inbox, sequence and payload, as it was when its message was consumed. A file that cannot
-be read is ignored; then a message may be delivered twice. The file is written before the acknowledgement, but only
-handed to the operating system: it survives the end of the process, but not a power failure at that moment.
+The next gateway process acknowledges them and does not deliver them a second time. One JSON file in the run directory holds for
+each transmitter the whole inbox, sequence and payload, as it was when its message was consumed. A file that cannot be read is
+ignored; then a message may be delivered twice. The file is written before the acknowledgement, but only passed to the operating
+system: it survives the end of the process, but not a power failure at that moment.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ MOST_BYTES = 1_000_000
 
 
 class AckedCommandStore:
-    """The file at `path`; with None, nothing is kept beyond this process."""
+    """The file of taken messages at `path`. If `path` is None, nothing is kept after this process ends."""
 
     def __init__(self, path: Path | None) -> None:
         self._path = path
@@ -34,12 +34,13 @@ class AckedCommandStore:
                 pass  # there is no file yet, or it is not one of ours
 
     def of(self, device: str) -> bytes:
-        """Return the inbox whose message was taken; empty if there is none."""
+        """Return the transmitter's inbox whose message was taken, or b"" if there is none."""
         return self._taken.get(device, b"")
 
     def note(self, device: str, raw: bytes) -> None:
-        """Note that the message of this inbox was taken; an empty `raw` means that it was also acknowledged. Raises
-        `Unreachable` if the disk refuses."""
+        """Note that the message of this inbox was taken. An empty `raw` means that it was also acknowledged.
+
+        Raises `Unreachable` if the write fails."""
         if raw == self.of(device):
             return
         self._taken.pop(device, None)

@@ -1,8 +1,8 @@
 """The exchanges with a transmitter's mailboxes, one at a time: acknowledge what was received, and send when there is
 room.
 
-The outbox is not checked more often than the modem's own speed justifies. Both ends of a link use this module, whatever
-decides about the messages.
+The outbox is not checked more often than the modem's own speed justifies. Both ends of a link use this module: the plant's
+gateway and the topside end.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ INBOX_KEPT = 256
 
 
 class Patience:
-    """When a full outbox is worth a check: the next message will take about as long to leave it as the previous one.
+    """The decision when to check a full outbox, from the time that the previous message took to leave it.
 
-    Three quarters of that time are waited, so that a modem that became faster is noticed. Pure; times are monotonic
+    The next check is after three quarters of that time, so that a modem that became faster is noticed. Pure; times are monotonic
     nanoseconds.
     """
 
@@ -38,7 +38,7 @@ class Patience:
         self._was_full = False
 
     def asks(self, now_ns: int) -> bool:
-        """Return whether to check now. A True result counts as a check."""
+        """Return whether to check the outbox now. If the result is True, it counts as a check."""
         if now_ns < self._next_ns or (self._sent_ns is not None and now_ns < self._sent_ns + self._wait_ns):
             return False
         self._next_ns = now_ns + ASK_EVERY_NS
@@ -58,7 +58,7 @@ class Patience:
 
 
 class Inbox(Consumer[DATA]):
-    """The messages that a transmitter received; sets an event for each."""
+    """The queue of messages that a transmitter received. It sets an event for each message."""
 
     def __init__(self, driver: TransmitterDriver, news: asyncio.Event) -> None:
         super().__init__(driver.emitter.event, INBOX_KEPT)
@@ -71,8 +71,7 @@ class Inbox(Consumer[DATA]):
 
 
 class Mailboxes:
-    """The exchanges of `driver` on `bus`. `ended` is called with the error of each one, or None; `busy` is False by
-    then."""
+    """The exchanges of `driver` on `bus`. When one ends, `busy` becomes False, and `ended` is called with its error or None."""
 
     def __init__(
         self,
@@ -88,7 +87,7 @@ class Mailboxes:
 
     @property
     def ready(self) -> bool:
-        """Whether another exchange may begin."""
+        """Return whether another exchange may begin."""
         return not self.busy and self._bus.online(self.driver)
 
     def acknowledge(self) -> None:
@@ -101,12 +100,12 @@ class Mailboxes:
         self._submit(self.driver.send)
 
     def look(self, now_ns: int) -> None:
-        """Check whether the outbox is free, if it is time for that."""
+        """Check whether the outbox is free, if a check is due."""
         if self._patience.asks(now_ns):
             self._submit(self._check)
 
     def next(self, now_ns: int, *, taken: bool) -> None:
-        """Start the exchange that is due, if any. `taken`: everything that was received may be acknowledged."""
+        """Start the exchange that is due, if any. `taken` says that everything that was received may be acknowledged."""
         if not self.ready:
             return
         if self.driver.to_acknowledge and taken:

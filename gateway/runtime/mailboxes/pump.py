@@ -1,10 +1,10 @@
 """The connection between a transmitter's mailboxes and the control logic: acknowledge what was consumed, send if there
 is room.
 
-A mailbox is acknowledged only when the PLC has consumed its message, so a command survives a gateway process that dies
-in between. The consumption is stored before the acknowledgement, so that the successor of a gateway that died then does
-not deliver the message again. A plant whose switch is set to `local` accepts no commands: they are acknowledged,
-refused and recorded. Mailboxes that are lent to a digital thread belong to it: this module does not read or write them.
+A mailbox is acknowledged only when the PLC has consumed its message, so a command is not lost if the gateway process dies before.
+The consumption is stored before the acknowledgement, so that the next gateway process does not deliver the message again. A plant
+whose switch is set to `local` accepts no commands: they are acknowledged, refused and recorded. While mailboxes are delegated to
+a digital thread, this module does not read or write them.
 """
 
 from __future__ import annotations
@@ -26,8 +26,7 @@ RETRY_NS = 1000 * NS_PER_MS
 
 
 class MailboxPump:
-    """The pump of one transmitter. `inbox` holds messages that were received and not yet given to the PLC; `tick` never
-    waits."""
+    """The pump of one transmitter. `inbox` holds the received messages that the PLC has not got yet. `tick` never waits."""
 
     def __init__(
         self,
@@ -41,7 +40,10 @@ class MailboxPump:
         taken: AckedCommandStore | None = None,
         journal: Refusals | None = None,
     ) -> None:
-        """`journal` receives the messages that do not reach the transmitter, and the commands that are refused."""
+        """Create the pump.
+
+        `journal` records the messages that do not reach the transmitter, and the commands that are refused.
+        """
         self.driver = driver
         self._journal = journal
         self._withheld: tuple[str, object] | None = None
@@ -65,8 +67,10 @@ class MailboxPump:
         self._recorded: tuple[str, object] | None = None
 
     def command(self, payload: bytes, by: str) -> bool:
-        """Handle a command that did not come through the mailbox. Return False if the plant's switch is set to `local`.
-        The command is recorded in both cases."""
+        """Handle and record a command that did not come through the mailbox.
+
+        Return False if the plant's switch is set to `local`.
+        """
         name = self.driver.config.name
         result = "taken" if self.remote else "the plant is switched to local"
         with suppress(Unreachable):
@@ -78,8 +82,10 @@ class MailboxPump:
         return self.remote
 
     def offer(self, payloads: list[bytes]) -> None:
-        """Queue messages of the control logic, in order. If the mailbox is lent, its thread reads them from the process
-        image."""
+        """Queue messages of the control logic, in order.
+
+        If the mailbox is delegated, its thread reads them from the process image.
+        """
         if self._lent:
             return
         for payload in payloads:
@@ -87,7 +93,7 @@ class MailboxPump:
 
     @property
     def undelivered(self) -> int:
-        """How many messages of the control logic have not reached the transmitter's mailbox yet."""
+        """Return the number of messages of the control logic that have not reached the transmitter's mailbox yet."""
         return len(self.driver.consumer.queue) + self._sending
 
     def refuse_when_local(self) -> None:
@@ -121,7 +127,7 @@ class MailboxPump:
                 self._tell(*waits, Cause.READ_ONLY, "this plant is read-only (start with --allow-writes)", audit=True)
 
     def tick(self, now_ns: int, all_consumed: bool) -> None:
-        """Start the next exchange. `all_consumed`: the PLC has consumed everything that it was given."""
+        """Start the next exchange. `all_consumed` says that the PLC has consumed all messages that it got."""
         self._now_ns = now_ns
         self._keep(all_consumed)
         if not self._allow_writes:
@@ -150,7 +156,7 @@ class MailboxPump:
                 self._taken.note(name, b"")
 
     def _on_record(self, tag: str, new: object, now_ns: int) -> bool:
-        """Record the write before it is sent; without a record it waits and is tried again."""
+        """Record the write before it is sent. If it cannot be recorded, it waits and is tried again."""
         name = self.driver.config.name
         try:
             self._audit.note("write", name, by="plc", result="asked", tag=f"{name}.{tag}", old=None, new=new)

@@ -1,1 +1,1 @@
-"""Outputs: what the PLC commands, what a device holds, and what was refused."""
+"""Outputs: the values that the PLC commands, the values that devices hold, and the writes that were refused."""

@@ -1,8 +1,7 @@
 """The first write of an output: the gateway reads the device first, and does not write a value that it already holds.
 
-This applies only before the first write, and only to a device that was not lost meanwhile. What a device holds when it
-comes back may be a default that equals the wanted value by chance, so the value is written again. A value that is not
-good is not used.
+This applies only before the first write, and only to a device that was not lost meanwhile. A device that returns after a loss may
+hold a default that equals the wanted value by chance, so the value is written again. A reading that is not good is not used.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ READ_BACK_NS = 2 * NS_PER_S
 
 
 def waits_for_reading(output: Output, current: TagValue, now_ns: int) -> bool:
-    """Return whether the first write has to wait for a reading that is still to come. A safe value does not wait."""
+    """Return whether the first write has to wait for the first reading. A safe value does not wait."""
     if output.due_since_ns is None:
         output.due_since_ns = now_ns
     if is_known(output, current) or output.by.startswith(SAFE) or not output.read_back:
@@ -27,8 +26,9 @@ def waits_for_reading(output: Output, current: TagValue, now_ns: int) -> bool:
 
 
 def is_known(output: Output, current: TagValue) -> bool:
-    """Return whether `current` is what the device holds. A node may hold other values since its configuration was
-    written: then only a later reading counts."""
+    """Return whether `current` is the value that the device holds.
+
+    Writing a node's configuration may change its values, so only a later reading counts."""
     if current.quality is not Quality.GOOD or output.due_since_ns is None:
         return False
     driver = output.driver

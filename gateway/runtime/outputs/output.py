@@ -1,4 +1,4 @@
-"""One output: its tag, its device, its wanted value and how far the last write got. It makes no decisions."""
+"""The state of one output: its tag, its device, its wanted value and the progress of the last write. It makes no decisions."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SAFE = "safe: "
 
 @dataclass
 class Output:
-    """One output: its tag, its device, and how far the last write got."""
+    """One output: its tag, its device, and the progress of the last write."""
 
     tag: str
     local: str
@@ -46,23 +46,24 @@ class Output:
 
     @property
     def ready(self) -> bool:
-        """Whether the device accepts a write now."""
+        """Return whether the device accepts a write now."""
         return self.bus.takes(self.driver.config.name, self.local)
 
     @property
     def frame(self) -> object | None:
-        """The frame that carries this output: the same object for each output that shares it, None for one that is
-        written by itself."""
+        """Return the frame that carries this output, or None for an output that is written by itself.
+
+        Outputs that share a frame get the same object."""
         return self.bus.frame_of(self.driver.config.name, self.local)
 
     @property
     def settle_ns(self) -> int:
-        """How many nanoseconds after a write the device may still report the value before it."""
+        """Return how long after a write the device may still report the previous value, in ns."""
         return self.bus.settle_ns(self.driver.config.name, self.local)
 
     @property
     def read_back(self) -> bool:
-        """Whether the gateway reads it cyclically: by polls, or because the device sends it."""
+        """Return whether the gateway gets the output's value cyclically, by polls or because the device sends it."""
         driver, tag = self.driver, self.driver.profile.tags[self.local]
         if not tag.readable:
             return False
@@ -71,12 +72,13 @@ class Output:
         return any(tag in driver.profile.group(group) for group in driver.config.poll)
 
     def shown(self, value: object) -> object:
-        """Return `value` as the audit log may show it: a secret is not written down."""
+        """Return `value` for the audit log; a secret value is hidden."""
         return "(secret)" if self.driver.profile.tags[self.local].secret else value
 
     def answer(self, error: FieldtwinError | None) -> None:
-        """Report the result to the client that requested the write. The request was for one write, so the gateway does
-        not write the value again later."""
+        """Report the result to the client that requested the write.
+
+        The client requested one write, so the gateway does not write the value again later."""
         asked, self.asked = self.asked, None
         if asked is not None:
             if not self.by.startswith(SAFE):
@@ -85,7 +87,7 @@ class Output:
 
 
 def as_sent(output: Output) -> bytes:
-    """Return the bytes that `output` would send now for the value it holds; empty if it may no longer be sent."""
+    """Return the bytes that would be sent now for the value that `output` holds; empty if the value is no longer allowed."""
     try:
         return output.driver.command(output.local, output.held).data if output.held is not None else b""
     except NotAllowed:

@@ -1,10 +1,10 @@
 """Outputs of one device that are written together or not at all.
 
-A drive that is started with its old setpoint because the new one was refused is worse than one that is not started. So
-the members of a group are checked before any of them is written: when a program's value for one of them is refused, or
-does not exist yet, the others are held back. Adjacent registers are written with one request, and objects that share an
-RPDO with one frame. All other members are written in the group's order, each write after the previous one was
-confirmed. If a communication error interrupts the writes, it is reported, and the whole group is written again.
+It is worse to start a drive with its old setpoint, because the new one was refused, than not to start it. So the members of a
+group are checked before any of them is written: when a program's value for one of them is refused, or does not exist yet, the
+others are held back. Adjacent registers are written with one request, and objects that share an RPDO with one frame. All other
+members are written in the group's order, each write after the previous one was confirmed. If a communication error interrupts the
+writes, it is reported, and the whole group is written again.
 
 The safe state is independent of groups: safe values are written one by one, whatever the programs want.
 """
@@ -17,7 +17,7 @@ from fieldtwin.gateway.runtime.outputs.output import Output
 
 
 class OutputGroup:
-    """The members of one group, in the order of the system file. They are outputs of one device."""
+    """One group: its members are outputs of one device, in the order of the system file."""
 
     def __init__(self, name: str, outputs: Sequence[Output]) -> None:
         self.name = name
@@ -27,7 +27,7 @@ class OutputGroup:
 
     @property
     def obstacle(self) -> tuple[Output, str] | None:
-        """The member that prevents the group from being written, and the reason; None if nothing prevents it."""
+        """Return the member that prevents the group from being written, and the reason; None if nothing prevents it."""
         for output in self.outputs:
             if output.not_a_number or (output.wanted is not None and output.refused == (output.wanted, output.by)):
                 return output, f"{output.tag} was refused"
@@ -38,7 +38,7 @@ class OutputGroup:
 
     @property
     def by_programs(self) -> bool:
-        """Whether programs command the group: False while a member is at its safe value or on the way to it."""
+        """Return whether programs command the group: False while a member has its safe value, or is to get it."""
         return all(output.by in ("plc", "") for output in self.outputs)
 
     def differing(self) -> list[Output]:

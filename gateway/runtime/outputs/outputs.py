@@ -1,11 +1,11 @@
-"""Output writing: what the PLC commands, which values are safe, and whether a write is allowed at all.
+"""The writing of outputs: the values that the PLC commands, safe values, and the check whether a write is allowed.
 
-A stopped PLC cannot make anything safe, so the gateway holds each output's safe value and writes it when the PLC's
-heartbeat stops (DESIGN.md, "Who makes outputs safe"). A value is written when it differs from what the device last
-confirmed; a device that comes back, or that reads back a different value, gets it again. At the start the writer waits
-for the first reading of an output, and writes nothing if the device already holds the wanted value. Outputs that share
-one frame (an RPDO) are written together. Nothing is written to a plant where writing is not allowed, and every write
-and refusal is recorded in the audit log before it is sent.
+A stopped PLC cannot make anything safe, so the gateway holds each output's safe value and writes it when the PLC's heartbeat
+stops (DESIGN.md, "Who makes outputs safe"). A value is written when it differs from the value that the device last confirmed. It
+is written again after the device was lost, or when the device reads back a different value. At the start the writer waits for the
+first reading of an output, and writes nothing if the device already holds the wanted value. Outputs that share one frame (an
+RPDO) are written together. Nothing is written to a plant where writing is not allowed, and every write and refusal is recorded in
+the audit log before it is sent.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ AWAY_REPORTED = -1
 
 
 class OutputWriter:
-    """Writes the wanted values to the devices. `tick` starts writes and never waits for one."""
+    """The writer of wanted values to the devices. `tick` starts writes and never waits for their end."""
 
     def __init__(self, outputs: list[Output], tags: TagTable, audit: AuditLog, allow_writes: bool) -> None:
         self.outputs = outputs
@@ -49,8 +49,9 @@ class OutputWriter:
         self._now_ns = 0
 
     def want(self, tag: str, value: float) -> None:
-        """Take the PLC's command `value` for `tag`. A value that cannot be written is refused now, not when its turn
-        comes: by then a newer value may have replaced it."""
+        """Take the PLC's command `value` for `tag`.
+
+        A value that cannot be written is refused immediately, because a newer value may replace it before it would be written."""
         for output in self.outputs:
             if output.tag == tag and (output.wanted != value or output.by != "plc" or output.not_a_number):
                 self._command(output, value)
@@ -69,7 +70,7 @@ class OutputWriter:
             self.journal.settle(output.tag)
 
     def want_no_number(self, tag: str) -> None:
-        """Handle a program that set the output to something that is not a number: the device keeps its value."""
+        """Handle an output that a program set to NaN: the device keeps its value."""
         for output in self.outputs:
             if output.tag == tag and not output.not_a_number:
                 output.not_a_number, output.by = True, "plc"
@@ -81,8 +82,8 @@ class OutputWriter:
         """Write a tag once for a client (`by`); the tag must not be one that the PLC commands. `done` is called with
         the result.
 
-        While the outputs are in their safe state, those that have a safe value keep it. A write that is not carried out
-        is recorded in the journal and in the audit log, whatever the reason.
+        While the outputs are in their safe state, those that have a safe value keep it. Every write that is not carried out is
+        recorded in the journal and in the audit log.
         """
         output = next((o for o in self.outputs if o.tag == tag), None)
         where = output.driver.config.where if output is not None else tag
@@ -100,7 +101,7 @@ class OutputWriter:
             self._start(output, value)
 
     def _turned_away(self, output: Output | None, tag: str, where: str) -> tuple[Cause, FieldtwinError | None]:
-        """Return why a client's write of a tag is not started; the error is None if it may start."""
+        """Return the cause and the error if a client's write of a tag must not be started; the error is None if it may."""
         if output is None or output.by == "plc":
             return Cause.NOT_WRITABLE, NotAllowed(f"{tag} cannot be commanded by this client", where=where)
         if output.tag in self._group_of:
@@ -125,8 +126,11 @@ class OutputWriter:
                 output.wanted, output.by = output.safe, f"{SAFE}{why}"
 
     def release(self) -> None:
-        """Follow the PLC's commands again. The gateway stops writing an output that no program writes; an output that a
-        program writes keeps its safe value until the program has started."""
+        """Follow the PLC's commands again.
+
+        The gateway stops writing an output that no program writes. An output that a program writes keeps its safe value until the
+        program has started.
+        """
         self.safe_active = False
         for output in self.outputs:
             if not output.commanded and output.by.startswith(SAFE):
@@ -135,8 +139,8 @@ class OutputWriter:
     def restated(self, driver: DeviceDriver, held: Mapping[str, bytes]) -> None:
         """Apply the new configuration of a driver's device.
 
-        `held` is what the device held, as sent, by tag: a value that would now be sent as different bytes is written
-        again. Values that were refused may be allowed now.
+        `held` maps each tag to the bytes that were sent for the value that the device holds. A value that would now be sent as
+        different bytes is written again. Values that were refused may be allowed now.
         """
         for output in self.outputs:
             if output.driver is not driver:
@@ -154,14 +158,14 @@ class OutputWriter:
         return {o.tag: as_sent(o) for o in self.outputs if o.driver is driver and o.held is not None}
 
     def forget(self, driver: DeviceDriver) -> None:
-        """Forget what a lost device holds: after its return the values are unknown."""
+        """Forget the values that a lost device held, because they are unknown after its return."""
         for output in self.outputs:
             if output.driver is driver:
                 output.held, output.untouched = None, False
 
     @property
     def settled(self) -> bool:
-        """True when no output that could be written still differs from its wanted value."""
+        """Return whether every output that can be written has its wanted value."""
         return not any(
             o.pending or (o.wanted is not None and o.held != o.wanted and self._possible(o)) for o in self.outputs
         )
@@ -231,7 +235,7 @@ class OutputWriter:
         return output.refused != (output.wanted, output.by)
 
     def _tick_group(self, group: OutputGroup) -> None:
-        """Write a group whose device does not hold what its programs want, or hold the whole group back."""
+        """Write a group whose device does not hold the values that its programs want, or hold the whole group back."""
         differing = group.differing()
         if not differing or not group.by_programs or any(o.pending for o in group.outputs):
             return
@@ -283,7 +287,7 @@ class OutputWriter:
         first.bus.write(first.driver.config.name, list(zip(members, commands, strict=True)), ended)
 
     def _wait(self, output: Output, value: float) -> None:
-        """Note that the device accepts no write now. An output that waits for `AWAY_AFTER_NS` is reported, once."""
+        """Note that the device accepts no write now. An output that has waited for `AWAY_AFTER_NS` is reported once."""
         since_ns = output.waits_since_ns
         if since_ns is None:
             output.waits_since_ns = self._now_ns
@@ -300,13 +304,14 @@ class OutputWriter:
                 self._note(output, value, Cause.AWAY, error, output.by)
 
     def _waiting_frames(self, now_ns: int) -> set[object]:
-        """Return the frames with an output that has to wait. The other outputs of the frame wait too, so that the
-        commands of one scan are sent together."""
+        """Return the frames that contain an output that has to wait.
+
+        The other outputs of such a frame wait too, so that the commands of one scan are sent together."""
         waits = [o for o in self.outputs if o.pending or now_ns < o.next_try_ns]
         return {o.frame for o in waits if o.frame is not None}
 
     def _compare_with_device(self, output: Output, now_ns: int) -> None:
-        """Write a value again if the device reads back a different one: it lost the commanded value (a restart).
+        """Write a value again if the device reads back a different value, because it lost the commanded one (a restart).
 
         The bytes as sent are compared, because a device that holds the rounded value holds the commanded value.
         """
@@ -373,8 +378,9 @@ class OutputWriter:
         )
 
     def _on_record(self, output: Output, name: str, old: object, value: float) -> bool:
-        """Record the write in the audit log before it is sent. Without a record only a safe value is written; other
-        writes are tried again later."""
+        """Record the write in the audit log before it is sent.
+
+        If that fails, only a safe value is written; other writes are tried again later."""
         try:
             self._audit.note(
                 "write",
@@ -399,7 +405,7 @@ class OutputWriter:
             raise NotAllowed(f"writes are blocked: {output.driver.identity_error}", where=where)
 
     def _check_allowed(self, output: Output) -> None:
-        """Raise `NotAllowed` for what the configuration forbids, whatever device answers."""
+        """Raise `NotAllowed` if the configuration forbids the write, independently of the device."""
         where = output.driver.config.where
         if not self.allow_writes:
             raise NotAllowed("this plant is read-only", where=where, hint="start with --allow-writes")
@@ -407,8 +413,7 @@ class OutputWriter:
             raise NotAllowed(f"{output.tag} is not marked writable in the system file", where=where)
 
     def _done(self, output: Output, value: float, by: str, error: FieldtwinError | None) -> None:
-        """Handle the end of a write of `value`. `by` requested it; the output may be commanded by a different source
-        now."""
+        """Handle the end of a write of `value` that `by` requested. A different source may command the output now."""
         output.pending = False
         output.next_try_ns = self._now_ns + (MIN_SPACING_NS if error is None else RETRY_NS)
         if error is None:

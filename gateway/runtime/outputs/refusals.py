@@ -90,8 +90,8 @@ class Refusal:
     """One entry. `first` is the value of the first refusal, `value` that of the newest; `t_ns` and `last_ns` are
     monotonic.
 
-    `place` is the line of the program that set the value (``pump.st:14``), "" if it is not known. Another process looks
-    it up after the entry was made; until then `known` is False.
+    `place` is the line of the program that set the value (``pump.st:14``), "" if the line is not known. Another process looks it
+    up after the entry was created; until then `known` is False.
     """
 
     number: int
@@ -112,13 +112,14 @@ class Refusal:
 
     @property
     def of_program(self) -> bool:
-        """Whether a program or the safe state requested the write, and not a client."""
+        """Return whether a program or the safe state requested the write, and not a client."""
         return self.by == "plc" or self.by.startswith("safe: ")
 
     @property
     def fault(self) -> str:
-        """What has to be changed: "program" if the program or the configuration is wrong, "device" if a device refused.
-        "" for a write that is refused by design, is tried again, or was requested by a client."""
+        """Return what has to be corrected: "program" (the program or the configuration) or "device" (a device refused).
+
+        Return "" for a write that is refused by design, is tried again, or was requested by a client."""
         if not self.of_program:
             return ""
         return "program" if self.cause in OF_PROGRAM else "device" if self.cause in OF_DEVICE else ""
@@ -164,7 +165,7 @@ class Refusals:
 
     @property
     def total(self) -> int:
-        """The number of refusals, repetitions included."""
+        """Return the number of refusals, repetitions included."""
         return sum(self.counts.values())
 
     def note(
@@ -206,7 +207,7 @@ class Refusals:
             self.on_new(entry)
 
     def settle(self, tag: str) -> None:
-        """End the standing refusal of a tag, because the tag was written or a value is wanted that may be written."""
+        """End the present refusal of a tag, because the tag was written, or because the wanted value is now allowed."""
         if tag in self._newest:
             self._newest[tag].standing = False
 
@@ -239,8 +240,7 @@ class Refusals:
             self.unrecorded += 1  # counted; the write is refused with or without a record
 
     def flush(self) -> None:
-        """Write into the audit log how many refusals came since the last line about their tag. Called when the gateway
-        stops."""
+        """Write into the audit log the number of refusals since the last line about their tag. Called when the gateway stops."""
         for key, (last_ns, more) in list(self._audited.items()):
             self._write_rest(key, more)
             self._audited[key] = (last_ns, 0)
@@ -253,8 +253,7 @@ class Refusals:
                 return
 
     def since(self, number: int) -> list[Refusal]:
-        """Return the entries after `number` that are kept, the oldest first, up to the first whose place is still
-        looked up."""
+        """Return the kept entries after `number`, oldest first, up to the first entry whose place is still being looked up."""
         found: list[Refusal] = []
         for entry in self._entries:
             if entry.number > number:

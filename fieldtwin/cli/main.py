@@ -6,7 +6,6 @@ Each command is imported when it is called, so `--version` and completion stay f
 from __future__ import annotations
 
 import contextlib
-import difflib
 import errno
 import os
 import signal
@@ -18,6 +17,7 @@ import click
 
 from fieldtwin.__about__ import __version__
 from fieldtwin.cli.broken_pipe import VERDICTS, talk_unheard, to_nowhere, verdict_unheard
+from fieldtwin.gateway.core.files.nearest import nearest
 
 COMMANDS = {
     "run": ("fieldtwin.cli.run.run_command", "Run a system: the plant, or its prototype."),
@@ -162,7 +162,7 @@ class LazyGroup(click.Group):
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """Suggest similar command names: click suggests only options."""
-        near = difflib.get_close_matches(args[0], COMMANDS, n=1)
+        near = nearest(args[0], COMMANDS)
         if args[0] not in COMMANDS and near:
             raise click.UsageError(f"No such command {args[0]!r}. Did you mean {near[0]!r}?", ctx)
         if args[0] in VERDICTS:

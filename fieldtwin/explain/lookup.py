@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Sequence
 from functools import cache
 
 from fieldtwin.explain.explanation import Explanation
 from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.files.nearest import nearest
 
 _CASE = re.compile(r"(mb|co)-?0*(\d{1,3})([a-h]?)")
 
@@ -40,7 +40,7 @@ def explain(text: str) -> Sequence[Explanation]:
     if found:
         return found
     known = [spelling for entry in everything() for spelling in entry.words]
-    near = difflib.get_close_matches(word, known, n=3)
+    near = nearest(word, known, most=3)
     raise UsageError(
         f"no explanation of {text!r}",
         expected="a test case (MB-015), a fault, `exception 02`, an SDO abort code, a quality or its reason, an error, `exit 4`",

@@ -22,12 +22,12 @@ Pure text handling: this module opens nothing and knows no operating system.
 
 from __future__ import annotations
 
-import difflib
 import re
 from dataclasses import dataclass, replace
 from urllib.parse import parse_qsl, urlencode
 
 from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.files.nearest import did_you_mean
 
 SERIAL_SCHEMES = ("rtu", "ascii")
 SOCKET_SCHEMES = ("tcp", "rtu+tcp", "udp", "tls")
@@ -227,8 +227,7 @@ def _meant(url: str, scheme: str) -> str:
     """Return a hint for a text that is not an endpoint: a device's path without its scheme, or a misspelt scheme."""
     if url.startswith("/dev/"):
         return f"a serial port is rtu:{url}?baudrate=9600&frame=8N1"
-    near = difflib.get_close_matches(scheme, SCHEMES, n=1)
-    return f"did you mean {near[0]}:?" if near else ""
+    return did_you_mean(scheme, SCHEMES)
 
 
 def _host_port(url: str, scheme: str, rest: str) -> tuple[str, int]:

@@ -6,10 +6,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from difflib import get_close_matches
 from typing import Any, NoReturn, Protocol
 
 from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.files.nearest import did_you_mean
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st.source import shortened
 from fieldtwin.plc.st.tree import Expr, Pos
@@ -94,9 +94,7 @@ class Environment:
         raise self.error(pos, message, expected=expected, got=got, hint=hint)
 
     def unknown(self, pos: Pos, what: str, name: str, known: list[str]) -> NoReturn:
-        near = get_close_matches(name.lower(), [k.lower() for k in known], 1)
-        nearest = next((k for k in known if near and k.lower() == near[0]), "")
-        self.fail(pos, f"{what} {name!r} is not declared", hint=f"did you mean {nearest}?" if nearest else "")
+        self.fail(pos, f"{what} {name!r} is not declared", hint=did_you_mean(name, known))
 
 
 class Compiling(Protocol):

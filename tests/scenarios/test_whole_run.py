@@ -101,7 +101,7 @@ def test_probes_see_served_values_under_their_names(tmp_path: Path) -> None:
         (HMI.replace("desk:", "ctd:"), "device or program", 4),
         (HMI.replace("    serve: hmi\n", ""), "one endpoint", 4),
         (HMI.replace("serve: hmi", 'endpoint: "can:socketcan/can0"'), "uses Modbus", 5),
-        (HMI.replace("serve: hmi", 'endpoint: "tpc://127.0.0.1"'), "did you mean tcp:", 5),
+        (HMI.replace("serve: hmi", 'endpoint: "tpc://127.0.0.1"'), "did you mean 'tcp'", 5),
         ("rate: [{tag: ctd.pressure, requests_per_s: {max: 1}}]\n", "needs a tag or a wire", 3),
         ("cycle: [{changes_of: ctd.pressure}]\n", "bounds", 3),
         ("cycle: [{changes_of: ctd.pressure, min: 2s, max: 1s}]\n", "these bounds can never be met", 3),

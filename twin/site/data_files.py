@@ -7,12 +7,12 @@ files.
 
 from __future__ import annotations
 
-import difflib
 import os
 from collections.abc import Iterable
 from pathlib import Path
 
 from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.files.nearest import did_you_mean
 
 MAX_BYTES = 8 * 1024 * 1024
 _HERE = Path(__file__).absolute().parents[3].resolve()  # not resolved at once: in a checkout fieldtwin/twin is a link
@@ -72,11 +72,10 @@ def find(kind: str, name: str, beside: Path | None = None, extra: Iterable[Path]
     if direct.name != name or direct.suffix in (".yaml", ".yml"):
         raise UsageError(f"there is no file {name!r}", expected=f"a {kind[:-1]}'s file, or one of " + ", ".join(known))
     files = [f.name for f in (Path(f"{name}.yaml"), Path(f"{name}.yml")) if f.is_file()]
-    near = files or difflib.get_close_matches(direct.name, known, n=1)
     raise UsageError(
         f"no {kind[:-1]} {name!r}",
         expected="a file, or one of " + ", ".join(known),
-        hint=f"did you mean {near[0]!r}?" if near else "",
+        hint=f"did you mean {files[0]!r}?" if files else did_you_mean(direct.name, known),
     )
 
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from difflib import get_close_matches
 from typing import Protocol
 
 from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.files.nearest import nearest
 
 _ID = re.compile(r"^((?:MB|CO)-)?(\d{1,3})([a-h]?)$", re.IGNORECASE)
 
@@ -33,7 +33,7 @@ def only_of(text: str | None, cases: Sequence[Named]) -> frozenset[str]:
         match = _ID.match(part.strip())
         id = f"{(match[1] or prefix).upper()}{int(match[2]):03}{match[3].lower()}" if match else part.strip()
         if id not in known:
-            near = get_close_matches(id, known, 1)
+            near = nearest(id, known)
             raise UsageError(f"no case {part.strip()!r}", expected=near[0] if near else "an id such as " + cases[0].id)
         chosen.add(id)
     return frozenset(chosen)

@@ -14,12 +14,12 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import dataclass
 from datetime import date
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from fieldtwin.gateway.core.files.nearest import nearest
 from fieldtwin.gateway.core.files.yaml_file import YamlFile, load, validate
 
 
@@ -79,7 +79,7 @@ def read_waivers(file: YamlFile, known: Collection[str]) -> Waivers:
     seen: set[str] = set()
     for at, entry in enumerate(entries):
         if entry.id not in known:
-            near = get_close_matches(entry.id, known, 1)
+            near = nearest(entry.id, known)
             raise file.error(
                 ("waivers", at, "id"), f"no case {entry.id!r}", expected=near[0] if near else "an id such as MB-013"
             )

@@ -70,7 +70,7 @@ def test_errors_name_line_and_column_of_the_export(tmp_path: Path) -> None:
     line = next(n for n, row in enumerate(text.splitlines(), 1) if row.startswith("valve := "))
     for wrong, told, column in (
         ("E_Mode.Fillin", "Fillin", 18),
-        ("GVL.setpint", "did you mean setpoint?", 22),
+        ("GVL.setpint", "did you mean 'setpoint'?", 22),
     ):
         path = tmp_path / "tank.xml"
         path.write_text(text.replace("valve := eMode = E_Mode.Filling;", f"valve := eMode = {wrong};"))

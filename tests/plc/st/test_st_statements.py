@@ -216,7 +216,7 @@ def test_an_alarm_outlives_a_restart_and_its_delay_starts_again() -> None:
 @pytest.mark.parametrize(
     ("text", "line", "told"),
     [
-        ("PROGRAM p VAR a : INTT; END_VAR END_PROGRAM", 1, "did you mean INT?"),
+        ("PROGRAM p VAR a : INTT; END_VAR END_PROGRAM", 1, "did you mean 'INT'?"),
         ("PROGRAM p VAR a : INT; A : BOOL; END_VAR END_PROGRAM", 1, "declared twice"),
         ("VAR_GLOBAL a AT %IX0.0 : BOOL; END_VAR PROGRAM p END_PROGRAM", 1, "bind it to a tag"),
         (
@@ -228,7 +228,7 @@ def test_an_alarm_outlives_a_restart_and_its_delay_starts_again() -> None:
         ("PROGRAM p VAR CONSTANT c : INT := 1; END_VAR\nc := 2; END_PROGRAM", 2, "c cannot be assigned to"),
         ("PROGRAM p VAR_INPUT c : INT; END_VAR\nc := 2; END_PROGRAM", 2, "c cannot be assigned to"),
         ("PROGRAM p VAR t : TON; END_VAR\nt.Q := TRUE; END_PROGRAM", 2, "cannot be assigned to"),
-        ("PROGRAM p VAR t : TON; END_VAR\nt(INN := TRUE); END_PROGRAM", 2, "did you mean IN?"),
+        ("PROGRAM p VAR t : TON; END_VAR\nt(INN := TRUE); END_PROGRAM", 2, "did you mean 'IN'?"),
         ("PROGRAM p VAR t, u : TON; END_VAR\nt := u; END_PROGRAM", 2, "a TON cannot be assigned"),
         ("PROGRAM p VAR n : INT; END_VAR\nIF n THEN ; END_IF END_PROGRAM", 2, "expected BOOL; got INT"),
         ("PROGRAM p\nEXIT; END_PROGRAM", 2, "EXIT outside a loop"),

@@ -1,0 +1,26 @@
+"""Suggestions for misspelt names."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fieldtwin.gateway.core.files.nearest import did_you_mean, nearest
+
+NAMES = st.lists(st.text("abcdeXYZ_.", min_size=1, max_size=8), max_size=8, unique_by=str.lower)
+
+
+@given(NAMES, st.text("abcdeXYZ_.", min_size=1, max_size=8), st.integers(1, 4))
+def test_suggestions_are_known_names_and_a_known_name_in_another_case_is_the_first(
+    known: list[str], name: str, most: int
+) -> None:
+    near = nearest(name, known, most)
+    assert set(near) <= set(known)
+    assert len(near) == len(set(near)) <= most
+    same = [k for k in known if k.lower() == name.lower()]
+    assert near[:1] == same or not same
+
+
+def test_a_hint_quotes_the_name_as_it_is_written() -> None:
+    assert did_you_mean("SETPINT", ["Setpoint", "other"]) == "did you mean 'Setpoint'?"
+    assert did_you_mean("x", ["Setpoint"], "see the manual") == "see the manual"

@@ -14,8 +14,9 @@ from fieldtwin.gateway.core.errors import Unreachable
 
 
 class Acts:
-    """Appends to the file at `path`, which is created if necessary and which only its owner may read; with ``""``
-    nothing is written."""
+    """The record in the file at `path`, which is created if necessary and which only its owner may read.
+
+    If `path` is ``""``, nothing is written."""
 
     def __init__(self, path: str) -> None:
         self.counts: dict[str, int] = {}

@@ -28,11 +28,11 @@ _ST_SUFFIXES = (".st", ".xml")
 
 @dataclass(frozen=True, slots=True)
 class InputBinding:
-    """The source of an input, and what a program sees while it is BAD: a tag of the plant, or another program's
-    ``program.variable``.
+    """The source of an input (a tag of the plant, or another program's ``program.variable``), and its policy for bad values.
 
-    `if_bad` is ``"pass"`` (the value as it is, BAD), ``"hold"`` (the last value that was not BAD, UNCERTAIN), a number
-    that replaces it (SUBSTITUTED), or ``"trip"``: a bad value, once it was good, stops the task with its outputs safe.
+    `if_bad` decides what the program sees while the source is BAD. ``"pass"``: the value as it is, BAD. ``"hold"``: the last
+    value that was not BAD, as UNCERTAIN. A number: this number, as SUBSTITUTED. ``"trip"``: the task stops with its outputs safe
+    when a value that was good becomes bad.
     """
 
     tag: str
@@ -116,8 +116,8 @@ def image_for(
 ) -> ImageLayout:
     """Return the process image that `programs` need of a plant whose tags are `plant`. Raises `FileInvalid`.
 
-    INPUTS holds every tag to which an input is bound, then the `watched` ones; OUTPUTS holds every output and local. An
-    input may also be bound to another program's variable: ``<program>.<variable>``.
+    INPUTS holds every tag to which an input is bound, then the `watched` tags; OUTPUTS holds every output and local. An input may
+    also be bound to another program's variable: ``<program>.<variable>``.
     """
     inputs: dict[str, TagSpec] = {}
     outputs: dict[str, TagSpec] = {}
@@ -183,7 +183,7 @@ def _plant_tag(bound: BoundProgram, variable: Variable, tag: str, plant: Mapping
 
 
 def substitute(spec: TagSpec, if_bad: str | float) -> Scalar | None:
-    """Return the value that `if_bad` puts in place of a BAD value of tag `spec`; None for a policy without a value.
+    """Return the number with which `if_bad` replaces a BAD value of tag `spec`; None if the policy is not a number.
 
     Raises `FileInvalid` for an invalid policy or value.
     """

@@ -19,8 +19,11 @@ from fieldtwin.plc.start import StartPolicy
 
 @dataclass(frozen=True, slots=True)
 class ProgramConfig:
-    """A program: its source (`fieldtwin.plc.binding.load_program`), its bindings from variable to tag, its task (the
-    first if empty), and how long it waits for its inputs."""
+    """The configuration of a program.
+
+    It holds its source (`fieldtwin.plc.binding.load_program`), its bindings from variable to tag, its task (the first task if
+    empty), and its policy while it waits for its inputs.
+    """
 
     name: str
     source: str
@@ -38,7 +41,7 @@ class ProgramConfig:
 class TaskSpec:
     """A task (IEC 61131-3, 6.8.2): every `interval_ms`, or once at each rising edge of the tag `single`.
 
-    `priority` 0 is the highest. `late_ms`: how late a scan may begin, 0 for the value of the PLC.
+    `priority` 0 is the highest. `late_ms` is the permitted delay of a scan's start; 0 stands for the value of the PLC.
     """
 
     name: str
@@ -50,15 +53,16 @@ class TaskSpec:
 
 @dataclass(frozen=True, slots=True)
 class PlcConfig:
-    """A PLC process. `layout` is `ImageLayout.describe()`; `image_path` is a file that holds a formatted image of it.
+    """The configuration of a PLC process.
 
-    `heartbeat_limit_ms`: the age of the gateway's last publication beyond which inputs are BAD. `priority`: of
-    SCHED_FIFO, 0 to stay in the normal class. `python_path`: folders that are searched first for programs. Without
-    `tasks` there is one task, with `cycle_ms`. A scan of more than `stuck_ms` is ended by force (0: never). After that,
-    or after a stop by the watchdog, the programs start again `restart_after_ms` later, at most `max_restarts` times in
-    a row. `retain_path`: the file of retained variables, ``""`` for none; with `cold` they begin with their initial
-    values. `outputs_first`: outputs are published at the start of the cycle. `audit_path`: the file that records what
-    users do to the PLC, ``""`` for none.
+    `layout` is the result of `ImageLayout.describe()`; `image_path` is a file that holds a formatted image with this layout.
+    Inputs are BAD when the gateway's last publication is older than `heartbeat_limit_ms`. `priority` is that of SCHED_FIFO; 0
+    leaves the process in the normal scheduling class. `python_path` lists folders that are searched first for programs. Without
+    `tasks` there is one task, with `cycle_ms`. A scan of more than `stuck_ms` is ended by force (0: never). After that, or after
+    a stop by the watchdog, the programs start again `restart_after_ms` later, at most `max_restarts` times in a row.
+    `retain_path`: the file of retained variables, ``""`` for none; with `cold` they begin with their initial values.
+    `outputs_first`: outputs are published at the start of the cycle. `audit_path`: the file that records what users do to the
+    PLC, ``""`` for none.
     """
 
     image_path: str
@@ -84,7 +88,7 @@ class PlcConfig:
         return ImageLayout.from_description(self.layout)
 
     def to_json(self) -> bytes:
-        """Return the inverse of `from_json`."""
+        """Return the configuration as JSON; the inverse of `from_json`."""
         return msgspec.json.format(msgspec.json.encode(self), indent=2)
 
     @classmethod
@@ -97,7 +101,7 @@ class PlcConfig:
 
     @classmethod
     def load(cls, path: Path) -> PlcConfig:
-        """Read a file. Raises `FileInvalid`."""
+        """Read a configuration from a file. Raises `FileInvalid`."""
         try:
             return cls.from_json(path.read_bytes(), str(path))
         except OSError as e:

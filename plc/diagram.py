@@ -1,7 +1,7 @@
-"""A state table as a drawing: SVG, without a network, a font or a layout program.
+"""Draws a state table as SVG, without a network, a font or a layout program.
 
-States are placed on an ellipse in the order of their codes, the initial one on top with a dot before it; each
-transition is an arrow with its guard. Transitions from any state are drawn from each state. Pure: text in, text out.
+States are placed on an ellipse in the order of their codes, with the initial state on top and a dot before it; each transition is
+an arrow with its guard. Transitions from any state are drawn from each state. Pure: text in, text out.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class _Box:
     width: float
 
     def edge(self, angle: float) -> tuple[float, float]:
-        """Return where a line from the middle at `angle` leaves the box."""
+        """Return the point at which a line from the middle of the box at `angle` leaves it."""
         dx, dy = cos(angle), sin(angle)
         across = self.width / 2 / abs(dx) if dx else float("inf")
         up = _BOX_H / 2 / abs(dy) if dy else float("inf")
@@ -47,15 +47,17 @@ class _Box:
 
 
 class _Labels:
-    """Places texts where they hide neither a state nor each other, as far as there is room."""
+    """The placement of texts, so that they hide neither a state nor each other, as far as there is room."""
 
     def __init__(self, boxes: Iterable[_Box]) -> None:
         self._taken = [(b.x - b.width / 2, b.y - _BOX_H / 2, b.x + b.width / 2, b.y + _BOX_H / 2) for b in boxes]
         self.drawn: list[str] = []
 
     def place(self, spots: Sequence[tuple[float, float]], lines: Sequence[str]) -> None:
-        """Place `lines` at the first of `spots` (the middle of the text) where they hide nothing, else where they hide
-        least."""
+        """Place `lines` at the first of `spots` where they hide nothing, or where they hide least.
+
+        A spot is the middle of the text.
+        """
         if not lines:
             return
         width, height = max(len(line) for line in lines) * _CHAR + 8, len(lines) * _LINE_H + 2
@@ -109,8 +111,10 @@ def svg(table: StateTable, title: str = "", current: str = "") -> str:
 
 
 def _arrows(table: StateTable) -> list[tuple[str, str, list[str]]]:
-    """Return (source, target, labels): several transitions between the same two states share an arrow, with a line for
-    each."""
+    """Return the arrows as (source, target, labels).
+
+    Transitions between the same two states share an arrow, with a label each.
+    """
     found: dict[tuple[str, str], list[str]] = {}
     for state in table.states:
         for transition in table.leaving(state):

@@ -1,8 +1,8 @@
 """Forces: values that a user sets in place of a tag's value, until they are removed.
 
-A forced input is what every program sees, with quality SIMULATED. A forced output or local is set before the logic and
-again after it, and is published as SIMULATED (SPEC ruling 15). The number of forces is limited, and they are listed in
-every status. This module does not check whether a force is safe: that is the user's decision.
+Every program sees the forced value of an input, with quality SIMULATED. A forced output or local is set before the logic and
+again after it, and is published as SIMULATED (SPEC ruling 15). The number of forces is limited, and they are listed in every
+status. This module does not check whether a force is safe: that is the user's decision.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ MAX_FORCES = 256
 
 @dataclass(frozen=True, slots=True)
 class Force:
-    """A forced tag: its value, since when (monotonic ns), and the user who forced it."""
+    """A forced tag: its value, the time when it was forced (monotonic ns), and the user who forced it."""
 
     value: Scalar
     since_ns: int
@@ -47,7 +47,7 @@ class Forces:
         return found is not None
 
     def clear(self) -> int:
-        """Remove all forces; return how many there were."""
+        """Remove all forces; return how many were removed."""
         count = len(self)
         self.inputs.clear()
         self.outputs.clear()
@@ -65,7 +65,7 @@ class Forces:
 
 
 def checked(spec: TagSpec, value: Scalar) -> Scalar:
-    """Return `value` as one of the tag's kind. Raises `UsageError`."""
+    """Return `value` converted to the tag's kind. Raises `UsageError` for a value that the tag cannot hold."""
     if isinstance(value, int | float) and (isinstance(value, int) or isfinite(value)) and -(2**63) <= value < 2**63:
         if spec.kind is TagKind.REAL:
             return float(value)

@@ -242,8 +242,9 @@ def _text(args: dict[str, Any], name: str) -> str:
 
 
 def plc_main(config: PlcConfig) -> int:
-    """Attach, run until requested to stop, return the exit code. Raises `FileInvalid` or `Unreachable` before the first
-    scan."""
+    """Attach to the image, run until requested to stop, and return the exit code.
+
+    Raises `FileInvalid` or `Unreachable` before the first scan."""
     try:
         fd = os.open(config.image_path, os.O_RDWR | os.O_CLOEXEC)
     except OSError as e:

@@ -34,8 +34,9 @@ MESSAGE_DEPTH = 16
 
 
 class ProgramFailed(FieldtwinError):
-    """A program raised an error, or set a variable to a value that its tag cannot hold. The task stops and its outputs
-    become safe.
+    """A program raised an error, or set a variable to a value that its tag cannot hold.
+
+    The task stops and its outputs become safe.
 
     `program` is its name in the system file, `line` the line of its source that raised the error (0 if unknown),
     `variable` the tag concerned, if any.
@@ -83,9 +84,12 @@ class Role(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Variable:
-    """A declared variable. `initial` is its value before the first scan; `max_bytes` and `depth` belong to a message
-    output; `retain`: its value outlives the process; `limits` are shown to users, and a force has to keep to them;
-    `words`: the names of its values."""
+    """A declared variable.
+
+    `initial` is its value before the first scan. `max_bytes` and `depth` apply to message outputs. The value of a `retain`
+    variable is kept when the process ends. `limits` are shown to users, and a force must be within them. `words` are the names of
+    its values.
+    """
 
     name: str
     role: Role
@@ -100,7 +104,7 @@ class Variable:
 
 
 def var_input(kind: TagKind, initial: Scalar | None = None) -> Any:
-    """Declare an input. It is None while the plant has not had a value yet and no substitute applies."""
+    """Declare an input. It is None as long as the plant has had no value and no substitute applies."""
     return Variable("", Role.INPUT, kind, initial)
 
 
@@ -127,7 +131,10 @@ def var_retain(kind: TagKind, initial: Scalar | None = None, unit: str = "", lim
 
 
 def message_input() -> Any:
-    """Declare an input of messages: in each scan a tuple of every new `Message`, each in exactly one scan."""
+    """Declare an input of messages.
+
+    In each scan it is the tuple of the new messages; each `Message` appears in exactly one scan.
+    """
     return Variable("", Role.INPUT, TagKind.MESSAGE)
 
 
@@ -137,7 +144,7 @@ def message_output(max_bytes: int = MESSAGE_BYTES, depth: int = MESSAGE_DEPTH) -
 
 
 class ScanInfo(msgspec.Struct, frozen=True, gc=False):
-    """The scan that runs: its frozen time (monotonic), its number from 1, and whether it is the first since start."""
+    """The present scan: its frozen time (monotonic, ns), its number from 1, and whether it is the first since the start."""
 
     now_ns: int
     number: int
@@ -145,10 +152,9 @@ class ScanInfo(msgspec.Struct, frozen=True, gc=False):
 
 
 class Outbox:
-    """A message output. There are never more than `depth` messages under way, so that none is overwritten before it is
-    read.
+    """A message output. At most `depth` messages wait for the receiver, so that none is overwritten before it is read.
 
-    `waits` counts sends that were refused because the receiver had not kept up: one per scan that had to wait.
+    `waits` counts the calls of `send` that were refused because there was no room.
     """
 
     def __init__(self, max_bytes: int, depth: int) -> None:
@@ -162,12 +168,12 @@ class Outbox:
 
     @property
     def room(self) -> int:
-        """How many more messages can be sent in this scan."""
+        """Return the number of messages that can still be sent in this scan."""
         return max(0, self.depth - self.outstanding - len(self.pending))
 
     def send(self, data: bytes, t_ns: int) -> bool:
-        """Send `data`, whose source time is `t_ns`. Return False, and count it, if there is no room: keep it and try in
-        the next scan.
+        """Send `data`, whose source time is `t_ns`. Return False if there is no room: the program should try again in the next
+        scan.
 
         Raises `Bug` for a message longer than `max_bytes`.
         """
@@ -182,8 +188,9 @@ class Outbox:
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """A line of a program's source. In a code object it is an instruction, whose line is looked up only when it is
-    shown."""
+    """A line of a program's source.
+
+    It is stored as an instruction of a code object; the line is looked up only when it is shown."""
 
     path: str = ""
     line: int = 0
@@ -191,7 +198,7 @@ class Place:
     instruction: int = 0
 
     def __str__(self) -> str:
-        """Return ``pump.st:14``; the path alone if the line is not known, "" if neither is known."""
+        """Return a text such as ``pump.st:14``; the path alone if the line is not known, "" if neither is known."""
         path, line = self.path, self.line
         if self.code is not None:
             path = _within_its_import_path(self.code.co_filename)
@@ -201,7 +208,7 @@ class Place:
 
 
 def _within_its_import_path(path: str) -> str:
-    """Return ``plc/control.py``, the file of a module as seen from its entry of `sys.path`.
+    """Return the path of a module's file relative to its entry of `sys.path`, such as ``plc/control.py``.
 
     A place is recorded in traces, which must not differ between two computers or folders.
     """
@@ -210,7 +217,7 @@ def _within_its_import_path(path: str) -> str:
 
 
 class _Assigned:
-    """An output as a class attribute: it keeps the value in the instance and remembers which instruction assigned it.
+    """A descriptor for outputs: it keeps the value in the instance, and records which instruction assigned it.
 
     It has no ``__get__``, so that reading an output costs as little as reading any other attribute.
     """
@@ -227,7 +234,7 @@ class _Assigned:
 
 
 class Program(ABC):
-    """Base of all programs. A subclass declares variables in its body and overrides `execute`."""
+    """The base class of all programs. A subclass declares variables in its body and overrides `execute`."""
 
     __slots__ = ("__dict__", "__weakref__", "_assigned")
     _assigned: dict[str, tuple[CodeType, int]]
@@ -263,29 +270,28 @@ class Program(ABC):
         """Execute one scan: read inputs, set outputs, return. An error that it raises stops the task."""
 
     def _whole_state(self, now_ns: int) -> Any:
-        """Return all that the next scans depend on, as a hashable value with times relative to `now_ns`.
+        """Return the whole state on which the next scans depend, as a hashable value with times relative to `now_ns`.
 
-        Return None if that is unknown, as for logic in Python, which can keep state anywhere.
+        Return None if it is unknown, as for logic in Python, which can keep state anywhere.
         """
         return None
 
     def place(self, name: str) -> Place | None:
-        """Return the line that assigned output `name` last; None while it has its initial value, or one set from
-        outside."""
+        """Return the line that assigned output `name` last; None while it has its initial value, or a value set from outside."""
         assigned = self._assigned.get(name)
         return Place(code=assigned[0], instruction=assigned[1]) if assigned is not None else None
 
     def put(self, name: str, value: Scalar) -> None:
-        """Set a variable from outside the logic, as a force does."""
+        """Set a variable from outside the logic, for example for a force."""
         self.__dict__[name] = value
         self._assigned.pop(name, None)
 
     def retained(self) -> dict[str, Any]:
-        """Return what a warm start needs, by variable: numbers, strings, and lists and maps of those."""
+        """Return the values that a warm start needs, by variable: numbers, strings, and lists and maps of them."""
         return {v.name: self.__dict__[v.name] for v in self.variables.values() if v.retain}
 
     def retain_layout(self) -> Any:
-        """Return what must be unchanged for a retained value to keep its meaning, as data for JSON."""
+        """Return the properties that must be unchanged for retained values to keep their meaning, as data for JSON."""
         return [[v.name, v.kind.value] for v in self.variables.values() if v.retain]
 
     def retain_bytes(self) -> int:
@@ -293,8 +299,7 @@ class Program(ABC):
         return sum(9 + 5 + len(v.name.encode()) for v in self.variables.values() if v.retain)
 
     def check(self, name: str, value: Scalar) -> None:
-        """Raise `UsageError` if variable `name` cannot hold `value`, although its tag can. In this class every variable
-        can."""
+        """Raise `UsageError` if variable `name` cannot hold a `value` that its tag can hold. In this class every variable can."""
         return
 
     def restore(self, kept: dict[str, Any]) -> None:
@@ -304,9 +309,9 @@ class Program(ABC):
                 self.__dict__[v.name] = kept[v.name]
 
     def resume(self, known: Mapping[str, Scalar]) -> None:
-        """Before the first scan, continue from known values of the outputs and locals.
+        """Continue from known values of the outputs and locals. Called before the first scan.
 
-        A program whose state is more than its variables overrides this. Raises `UsageError` for a value that a variable
+        A program that has state besides its variables overrides this. Raises `UsageError` for a value that a variable
         cannot hold.
         """
         for v in self.variables.values():
@@ -315,7 +320,7 @@ class Program(ABC):
                 self.put(v.name, known[v.name])
 
     def tag(self, name: str) -> TagValue:
-        """Return input `name` with quality, reason and time, as this scan sees it (after its substitute policy)."""
+        """Return input `name` with quality, reason and time as this scan sees it, after its policy for bad values was applied."""
         if self._lookup is None:
             raise Bug("an input was looked up outside a scan", where=f"{type(self).__name__}.{name}")
         return self._lookup(name)

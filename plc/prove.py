@@ -1,14 +1,14 @@
 """Checks the invariants of a program in every state that it can reach with any inputs, breadth first.
 
-A `Proof` defines the possible inputs (a finite domain per scan: values, qualities, how much time passes), which part of
-the program's state matters, and the invariants. The program itself runs, scan by scan; there is no second model. The
-search is breadth first, so the path to the first violation is a shortest one. The search is limited: states that were
-not visited are reported, and then there is no proof.
+A `Proof` defines the possible inputs (a finite domain per scan: values, qualities, elapsed time), which part of the program's
+state matters, and the invariants. The program itself runs, scan by scan; there is no second model. The search is breadth first,
+so the path to the first violation has the fewest scans. The search is limited: states that were not visited are reported, and
+then there is no proof.
 
-A proof is only as good as its key: a key that leaves out a part of the state that matters ends the search too soon.
-Structured Text needs no key, because all of its state is known. The timers and other blocks of a program are always
-part of the key. A given key is tested afterwards by random paths through the program without any key: a state that the
-search has not seen makes the result "not proved".
+A proof is only as good as its key: if the key leaves out a part of the state that matters, the search ends too soon. Structured
+Text needs no key, because all of its state is known. The timers and other blocks of a program are always part of the key. A given
+key is tested afterwards by random paths through the program without any key: a state that the search has not seen makes the
+result "not proved".
 """
 
 from __future__ import annotations
@@ -36,8 +36,11 @@ WALKS, WALK_SCANS = 64, 64
 
 @dataclass(frozen=True, slots=True)
 class Given:
-    """The inputs of one scan: values by variable (None: BAD without a value; a `TagValue` with its quality), ms since
-    the previous scan, and whether the receiver of each message output has emptied its mailbox since."""
+    """The inputs of one scan.
+
+    They are the values by variable (None: BAD without a value; a `TagValue` has its own quality), the ms since the previous scan,
+    and for each message output whether its receiver has emptied the mailbox since then.
+    """
 
     inputs: tuple[tuple[str, Any], ...]
     ms: float
@@ -114,7 +117,7 @@ class Result:
 
     @property
     def bounded(self) -> bool:
-        """Whether a limit of the search was reached, so that a larger limit may lead to a proof."""
+        """Return whether a limit of the search was reached, so that a larger limit may lead to a proof."""
         return self.reason.startswith("more than")
 
     @property
@@ -179,8 +182,7 @@ def _key(proof: Proof, point: _Point) -> Hashable:
 
 
 def _tested(proof: Proof, choices: Sequence[Given], seen: set[Hashable], whole: Result) -> Result:
-    """Return `whole`, unless a random path without a key breaks an invariant or reaches a state that the search did not
-    see."""
+    """Return `whole`, unless a random path breaks an invariant or reaches a state that the search did not visit."""
     random = Random(0)
     for _ in range(WALKS):
         point = _Point(proof.make(), 0, 0, None, None)
@@ -198,8 +200,7 @@ def _tested(proof: Proof, choices: Sequence[Given], seen: set[Hashable], whole: 
 
 
 def shown(proof: Proof, way: Sequence[Given]) -> dict[str, Any]:
-    """Return the program's outputs and locals at the end of `way`, as far as it was executed: the last scan may have
-    raised an error."""
+    """Return the program's outputs and locals at the end of `way`. The last scan may have raised an error before its end."""
     point = _Point(proof.make(), 0, 0, None, None)
     for given in way:
         point = point.after(given)

@@ -40,8 +40,9 @@ MAX_CHANGES = 16
 
 
 class Output:
-    """One published variable and where the program keeps it. `taken` is the place in INPUTS that shows how far its
-    messages were taken."""
+    """One published variable, and the attribute in which the program keeps it.
+
+    `taken` is the index in INPUTS of the tag that counts how many of its messages were taken."""
 
     def __init__(self, bound: BoundProgram, variable: Variable, spec: TagSpec, index: int) -> None:
         self.program = bound.program
@@ -144,7 +145,7 @@ class OutputImage:
                 self.outboxes.append((source, source.outbox))
 
     def _before(self, image: Image) -> dict[str, int]:
-        """Return what an earlier process had consumed, by message tag."""
+        """Return the sequence up to which an earlier process had consumed messages, by message tag."""
         before = image.reader(OUTPUTS).snapshot()
         found = {}
         for tag in self.consumed:
@@ -292,13 +293,13 @@ class OutputImage:
         self.writer.release()
 
     def last(self) -> dict[str, Scalar | None]:
-        """Return every tag of OUTPUTS as last collected; of a message tag, the last sequence."""
+        """Return every tag of OUTPUTS as last collected. The value of a message tag is its last sequence."""
         shown = dict(zip(self.writer.shape.index, self._values, strict=True))
         return shown | {output.tag: self.writer.last_sequence(output.tag) for output, _ in self.outboxes}
 
 
 def find(shape: RegionShape, tag: str) -> tuple[TagSpec, int]:
-    """Return a tag's place in a region. Raises `FileInvalid`."""
+    """Return the index of a tag in a region. Raises `FileInvalid` if the region does not hold the tag."""
     index = shape.index.get(tag)
     if index is None:
         raise FileInvalid(f"tag {tag} is not in the process image", expected=f"a tag of region {shape.layout.name}")

@@ -1,4 +1,4 @@
-"""The wall clock of a PLC process: precise sleeping, and requests to the host for what makes that possible.
+"""The wall clock of a PLC process: precise sleeping, and the requests to the operating system that it needs.
 
 One thread does all the work. Between two scans it runs the control channel's asyncio loop, but only until `GUARD_NS`
 before the next deadline (asyncio rounds its timers up to 1 ms). The rest of the wait is an absolute clock_nanosleep,
@@ -73,7 +73,7 @@ def utc_ns() -> int:
 
 
 def sleep_until_ns(deadline_ns: int) -> None:
-    """Return at `deadline_ns` of `monotonic_ns` or after it; earlier only when a signal arrived."""
+    """Wait until `monotonic_ns` has reached `deadline_ns`; return earlier only when a signal arrived."""
     if _libc is None:
         time.sleep(max(0, deadline_ns - time.monotonic_ns()) / NS_PER_S)
         return
@@ -188,19 +188,22 @@ VIRTUAL_STUCK_MS = 10_000.0
 
 
 def alarm_if_free(stuck_ms: float) -> StuckAlarm | None:
-    """Return an alarm, or None if it cannot be used: outside the main thread, or where SIGALRM belongs to other code."""
+    """Return an alarm, or None if it cannot be used: outside the main thread, or if other code uses SIGALRM."""
     if threading.current_thread() is not threading.main_thread() or not hasattr(signal, "setitimer"):
         return None
     return StuckAlarm(stuck_ms) if signal.getsignal(signal.SIGALRM) is signal.SIG_DFL else None
 
 
 def lead(until_due_ns: int) -> int:
-    """Return how many ns before a deadline to be awake, when it is `until_due_ns` away; 0 when it has passed."""
+    """Return how many ns before a deadline the thread has to be awake.
+
+    The deadline is `until_due_ns` away; 0 if it has passed.
+    """
     return max(0, min(LEAD_NS, until_due_ns // LEAD_SHARE))
 
 
 def run_task(task: Driven, loop: asyncio.AbstractEventLoop, stop_requested: Callable[[], bool]) -> None:
-    """Drive `task` on the wall clock, and `loop` in its slack, until `stop_requested()`; outputs are safe afterwards.
+    """Run `task` on the wall clock, and `loop` between its scans, until `stop_requested()`; outputs are safe afterwards.
 
     When a task stops by itself, the loop keeps running, so that its status can be read. To end a wait early, stop the
     loop.

@@ -87,21 +87,24 @@ class ControlLogic:
 
     @property
     def period_s(self) -> int:
-        """`period` in Z: seconds, as last commanded."""
+        """Return `period` in Z: the last commanded period in seconds."""
         return self.machine.period_s
 
     def set_period(self, command: COMMAND) -> None:
-        """SetPeriod: set the period and the state that follows from it. Raises `Desync` for an invalid command."""
+        """Set the period and the state that follows from it (SetPeriod). Raises `Desync` for an invalid command."""
         self.machine.process_event(command)
 
     def log_data(self, kind: str, data: DATA, now_ns: int) -> None:
-        """LogData. Its precondition is period > 0: a call without that is a bug of the caller."""
+        """Append an entry to the data log (LogData).
+
+        The precondition is period > 0; a call that violates it is a bug of the caller.
+        """
         if self.period_s <= 0:
             raise Bug("data logged while nothing is sampled", expected="period > 0", got=str(self.period_s))
         self.data_log.append(LogEntry(now_ns, kind, data.data))
 
     def send_cmd(self, now_ns: int) -> None:
-        """sendCmd: drain the transmitter's queue; each command is consumed, sets the period, and is emitted.
+        """Drain the transmitter's queue (sendCmd): each command is consumed, sets the period, and is emitted.
 
         A command is always relayed; only logging requires period > 0, with the period after SetPeriod (SPEC ruling 1).
         An invalid command changes nothing and is not relayed: it is counted, and logged under the same condition.
@@ -118,7 +121,7 @@ class ControlLogic:
             self._log_if_active("command", command, now_ns)
 
     def send_rsp(self, now_ns: int) -> None:
-        """sendRsp: drain the sensor's queue; each response is consumed and emitted unaltered, and logged if active."""
+        """Drain the sensor's queue (sendRsp): each response is consumed, emitted unaltered, and logged if the state is active."""
         for response in self.sensor.drain():
             self.responses += 1
             self.response.emit(response)

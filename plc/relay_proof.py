@@ -1,8 +1,8 @@
 """The proof of the observatory's relay: SPEC part 1, row ControlLogic, with rulings 1, 2, 5 and 6.
 
-It covers every command that matters (its sign decides, so -1, 0, 1 and the limits of the type; and invalid commands),
-responses that arrive or not, and mailboxes that are emptied or not. The queue and the data log are limited to three
-entries, so that all their fill levels are reached.
+It covers commands of every sign (-1, 0, 1 and the limits of the type; only the sign matters), invalid commands, scans with and
+without a response, and mailboxes that are emptied or not. The queue and the data log are limited to three entries, so that all
+their fill levels are reached.
 """
 
 from __future__ import annotations
@@ -38,13 +38,14 @@ class Watched(Relay):
 
     @property
     def unaccounted(self) -> int:
-        """How many responses were taken and neither sent, nor waiting, nor counted as dropped."""
+        """Return how many responses were taken that are neither sent, nor waiting, nor counted as dropped."""
         return self.responses - self.sent - self.waiting - self._outgoing.dropped - self._too_long
 
     @property
     def key(self) -> Hashable:
-        """The part of the state that matters: the sign, and the fill levels of queues and mailboxes. Counters grow
-        without limit and do not affect the behaviour."""
+        """Return the part of the state that matters: the sign, and the fill levels of queues and mailboxes.
+
+        Counters grow without limit and do not affect the behaviour."""
         sign = (self.period_s > 0) - (self.period_s < 0)
         waiting = tuple(response.data for response in self._outgoing.queue)
         unsent = self.logic.data_log.total - self._log_sent

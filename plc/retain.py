@@ -71,7 +71,9 @@ class RetainFile:
 
     @classmethod
     def open(cls, path: Path, layout: bytes, size: int) -> tuple[RetainFile, Any, str]:
-        """Return the file, its content (None: empty, so start cold), and why an existing file was put aside, if it was.
+        """Return the file, its content, and the reason if an existing file was put aside.
+
+        A content of None means that the file is empty and the programs start cold.
 
         `size` is the largest size of a save, in bytes. A file of a different layout, or a damaged file, is kept as
         ``.old``. Raises `Unreachable` if the file cannot be created, and `FileInvalid` if `size` is more than a file
@@ -195,7 +197,7 @@ class Retained:
     """The retained variables of all programs, and their file: restored once, saved after scans."""
 
     def __init__(self, programs: Sequence[BoundProgram], path: Path | None, *, cold: bool = False) -> None:
-        """If `path` is None, or if no program retains anything, nothing is saved. `cold`: saved values are not used.
+        """Open the file and restore the values, unless `cold`. Nothing is saved if `path` is None or no program retains anything.
 
         Raises `Unreachable` if the file cannot be created.
         """
@@ -217,7 +219,7 @@ class Retained:
         return {p.name: p.program.retained() for p in self._programs}
 
     def save(self) -> None:
-        """Save the values, after a scan and outside its time. Raises `RetainFull`."""
+        """Save the values. Called after a scan, outside of its measured time. Raises `RetainFull`."""
         if self._file is not None:
             self._file.save(self._values())
 

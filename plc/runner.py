@@ -1,4 +1,4 @@
-"""All that a PLC runs: its programs in their tasks, one after the other by priority, restarted where that helps.
+"""The runner of a PLC's tasks: it runs the tasks by priority, one after the other, and restarts programs after some failures.
 
 Tasks are cyclic (INTERVAL) or run once at each rising edge of a tag (SINGLE), as in IEC 61131-3, 6.8.2. They share one
 thread, so a task is never interrupted. Of the tasks that are due, the one with the smallest PRIORITY number runs first;
@@ -6,8 +6,7 @@ among equals, the one that has waited longest. If one task stops by itself, all 
 a stop by the watchdog, or a scan that did not end, the programs are created anew and start warm, at most `max_restarts`
 times in a row. A program runs only after its inputs have been good once (fieldtwin.plc.start), also after a restart.
 
-The runner is driven like a `CyclicTask`: by `deadline_ns` and `run_once`, on the wall clock or in virtual time, and
-does not know which.
+The runner is driven like a `CyclicTask`, by `deadline_ns` and `run_once`. It cannot distinguish the wall clock from virtual time.
 """
 
 from __future__ import annotations
@@ -68,7 +67,7 @@ class Runner:
         guard: Guard | None = None,
         on_change: Callable[[Change], None] | None = None,
     ) -> None:
-        """`on_change` is called whenever a program changes an output or a local."""
+        """Create the runner. `on_change` is called whenever a program changes an output or a local."""
         self.config = config
         self.forces = Forces()
         self.restarts = 0
@@ -184,7 +183,7 @@ class Runner:
 
     @property
     def running(self) -> bool:
-        """Whether there is a scan or a restart to wait for."""
+        """Return whether there is a scan or a restart to wait for."""
         return self._ended is None and self._began
 
     @property
@@ -233,8 +232,7 @@ class Runner:
             self._on_stopped(entry)
 
     def _look_for_delay(self, entry: Entry) -> None:
-        """Note which task was still running when `entry` became due: a late scan is not always the fault of the late
-        task."""
+        """Record which task was still running when `entry` became due, because it may have caused the late scan."""
         before = self._ran
         if before is not None and before is not entry:
             held_up = before.task.ended_ns > entry.task.deadline_ns
@@ -317,7 +315,7 @@ class Runner:
 
     @property
     def error(self) -> FieldtwinError | None:
-        """Why the PLC stopped by itself."""
+        """Return the error because of which the PLC stopped by itself, or None."""
         return self._stopped.task.error if self._stopped else None
 
     @property
@@ -349,9 +347,10 @@ class Runner:
             raise UsageError("a PLC is stepped while it is paused", hint="pause it first")
 
     def step(self, count: int) -> dict[str, int]:
-        """While paused, execute `count` scans of the fastest cyclic task, and of each other cyclic task as many as fall
-        due in that time: if a task of 10 ms is stepped, a task of 100 ms runs in every tenth step. A SINGLE task runs
-        when a step triggers it.
+        """Execute `count` scans of the fastest cyclic task while paused.
+
+        Each other cyclic task executes as many scans as fall due in that time: if a task of 10 ms is stepped, a task of 100 ms
+        runs in every tenth step. A SINGLE task runs when a step triggers it.
 
         Return the scans of each cyclic task, by its name. Raises `UsageError` unless the PLC is paused.
         """
@@ -368,7 +367,7 @@ class Runner:
 
     @property
     def stepping(self) -> int:
-        """How many scans are still to be executed while paused."""
+        """Return the number of scans that are still to be executed while paused."""
         return sum(e.task.steps for e in self.entries) if self._stopped is None and self._ended is None else 0
 
     def force(
@@ -404,8 +403,7 @@ class Runner:
         return [(b.program, v.name) for b in self.programs for v, published in b.published() if published == tag]
 
     def waits(self, tag: str) -> str:
-        """Return what the program that writes output or local `tag` waits for before it starts; empty if it has
-        started."""
+        """Return the inputs and programs that the program that writes `tag` waits for; empty if it has started."""
         owner = next((b.name for b in self.programs if tag in (t for _, t in b.published())), "")
         return next((start.reason() for start in self.starts.waiting if start.name == owner), "")
 
@@ -418,7 +416,7 @@ class Runner:
         return [change.describe(now_ns) for change in reversed(self.outputs.changes.get(tag, ()))]
 
     def origin(self, tag: str, value: Scalar | None) -> tuple[str, str]:
-        """Return `OutputImage.origin`; a path inside the system's folder is relative to it."""
+        """Return `OutputImage.origin`, with paths inside the system's folder relative to that folder."""
         program, place = self.outputs.origin(tag, value)
         for folder in self.config.python_path:
             place = place.removeprefix(folder.rstrip("/") + "/")
@@ -426,11 +424,11 @@ class Runner:
 
     @property
     def halted(self) -> bool:
-        """Whether it has stopped, for good or until a restart: then it reads no inputs."""
+        """Return whether the PLC has stopped, for good or until a restart. It then reads no inputs."""
         return self._stopped is not None or self._ended is not None
 
     def _as_read(self, value: TagValue) -> TagValue:
-        """Return an input as the PLC knows it now: while no task reads inputs, their quality is bad."""
+        """Return an input as the PLC knows it now. While no task reads inputs, its quality is bad."""
         if not self.halted:
             return value
         return TagValue(value.value, Quality.BAD, Reason.NOT_OPERATIONAL, value.t_ns)
@@ -460,7 +458,7 @@ class Runner:
         return total
 
     def status(self) -> PlcStatus:
-        """Return the state: the first task's figures for the whole PLC, and each task's own figures."""
+        """Return the status: the figures of the first task for the whole PLC, and the figures of each task."""
         now_ns = self._now_ns()
         shown = self._stopped or self.entries[0]
         described = shown.task.describe()

@@ -43,7 +43,7 @@ MAX_SHOWN, MAX_SHOWN_BYTES = 4, 24
 
 
 class _Input:
-    """One bound input: its place in the image and in the program, and what the program sees while it is BAD."""
+    """One bound input: its place in the image and in the program, and its policy while it is BAD."""
 
     def __init__(
         self, owner: str, program: Program, variable: Variable, spec: TagSpec, index: int, binding: InputBinding
@@ -63,7 +63,7 @@ class _Input:
         self.held: tuple[Scalar | None, int] | None = None
 
     def apply(self, seen: TagValue) -> TagValue:
-        """Return what the program sees in place of `seen`."""
+        """Return the value that the program sees instead of `seen`, by the policy of the input."""
         if seen.quality is not Quality.BAD:
             return seen
         if self.substitute is not None:
@@ -79,10 +79,9 @@ class Scan:
     """The programs of one task over an attached image.
 
     `outputs` is the output image of all tasks; without it, the scan has its own. With `outputs_first`, a scan begins by
-    publishing what the previous scan computed, so that outputs change at the start of the cycle, however long the logic
-    runs. `starts` tells by name which programs may run; without it all may. After a restart of the process, messages
-    continue after the last one that OUTPUTS reports as consumed. Raises `FileInvalid` when a binding's tag is not in
-    the image.
+    publishing what the previous scan computed, so that outputs change at the start of the cycle, however long the logic runs.
+    `starts` determines by name which programs may run; without it all may run. After a restart of the process, messages continue
+    after the last message that OUTPUTS reports as consumed. Raises `FileInvalid` when a binding's tag is not in the image.
     """
 
     def __init__(
@@ -157,8 +156,10 @@ class Scan:
     # -- the cycle ----------------------------------------------------------------------------------------------
 
     def execute(self, now_ns: int) -> None:
-        """Execute one scan at `now_ns` (monotonic, the same clock as the gateway's). Raises `ProgramFailed`, publishing
-        nothing."""
+        """Execute one scan at `now_ns` (monotonic, the same clock as the gateway's).
+
+        If it raises `ProgramFailed`, nothing is published.
+        """
         self.number += 1
         if self._outputs_first:
             self.output_image.publish(now_ns)
@@ -175,7 +176,7 @@ class Scan:
             self.output_image.publish(now_ns)
 
     def _execute_started(self, now_ns: int) -> None:
-        """Execute a scan of the programs that have started, while others have not, or for the first time."""
+        """Execute a scan while some programs have not started, or just have started. Only started programs run."""
         waiting = self._read_for_started(now_ns)
         self.output_image.force()
         first = {bound.name: start for bound, start in self._not_run if start.started}
@@ -189,8 +190,9 @@ class Scan:
         self._not_run = [(bound, start) for bound, start in self._not_run if not start.ran]
 
     def _read_for_started(self, now_ns: int) -> frozenset[str]:
-        """Read the inputs while programs wait, and return the names of those programs. Messages are not consumed while
-        a program that takes messages waits."""
+        """Read the inputs, and return the names of the programs that still wait for their start.
+
+        Messages are not consumed while a program that takes messages waits."""
         waiting = self._waiting = frozenset(bound.name for bound, start in self._not_run if not start.started)
         held_back = any(item.owner in waiting for item in self._messages)
         self._read(now_ns, self._onlooker if held_back else self._reader)
@@ -201,7 +203,7 @@ class Scan:
 
     @property
     def waiting(self) -> bool:
-        """Whether none of the programs has started."""
+        """Return whether none of the programs has started."""
         return len(self._not_run) == len(self._programs) > 0 and not any(start.started for _, start in self._not_run)
 
     def hold(self, now_ns: int) -> None:
@@ -285,7 +287,7 @@ class Scan:
         return self._seen_at(item.index)
 
     def value(self, tag: str) -> Scalar | None:
-        """Return a tag of either region, as this scan last knew it; None while an input is bad."""
+        """Return the value of a tag of either region as this scan last knew it; None for an input that is bad."""
         index = self._reader.shape.index.get(tag)
         if index is not None:
             force = self.output_image.forces.inputs.get(tag)
@@ -299,8 +301,9 @@ class Scan:
         return {name: self._seen_at(i) for name, i in self._reader.shape.index.items()}
 
     def seen_otherwise(self, tag: str) -> dict[str, TagValue]:
-        """Return the variables (``program.variable``) whose value differs from that of input `tag`, because it is bad
-        and their policy replaces it."""
+        """Return the variables (``program.variable``) whose value differs from that of input `tag`.
+
+        They differ because the input is bad and the policy of the variable replaces its value."""
         found: dict[str, TagValue] = {}
         for item in self._by_tag.get(tag, ()):
             there = self._looked_up(item)
@@ -315,7 +318,10 @@ class Scan:
         return self._seen_at(self._reader.shape.index[tag])
 
     def outputs(self) -> dict[str, Scalar | None]:
-        """Return every tag of OUTPUTS as published by the last successful scan; of a message tag, the last sequence."""
+        """Return every tag of OUTPUTS as published by the last successful scan.
+
+        The value of a message tag is its last sequence.
+        """
         return self.output_image.last()
 
     def counters(self) -> dict[str, int]:
@@ -345,8 +351,7 @@ def _as_text(messages: tuple[Message, ...]) -> str | None:
 
 
 def failed(bound: BoundProgram, error: BaseException) -> ProgramFailed:
-    """Return the error with program and line: the innermost line in the program's own file, otherwise the innermost
-    line."""
+    """Return the error with program and line: the innermost line in the program's file, or else the innermost line at all."""
     made = type(bound.program)
     own = made.source_path or getattr(sys.modules.get(made.__module__), "__file__", None)
     path, line, inside = "", 0, False

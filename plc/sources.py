@@ -50,7 +50,7 @@ def sources(programs: Sequence[BoundProgram], before: Sequence[Source] = ()) -> 
 
 
 def _beside(path: str) -> list[str]:
-    """Return the files of the imported modules in the folder of the module `path`, or in a folder in it, except libraries'."""
+    """Return the files of the imported modules in the folder of the module `path` or below it, without those of libraries."""
     folder, libraries = Path(path).resolve().parent, tuple(Path(p).resolve() for p in {*get_paths().values()})
     files = {getattr(module, "__file__", None) for module in list(sys.modules.values())} - {None, path}
     return sorted(

@@ -1,9 +1,9 @@
 """When a program may run for the first time: after each of its inputs has been good once.
 
-A program that runs earlier computes with values that were never read, and the gateway would write the result to the
-plant. Until a program starts, its logic is not executed, its timers do not run, and its outputs have no value. The wait
-has a limit; the program's policy decides what happens then. Once started, a program stays started: what it sees of a
-bad input is defined by the input's `if_bad`.
+A program that runs earlier computes with values that were never read, and the gateway would write the result to the plant. Until
+a program starts, its logic is not executed, its timers do not run, and its outputs have no value. The wait has a limit, after
+which the program's policy applies. A program that has started stays started: afterwards the input's `if_bad` defines what the
+program sees of a bad input.
 
 Inputs that carry messages are events and have no quality, so no program waits for them. An input that is another
 program's variable counts as good once that program has executed a scan. If two programs read each other, both wait for
@@ -46,11 +46,11 @@ class InputsMissing(FieldtwinError):
 
 @dataclass(frozen=True, slots=True)
 class StartPolicy:
-    """The longest wait of a program for its inputs (`timeout_ms`, from 0 ms), and the action after it.
+    """The longest wait of a program for its inputs (`timeout_ms`, at least 0), and the action after it.
 
-    ``wait``: it continues to wait, and the status shows that it is overdue. ``stop``: the PLC stops, with its outputs
-    safe. ``start_anyway``: it starts with the inputs that it has. Whatever the policy, the program then no longer waits
-    for an input whose `if_bad` is a number, because the number replaces it.
+    ``wait``: the program continues to wait, and the status shows that it is overdue. ``stop``: the PLC stops, with its outputs
+    safe. ``start_anyway``: the program starts with the inputs that it has. With each of these policies, the program then no
+    longer waits for an input whose `if_bad` is a number, because the number replaces it.
     """
 
     timeout_ms: float = TIMEOUT_MS
@@ -58,10 +58,10 @@ class StartPolicy:
 
 
 class ProgramStart:
-    """The start of one program. `started`: it may run; `ran`: it has executed a scan.
+    """The start of one program. `started` says that it may run, `ran` that it has executed a scan.
 
-    `missing` maps each input tag that has not been good yet to the reason. `without` is what was missing when it
-    started.
+    `missing` maps each input tag that has not been good yet to the reason. `without` holds the inputs that were missing when the
+    program started.
     """
 
     __slots__ = (
@@ -70,7 +70,10 @@ class ProgramStart:
     )  # fmt: skip
 
     def __init__(self, name: str, policy: StartPolicy, inputs: Mapping[str, bool]) -> None:
-        """`inputs` maps each input tag of the plant to whether a number replaces it while it is bad."""
+        """Create the start of a program.
+
+        `inputs` maps each input tag of the plant to whether a number replaces it while it is bad.
+        """
         self.name = name
         self.policy = policy
         self.missing: dict[str, Reason] = dict.fromkeys(inputs, Reason.NEVER_READ)
@@ -85,12 +88,12 @@ class ProgramStart:
 
     @property
     def needed(self) -> list[str]:
-        """The inputs of the plant that the program waits for now."""
+        """Return the inputs of the plant that the program waits for now."""
         return [tag for tag in self.missing if not (self.overdue and tag in self._numbered)]
 
     @property
     def waits_for(self) -> list[ProgramStart]:
-        """The programs that this one waits for now."""
+        """Return the programs that this program waits for now."""
         blocked = [p for p in self.all_producers if not p.started and p.needed]
         return blocked + [p for p in self.producers if not p.ran and p not in blocked]
 
@@ -139,8 +142,9 @@ class Starts:
         heartbeat_limit_ms: float,
         single: Sequence[str] = (),
     ) -> None:
-        """`single` names the programs of SINGLE tasks. Inputs count while the gateway's last publication is at most
-        `heartbeat_limit_ms` milliseconds old."""
+        """Create the starts. `single` names the programs of SINGLE tasks.
+
+        Inputs are used only while the gateway's last publication is at most `heartbeat_limit_ms` old."""
         self._reader = image.reader(INPUTS)
         self._forces = forces
         self._limit_ns = int(heartbeat_limit_ms * NS_PER_MS)
@@ -193,16 +197,16 @@ class Starts:
 
     @property
     def missing_something(self) -> list[ProgramStart]:
-        """The programs that wait, without those that start with the next scan."""
+        """Return the programs that wait, without those that start with the next scan."""
         return [start for start in self.waiting if start.needed or start.waits_for]
 
     @property
     def error(self) -> InputsMissing | None:
-        """The error of the first program that is overdue; None if no program is."""
+        """Return the error of the first program that is overdue; None if no program is overdue."""
         return next((start.error() for start in self.waiting if start.overdue), None)
 
     def waiting_statuses(self, now_ns: int) -> dict[str, WaitingStatus]:
-        """Return the programs that wait."""
+        """Return the statuses of the programs that wait."""
         return {start.name: start.status(now_ns) for start in self.missing_something}
 
     def started_without(self) -> dict[str, dict[str, str]]:
@@ -218,8 +222,7 @@ class Starts:
 
 
 def _plant_inputs(bound: BoundProgram, index: Mapping[str, int]) -> dict[str, bool]:
-    """Return the tags of the plant that inputs of `bound` are bound to, with whether a number replaces each while it is
-    bad."""
+    """Return the plant's tags to which inputs of `bound` are bound, each with whether a number replaces it while it is bad."""
     found: dict[str, bool] = {}
     for variable in bound.variables(Role.INPUT):
         binding = bound.inputs.get(variable.name)

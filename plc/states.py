@@ -1,4 +1,4 @@
-"""State machines as tables: which state can follow which, when, and which action runs then. The table is the program.
+"""State machines as tables of transitions, each with source and target state, guard, delay and action. The table is the program.
 
     class Pump(StateMachine):
         start: bool = var_input(TagKind.BOOL)
@@ -34,8 +34,9 @@ ANY = "*"
 
 @dataclass(frozen=True, slots=True)
 class Transition:
-    """A transition from `source` to `target`, taken `when` the guard holds (always, if empty) and `after_ms` in the
-    source have passed."""
+    """A transition from `source` to `target`.
+
+    It is taken when the guard `when` holds (an empty guard always holds) and the machine has been in `source` for `after_ms`."""
 
     source: str
     target: str
@@ -45,7 +46,7 @@ class Transition:
 
     @property
     def label(self) -> str:
-        """The text that a diagram writes on the arrow."""
+        """Return the text that a diagram shows at the arrow."""
         parts = [self.when, f"after {self.after_ms:g} ms" if self.after_ms else "", f"/ {self.do}" if self.do else ""]
         return ", ".join(p for p in parts[:2] if p) + (f" {parts[2]}" if parts[2] else "")
 
@@ -96,13 +97,14 @@ class StateTable:
 
     @property
     def longest_ms(self) -> float:
-        """The longest time that any transition waits for: beyond it, time in a state makes no difference."""
+        """Return the longest `after_ms` of all transitions. A longer time in a state makes no difference."""
         return max((t.after_ms for t in self.transitions), default=0.0)
 
 
 class StateMachine(Program):
-    """Base of programs that are a `StateTable`. `state` is the state's code; ``during_<STATE>`` is called in each scan
-    in that state.
+    """The base class of programs that are a `StateTable`. `state` is the code of the present state.
+
+    ``during_<STATE>`` is called in each scan in that state.
 
     Guards can use the program's variables by name, and ``in_state_ms``.
     """

@@ -53,7 +53,7 @@ class WaitingStatus(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class StopsStatus(msgspec.Struct, frozen=True, kw_only=True):
-    """The failures after which the PLC began again: their number, and the error of the last one."""
+    """The failures after which the PLC restarted its programs: their number, and the error of the last failure."""
 
     count: int = 0
     last: str = ""
@@ -74,7 +74,10 @@ class RealtimeStatus(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class PlcStatus(ScanStatus, frozen=True, kw_only=True):
-    """A whole PLC. The fields of `ScanStatus` are those of the task that stopped it, otherwise of the first task."""
+    """The status of a whole PLC.
+
+    The fields of `ScanStatus` are those of the task that stopped it, otherwise of the first task.
+    """
 
     waiting: dict[str, WaitingStatus] = {}
     started_without: dict[str, dict[str, str]] = {}

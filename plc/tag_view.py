@@ -1,5 +1,6 @@
-"""The process image as users see it: each tag with value, quality, source time, age, unit, limits, force, and what
-programs see.
+"""The process image as users see it.
+
+Each tag has value, quality, source time, age, unit, limits, force, and the value that programs see.
 
 It is read between scans, from the image itself, so that it shows what the gateway gets. This module must not know how
 requests arrive, and must not change anything.
@@ -24,12 +25,12 @@ including the encoding."""
 
 
 def matches(tag: str, pattern: str) -> bool:
-    """Match ``ctd.pressure``, ``ctd.*``, ``*.state``, or ``ctd`` for all tags of that device or program."""
+    """Return whether a tag matches a pattern: ``ctd.pressure``, ``ctd.*``, ``*.state``, or ``ctd`` for all tags of ``ctd``."""
     return fnmatchcase(tag, pattern) or tag.startswith(f"{pattern}.")
 
 
 class TagView:
-    """Describes tags of an image that `runner` works on."""
+    """The view of the tags in the image that `runner` uses."""
 
     def __init__(self, image: Image, runner: Runner) -> None:
         self._runner = runner
@@ -41,8 +42,7 @@ class TagView:
         return list(self._specs[INPUTS] | self._specs[OUTPUTS])
 
     def describe(self, names: Sequence[str], now_ns: int, utc_ns: int) -> list[dict[str, Any]]:
-        """Return the tags as data for JSON, in the order of `names`; a tag of both regions gives two entries, the input
-        first.
+        """Return the tags as data for JSON, in the order of `names`. A tag of both regions has two entries, the input first.
 
         Raises `UsageError` for more than `MAX_AT_ONCE` tags, or for an unknown one. `now_ns` is monotonic, the tags'
         clock, and `utc_ns` the same instant.

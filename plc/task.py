@@ -1,4 +1,4 @@
-"""The cyclic task: a scan on absolute deadlines, its lateness, its watchdog.
+"""The cyclic task: it runs a scan at absolute deadlines, and measures its lateness. A watchdog stops it.
 
 Deadlines are start + k x cycle and never move. A task that is late runs once and continues with the next deadline in
 the future: missed periods are skipped and counted, and not made up for in a burst.
@@ -103,10 +103,10 @@ class TaskConfig:
 
 
 class CyclicTask:
-    """One scan on one cycle. `now_ns` is the clock's monotonic time, read around each scan.
+    """A task that runs one scan cyclically. `now_ns` returns the clock's monotonic time.
 
-    `lateness` and `duration` are histograms of start after deadline and of execution time. Counters: `scans`,
-    `missed_periods`, `overruns`.
+    `lateness` is a histogram of the delays of a scan's start after its deadline, `duration` one of execution times. The counters
+    are `scans`, `missed_periods` and `overruns`.
     """
 
     def __init__(
@@ -141,14 +141,14 @@ class CyclicTask:
         return self.state is _RUNNING
 
     def start(self) -> None:
-        """Go from READY to RUNNING: the first scan is due one cycle from now."""
+        """Change the state from READY to RUNNING. The first scan is due one cycle from now."""
         if self.state is not TaskState.READY:
             raise Bug("a task is started once", got=self.state.value)
         self.state = TaskState.RUNNING
         self.deadline_ns = self._now_ns() + self._cycle_ns
 
     def run_once(self) -> None:
-        """Run the scan that is due. Afterwards `deadline_ns` is the next one to wait for, or the task is STOPPED."""
+        """Run the scan that is due. Afterwards `deadline_ns` is the next deadline, or the task is STOPPED."""
         if self.state is not _RUNNING:
             raise Bug("a scan of a task that does not run", got=self.state.value)
         began_ns = self._now_ns()
@@ -201,7 +201,7 @@ class CyclicTask:
             self._stop(StopReason.REQUESTED)
 
     def fail(self, error: FieldtwinError, reason: StopReason) -> None:
-        """Stop because of `error`, which did not happen in a scan."""
+        """Stop because of `error`, which occurred outside of a scan."""
         self.error = error
         self._stop(reason)
 
@@ -246,8 +246,7 @@ class CyclicTask:
 
 
 async def run_on_clock(task: Driven, clock: Clock) -> None:
-    """Drive `task` in the running loop until it is stopped, as a virtual clock does. Cancelling it makes outputs
-    safe."""
+    """Run `task` in the running loop, on its clock, until it is stopped. Cancelling makes its outputs safe."""
     task.start()
     try:
         while task.running:

@@ -1,4 +1,4 @@
-"""Function blocks for programs: those of the standard (IEC 61131-3, 6.6.3.5) and those that every plant needs."""
+"""Function blocks for programs: the standard's blocks (IEC 61131-3, 6.6.3.5) and blocks that every plant needs."""
 
 from fieldtwin.plc.blocks.alarm import ALARM
 from fieldtwin.plc.blocks.block import MS, SECOND, FunctionBlock

@@ -16,7 +16,7 @@ from fieldtwin.plc.blocks.block import FunctionBlock
 
 
 class _Limit:
-    """One limit's state: `sign` +1 for a high limit, -1 for a low one."""
+    """The state of one limit. `sign` is +1 for a high limit and -1 for a low limit."""
 
     __slots__ = ("_since_ns", "active", "sign", "unacknowledged", "violated")
 
@@ -42,8 +42,11 @@ class _Limit:
 
 
 class ALARM(FunctionBlock):
-    """See the module. QLL, QL, QH, QHH: the condition is raised. UNACK: a condition was not acknowledged. Q: alarm,
-    WARN: warning."""
+    """The block that the module describes.
+
+    QLL, QL, QH and QHH are true while the condition of that limit is raised. UNACK: a condition is not acknowledged. Q: an alarm
+    is raised; WARN: a warning is raised.
+    """
 
     __slots__ = (
         "ACK", "DELAY", "H", "HH", "HYS", "L", "LL", "Q", "QH", "QHH", "QL", "QLL", "UNACK", "WARN", "X",

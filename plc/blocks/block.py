@@ -22,7 +22,7 @@ SECOND = NS_PER_S
 
 
 class FunctionBlock(ABC):
-    """Base of all blocks. `inputs` and `outputs` name them with their IEC type, in the standard's order."""
+    """The base class of all blocks. `inputs` and `outputs` list names and IEC types in the standard's order."""
 
     __slots__ = ()
     inputs: ClassVar[dict[str, str]]
@@ -33,8 +33,9 @@ class FunctionBlock(ABC):
         """Execute one call at `now_ns`: set the outputs from the inputs and the state."""
 
     def state(self, now_ns: int) -> tuple[Any, ...]:
-        """Return all that the next calls depend on, hashable; times are relative to `now_ns`, because only differences
-        matter."""
+        """Return the state on which the next calls depend, as a hashable value.
+
+        Times are relative to `now_ns`, because only differences matter."""
         return tuple([_state(name, getattr(self, name), now_ns) for name in _slots(type(self))])
 
 

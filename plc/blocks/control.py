@@ -1,6 +1,6 @@
 """Closed-loop blocks: HYSTERESIS, RAMP, PID.
 
-HYSTERESIS follows the one in IEC 61131-3's annex of examples. RAMP and PID are fieldtwin's own: they use rates and times
+HYSTERESIS follows the example in the annex of IEC 61131-3. RAMP and PID are fieldtwin's own: they use rates and times
 instead of the scan's length, have limits with anti-windup, and hold the output while an input is not a number.
 """
 
@@ -12,7 +12,7 @@ from fieldtwin.plc.blocks.block import SECOND, FunctionBlock
 
 
 class HYSTERESIS(FunctionBlock):
-    """Q becomes true when XIN1 exceeds XIN2 by more than EPS, and false when it is below by more than EPS."""
+    """Q becomes true when XIN1 exceeds XIN2 by more than EPS, and false when XIN1 is below XIN2 by more than EPS."""
 
     __slots__ = ("EPS", "Q", "XIN1", "XIN2")
     inputs = {"XIN1": "LREAL", "XIN2": "LREAL", "EPS": "LREAL"}
@@ -37,7 +37,7 @@ class HYSTERESIS(FunctionBlock):
 class RAMP(FunctionBlock):
     """XOUT moves towards X by at most UP units per second upwards and DOWN downwards; BUSY until it has reached X.
 
-    While RUN is false, XOUT is X at once. The first call starts from X0.
+    While RUN is false, XOUT follows X at once. The first call starts from X0.
     """
 
     __slots__ = ("BUSY", "DOWN", "RUN", "UP", "X", "X0", "XOUT", "_before_ns")
@@ -114,8 +114,7 @@ class PID(FunctionBlock):
             self._i += step
 
     def _derivative(self, dt_ns: int) -> float:
-        """Return -KP TD dPV/dt through the lag. The state of the lag is also updated while there is no derivative
-        part."""
+        """Return -KP TD dPV/dt, filtered by the first-order lag. The state of the lag is also updated while TD is 0."""
         if self._lag is None or self.TD <= 0:
             self._lag = self.PV
             return 0.0

@@ -1,5 +1,4 @@
-"""Counters: CTU, CTD, CTUD (IEC 61131-3, 6.6.3.5.4), on INT; the same with a suffix for the other types of the
-standard.
+"""Counters of type INT: CTU, CTD, CTUD (IEC 61131-3, 6.6.3.5.4). Names with a suffix are for the standard's other types.
 
 CU and CD count rising edges. A counter stops at the limits of its type; it never wraps.
 """

@@ -1,9 +1,9 @@
 """Timers: TON, TOF, TP (IEC 61131-3, 6.6.3.5.5 with its timing diagrams).
 
-Time is the scan's, so an edge counts from the scan that saw it, and an output changes in the first scan at or after its
-time. ET never exceeds PT. Where the standard does not define the behaviour: a PT that changes while the timer runs
-counts from the same start; a PT that changes after the timer expired has no effect until the next start; a negative PT
-is 0; a rise of TP's IN in the same scan that ends the pulse does not start a new one.
+Blocks use the scan's time. So a period begins with the scan that saw the edge, and an output changes in the first scan at or
+after its time. ET never exceeds PT. Where the standard does not define the behaviour: a PT that changes while the timer runs
+counts from the same start; a PT that changes after the timer expired has no effect until the next start; a negative PT is 0; a
+rise of TP's IN in the same scan that ends the pulse does not start a new one.
 """
 
 from __future__ import annotations
@@ -22,19 +22,20 @@ class _Timer(FunctionBlock):
     _since_ns: int | None
 
     def _runs(self) -> bool:
-        """Return whether the time at which the timer started still matters."""
+        """Return whether later outputs still depend on the time at which the timer started."""
         raise NotImplementedError
 
     def state(self, now_ns: int) -> tuple[Any, ...]:
-        """Return the state as for every block, without the start time of an expired timer: two expired timers behave
-        the same."""
+        """Return the state as every block does, without the start time of an expired timer, because all expired timers behave the
+        same.
+        """
         since_ns = self._since_ns if self._runs() else None
         phase_ns = None if since_ns is None else now_ns - since_ns
         return self.IN, self.Q, self.PT, self.ET, phase_ns
 
 
 class TON(_Timer):
-    """On-delay: Q follows IN's rise PT later, and its fall at once. ET: how long IN has been true, at most PT."""
+    """On-delay: Q becomes true PT after IN, and false together with IN. ET is the time for which IN has been true, at most PT."""
 
     __slots__ = ("ET", "IN", "PT", "Q", "_since_ns")
     inputs = {"IN": "BOOL", "PT": "TIME"}
@@ -65,7 +66,10 @@ class TON(_Timer):
 
 
 class TOF(_Timer):
-    """Off-delay: Q follows IN's rise at once, and its fall PT later. ET: how long IN has been false, at most PT."""
+    """Off-delay: Q becomes true together with IN, and false PT after IN.
+
+    ET is the time for which IN has been false, at most PT.
+    """
 
     __slots__ = ("ET", "IN", "PT", "Q", "_since_ns")
     inputs = {"IN": "BOOL", "PT": "TIME"}
@@ -96,7 +100,7 @@ class TOF(_Timer):
 
 
 class TP(_Timer):
-    """Pulse: a rise of IN makes Q true for PT, whatever IN does meanwhile. ET stays at PT until IN is false."""
+    """Pulse: a rise of IN makes Q true for PT, even if IN changes meanwhile. Afterwards ET stays at PT until IN is false."""
 
     __slots__ = ("ET", "IN", "PT", "Q", "_before", "_since_ns")
     inputs = {"IN": "BOOL", "PT": "TIME"}

@@ -21,8 +21,8 @@ MAX_REPEATED = 1000
 class Formals:
     """The parameter names of a standard function.
 
-    `names` come first, and the last `optional` of them may be left out. An extensible function continues with `repeats`
-    and a number from `first` on (IN1, IN2, ...): at least `least` of them.
+    `names` come first, and the last `optional` of them may be left out. An extensible function then has at least `least`
+    parameters named `repeats` and a number from `first` on (IN1, IN2, ...).
     """
 
     names: tuple[str, ...] = ()

@@ -1,7 +1,7 @@
 """Records which line of a PROGRAM last assigned an output: a pass over the Python that Structured Text was compiled to.
 
-After each assignment of an output (a statement, an output of a block or function, a VAR_IN_OUT) it inserts an
-assignment of the line's number. That costs one constant per assignment, and nothing if no output is assigned.
+After each assignment of an output (a statement, an output of a block or function, a VAR_IN_OUT) it inserts an assignment of the
+line's number. The cost at run time is one assignment of a constant.
 """
 
 from __future__ import annotations
@@ -17,8 +17,7 @@ def line_of(attribute: str) -> str:
 
 
 def is_line(attribute: str) -> bool:
-    """Return whether an attribute keeps a line. Lines are not part of a program's state: the next scan does not depend
-    on them."""
+    """Return whether an attribute keeps a line. Lines are not part of a program's state, because no scan depends on them."""
     return attribute.startswith(_PREFIX)
 
 

@@ -29,8 +29,9 @@ _API = frozenset(name for name in vars(Program) if not name.startswith("__")) | 
 
 @dataclass(frozen=True, slots=True)
 class ProgramVariable:
-    """A variable of a PROGRAM as tags see it. `role`: input, output or local; `kind` its type; `retain`: kept over
-    restarts."""
+    """A variable of a PROGRAM that can be bound to a tag.
+
+    `role` is input, output or local, and `kind` the type of the tag. A `retain` variable keeps its value over restarts."""
 
     name: str
     role: str
@@ -153,7 +154,7 @@ class _Unit:
             self.declarations.bounded(first, (symbol.type for symbol in self.env.globals.values()))
 
     def _write_globals(self) -> None:
-        """Write the global variables after all code that they may need, and before any program is created."""
+        """Write the code of the global variables, after all code that they may need and before any program is created."""
         self.out.line("class _Globals: pass")
         self.out.line("_G = _Globals()")
         for block in self.unit.globals:

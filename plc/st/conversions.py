@@ -1,9 +1,8 @@
 """Type conversions by name: INT_TO_REAL, TO_DINT, TRUNC, REAL_TRUNC_INT... (IEC 61131-3, 6.6.2.5.2).
 
-A conversion from real to integer rounds to the nearest, ties to even; TRUNC truncates, and gives a DINT
-(REAL_TRUNC_LINT and similar functions give other types). A number that the target cannot hold is an error at run time.
-But from one integer or bit string type to another only the bits that fit are kept, as the standard requires. As a
-number, TIME counts ms, and LTIME ns.
+A conversion from real to integer rounds to the nearest, ties to even; TRUNC truncates, and gives a DINT (REAL_TRUNC_LINT and
+similar functions give other types). A number that the target cannot hold is an error at run time. A conversion between integer or
+bit string types, however, keeps only the bits that fit, as the standard requires. As a number, TIME counts ms, and LTIME ns.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ _DIGITS = {32: 7, 64: 15}
 
 
 def conversion(name: str) -> Write | None:
-    """Return the conversion of that name (in capitals), or None."""
+    """Return the conversion function with this name (in capitals), or None."""
     if name == "TRUNC":
         return lambda x, call, given: _convert(x, call, given[0], None, ty.DINT, cut=True)
     if "BCD_" in name and (found := _BCD.get(name)) is not None:

@@ -19,7 +19,7 @@ _STANDARD = ty.standard_blocks(BLOCKS)
 
 
 class Declarations:
-    """The types of a unit, each resolved when it is first needed, in whatever order they are declared."""
+    """The types of a unit. Each is resolved when it is first needed, so they may be declared in any order."""
 
     def __init__(self, env: Environment, unit: t.Unit, out: Writer) -> None:
         self.env = env
@@ -59,7 +59,7 @@ class Declarations:
         self.scope = before
 
     def constant(self, v: t.VarDecl, code: str) -> Symbol | None:
-        """Return a CONSTANT with its value; None if its value is not elementary, or too long to be repeated."""
+        """Return a CONSTANT with its value; None if the value is not elementary, or too long to be written at each use."""
         if v.initial is None or isinstance(v.initial, t.InitArray | t.InitStruct):
             return None
         kind = self.type_of(v.type)
@@ -76,7 +76,7 @@ class Declarations:
         return compiler
 
     def shared(self, code: str) -> str:
-        """Return `code`, or, if it is long, a call of a function that contains it, so that it is written only once."""
+        """Return `code`, or, if it is long, the call of a function that contains it, so that the code is written only once."""
         if len(code) <= MAX_REPEATED:
             return code
         name = f"_new{len(self.out.lines)}"
@@ -87,7 +87,7 @@ class Declarations:
     # -- types ----------------------------------------------------------------------------------------------------------
 
     def type_of(self, spec: t.TypeSpec, role: str = "") -> ty.Type:
-        """Return the type of a type specification; `role` is VAR_INPUT and so on where MESSAGES is allowed."""
+        """Return the type of a type specification. `role` is VAR_INPUT or VAR_OUTPUT if MESSAGES is allowed here."""
         if isinstance(spec, t.NamedType):
             return self.named(spec.name, spec.pos)
         if isinstance(spec, t.ArrayType):
@@ -117,8 +117,7 @@ class Declarations:
         return made
 
     def bounded(self, pos: t.Pos, kinds: Iterable[ty.Type]) -> tuple[int, int]:
-        """Return the size of variables of these types, and how deep they are nested. Raises `FileInvalid` beyond the
-        limits."""
+        """Return the size and the nesting depth of variables of these types. Raises `FileInvalid` beyond the limits."""
         found = list(kinds)
         total, nested = sum(map(ty.elements, found)), max(map(ty.nested, found), default=0)
         if total > ty.MAX_ELEMENTS:

@@ -93,8 +93,9 @@ class Expressions:
         return int(value.constant)
 
     def settled(self, value: Value, pos: t.Pos) -> Value:
-        """Return `value` with its computed constant, where only constants are allowed: for instance ``N - 1`` of a
-        typed constant N."""
+        """Return `value` with its computed constant, for places where only constants are allowed, such as ``N - 1`` of a constant
+        N.
+        """
         of_a_scan = "_c." in value.code or bool(self.out.lines)
         if value.constant is not None or of_a_scan or not isinstance(ty.plain(value.type), ty.Elementary):
             return value
@@ -108,8 +109,11 @@ class Expressions:
     # -- expressions ------------------------------------------------------------------------------------------------------
 
     def value(self, expr: t.Expr, wanted: ty.Type | None = None) -> Value:
-        """Compile `expr`. `wanted` is the type that its context demands: an untyped literal in a shift, NOT or choice takes
-        that type (IEC 61131-3, 6.3.2). The caller still has to coerce the value."""
+        """Compile `expr`. `wanted` is the type that its context demands.
+
+        An untyped literal in a shift, NOT or choice takes that type (IEC 61131-3, 6.3.2). The caller still has to coerce the
+        value.
+        """
         if isinstance(expr, t.Literal):
             return self._literal(expr)
         if self._deep >= MAX_DEEP:
@@ -153,7 +157,7 @@ class Expressions:
         return kind
 
     def _flat(self, value: Value, pos: t.Pos) -> Value:
-        """Return `value`; if Python cannot parse that many nested brackets, compute it on a line before."""
+        """Return `value`. If it has more nested brackets than Python can parse, write it on a preceding line."""
         if value.code.count("(") + value.code.count("[") <= MAX_OPEN or _open(value.code) <= MAX_OPEN:
             return value
         name = self.out.temporary()
@@ -161,7 +165,7 @@ class Expressions:
         return Value(name, value.type, value.constant)
 
     def known(self, expr: t.Expr, result: float) -> Value:
-        """Return a constant without a type that was computed by the compiler."""
+        """Return the value for an untyped constant that the compiler computed."""
         if isinstance(result, int) and not -(2**63) <= result < 2**64:
             self.env.fail(expr.pos, "a whole number that no type holds")
         if isinstance(result, float) and not isfinite(result):
@@ -256,7 +260,10 @@ class Expressions:
     def _only_if_needed(
         self, expr: t.Binary, left: Value, right: Value, prepared: list[tuple[str, int]]
     ) -> tuple[Value, Value]:
-        """Return both sides if the right one needs its own lines: they run only if the left one does not decide."""
+        """Return both sides of AND or OR.
+
+        Lines that the right side needs run only if the left side does not decide the result.
+        """
         name = self.out.temporary()
         self.out.line(f"{name} = {left.code}", expr.pos)
         decided = "not " if expr.op == "OR_ELSE" else ""
@@ -522,7 +529,7 @@ class Expressions:
 
 
 def _open(code: str) -> int:
-    """Return the greatest nesting depth of brackets. Those in strings count too, which does no harm."""
+    """Return the greatest nesting depth of brackets. Brackets in strings also count, which does no harm."""
     open_, most = 0, 0
     for char in code:
         if char in "([":

@@ -1,4 +1,4 @@
-"""Structured Text to a tree, with lark (LALR). An error has line, column, and the tokens that were expected."""
+"""Parse Structured Text to a tree, with lark (LALR). An error has line, column, and the tokens that were expected."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""PLCopen XML (TC6, version 2.01, as CODESYS, OpenPLC and Beremiz export it) to Structured Text, line for line.
+"""Convert PLCopen XML (TC6, version 2.01, as CODESYS, OpenPLC and Beremiz export it) to Structured Text, line for line.
 
 Each line of the resulting text holds the content of the same line of the XML, so that every later error names a line of
 the user's file. Bodies in languages other than ST are refused with their language; drawings, task configurations and

@@ -31,13 +31,13 @@ _ROLES = {"input": Role.INPUT, "output": Role.OUTPUT, "local": Role.LOCAL}
 
 
 class StProgram(Program):
-    """Base of the classes that `program_class` makes."""
+    """The base class of the classes that `program_class` creates."""
 
     st_unit: CompiledUnit
     st_declared: CompiledProgram
 
     def __init__(self, together: Together | None = None) -> None:
-        """`together` holds what the programs of one PLC share: those of one file have the same global variables."""
+        """Create the program. `together` holds the resources that the programs of one PLC share: one for each file."""
         self.st_resource = Resource.of(self.st_unit, together)
         self.st_body: Any = self.st_resource.space[f"P_{self.st_declared.name.lower()}"]()
         """The instance of the compiled program, its variables as ``v_<name>`` in lower case."""
@@ -62,8 +62,7 @@ class StProgram(Program):
         self.st_show()
 
     def _whole_state(self, now_ns: int) -> Any:
-        """Return all that the next scans depend on, hashable: variables, blocks with the phase of their timers, global
-        variables."""
+        """Return the state on which the next scans depend: variables, blocks with the phase of their timers, global variables."""
         resource = self.st_resource
         body = {name: value for name, value in vars(self.st_body).items() if not is_line(name)}
         held = [body, vars(resource.globals)]
@@ -193,7 +192,7 @@ def load_file(path: Path, name: str = "") -> type[StProgram]:
 
 @lru_cache(maxsize=32)
 def _compiled(text: str, path: str) -> CompiledUnit:
-    """Compile a unit once: a system's file is read more than once, and several systems run the same program."""
+    """Return a compiled unit from a cache, because a system's file is read more than once and systems may share a program."""
     return compile_text(text, path)
 
 
@@ -226,7 +225,7 @@ def _from_tag(kind: ty.Type) -> Callable[[Any], Any] | None:
 
 
 def _described(kind: ty.Type) -> Any:
-    """Describe a type by what its values mean: names and elementary types, as data for JSON."""
+    """Return a description of a type by the names and elementary types of its values, as data for JSON."""
     if isinstance(kind, ty.Array):
         return [kind.ranges, _described(kind.of)]
     if isinstance(kind, ty.Struct):
@@ -240,7 +239,7 @@ def _described(kind: ty.Type) -> Any:
 
 
 def _most(kind: ty.Type, now: Any) -> int:
-    """Return the largest size in bytes, as MessagePack, of a value whose present data is `now`."""
+    """Return the largest possible size in bytes, as MessagePack, of a value whose present data is `now`."""
     if isinstance(kind, ty.String):
         return 5 + 3 * kind.length
     if isinstance(now, list):
@@ -270,8 +269,9 @@ def _dump(value: Any) -> Any:
 
 
 def _own(value: Any) -> list[str]:
-    """Return the slots to be saved: without a timer's times, which mean nothing after a restart, and without references
-    of VAR_IN_OUTs."""
+    """Return the slots to be saved.
+
+    A timer's times, which have no meaning after a restart, and references of VAR_IN_OUTs are not saved."""
     others = getattr(value, "in_outs", ())
     return [name for name in value.__slots__ if name not in others and not (name[0] == "_" and name.endswith("_ns"))]
 

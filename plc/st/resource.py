@@ -1,5 +1,4 @@
-"""What the programs of one Structured Text file share while they run together: compiled code, global variables, the
-scan.
+"""The data that programs of one Structured Text file share while they run: compiled code, global variables, the scan.
 
 The standard calls this a resource (IEC 61131-3, 6.8.1). Programs of one file that run in one PLC share a resource, so
 that they see the same VAR_GLOBAL. A deep copy has separate global variables and shares the code, which has no state.
@@ -26,7 +25,7 @@ Together = dict[Any, Any]
 
 
 class Context:
-    """What compiled code can use of the running scan."""
+    """The interface to the running scan for compiled code."""
 
     __slots__ = ("first_scan", "left", "lookup", "now_ns")
 
@@ -39,7 +38,7 @@ class Context:
 
     @property
     def scan_ns(self) -> int:
-        """The scan's time for SCAN_TIME(): a program that uses it depends on more than time differences."""
+        """Return the scan's time for SCAN_TIME(). A program that uses it depends on absolute time, not only on differences."""
         return self.now_ns
 
     def is_good(self, name: str) -> bool:
@@ -81,7 +80,7 @@ class Resource:
         return found
 
     def begin(self, scan: ScanInfo, lookup: Callable[[str], TagValue]) -> None:
-        """Prepare one execution of a program: from now on compiled code sees this scan and these global variables."""
+        """Prepare one execution of a program: from now on compiled code uses this scan and these global variables."""
         self.space["_G"] = self.globals
         context = self.context
         context.left = MAX_STEPS

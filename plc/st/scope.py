@@ -34,7 +34,7 @@ class Symbol:
 
 @dataclass(frozen=True, slots=True)
 class Value:
-    """A compiled expression. `place`: it is a variable or a part of one; `constant`: its value if that is known.
+    """A compiled expression. `place` says that it is a variable or a part of one. `constant` is its value if it is known.
 
     `reference`: Python expression of an object that refers to the variable; empty for a function's own variable.
     """
@@ -57,7 +57,7 @@ class Parameter:
 
 @dataclass(frozen=True, slots=True)
 class Signature:
-    """How a user's function is called. It returns a tuple if it has outputs."""
+    """The signature of a user's function. The compiled function returns a tuple if it has outputs."""
 
     name: str
     returns: ty.Type
@@ -126,7 +126,7 @@ def wrapped(code: str, kind: ty.Elementary) -> str:
 
 
 class Writer:
-    """Lines of Python with the source line of each."""
+    """The Python code being written: its lines, each with the line of the source."""
 
     def __init__(self) -> None:
         self.lines: list[tuple[str, int]] = []
@@ -154,7 +154,7 @@ class Writer:
 
     @property
     def depth(self) -> int:
-        """How many blocks enclose what is written next."""
+        """Return the number of blocks that enclose the next line."""
         return self._depth
 
     def since(self, mark: int) -> list[tuple[str, int]]:

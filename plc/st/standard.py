@@ -1,8 +1,7 @@
-"""The standard functions (IEC 61131-3, 6.6.2.5) by name: each checks its arguments' types and returns the Python to
-write.
+"""The standard functions (IEC 61131-3, 6.6.2.5) by name. Each checks the types of its arguments and returns Python code.
 
-Beyond the standard: IS_GOOD(input), FIRST_SCAN(), SCAN_TIME(), and for messages MSG_COUNT, MSG_AT, MSG_TIME, MSG_ROOM,
-MSG_SEND (a message is a STRING with one character per byte).
+Functions that are not in the standard: IS_GOOD(input), FIRST_SCAN(), SCAN_TIME(), and for messages MSG_COUNT, MSG_AT, MSG_TIME,
+MSG_ROOM, MSG_SEND (a message is a STRING with one character per byte).
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ _MATH = {
 
 @dataclass(frozen=True, slots=True)
 class Standard:
-    """A standard function: the names of its parameters, and how a call of it is written."""
+    """A standard function: the names of its parameters, and the function that writes a call."""
 
     formals: Formals
     write: Write
@@ -141,7 +140,7 @@ def _operator(x: Compiling, call: t.Call, given: list[t.Expr]) -> Value:
 
 @FUNCTIONS.add(*_SEQUENCES, takes=_SOME)
 def _sequence(x: Compiling, call: t.Call, given: list[t.Expr]) -> Value:
-    """Write a comparison of each argument with the next (Table 33): GT is true for a decreasing sequence."""
+    """Write a comparison of each argument with the next one (Table 33). For example, GT is true for a decreasing sequence."""
     op = _SEQUENCES[call.ref.name.upper()]
     if len(given) == 2:
         return x.value(t.Binary(call.pos, op, *given))

@@ -22,7 +22,7 @@ _CHAIN = 48
 
 
 class Statements(Expressions):
-    """Compiles a body. `leave` is the Python statement for RETURN."""
+    """The compiler of a body. `leave` is the Python statement for RETURN."""
 
     leave = "return"
 
@@ -113,8 +113,9 @@ class Statements(Expressions):
         more: bool,
         pos: t.Pos,
     ) -> None:
-        """Write if, elif and so on, and `otherwise` if there is `more`. A condition that needs lines before it begins a
-        new chain, inside the else of the previous one."""
+        """Write a chain of if and elif, and `otherwise` as the else branch if there is `more`.
+
+        A condition that needs lines before it begins a new chain inside the else branch of the previous chain."""
         with ExitStack() as inside:
             word = "if"
             for condition, body in branches:
@@ -160,8 +161,10 @@ class Statements(Expressions):
         self._cases(name, list(zip(tests, bodies, places, strict=True)), 0, s)
 
     def _cases(self, name: str, rows: list[tuple[str, tuple[t.Statement, ...], t.Pos]], first: int, s: t.Case) -> None:
-        """Write a chain of branches. If there are many, they are selected by number, and the chain is split into
-        halves."""
+        """Write the branches of a CASE as a chain of conditions.
+
+        If there are many, they are selected by number, in nested halves.
+        """
         if len(rows) > _CHAIN:
             half = len(rows) // 2
             with self.out.block(f"if 0 <= {name} < {first + half}:", s.pos):

@@ -7,8 +7,9 @@ from fieldtwin.plc.st.scope import Value, wrapped
 
 
 def with_time(op: str, left: Value, right: Value) -> Value | None:
-    """Return `left` `op` `right` if one side is a duration, date or time of day; None if neither side is one, or if the
-    standard defines no such operation."""
+    """Return the code of `left` `op` `right` for a duration, date or time of day.
+
+    Return None if neither side has such a type, or if the standard defines no such operation."""
     a, b = ty.plain(left.type), ty.plain(right.type)
     ka, kb = _kind(a), _kind(b)
     x, y = left.code, right.code

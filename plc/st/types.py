@@ -1,4 +1,4 @@
-"""The data types of Structured Text: which exist, which convert implicitly, and how values are represented.
+"""The data types of Structured Text, their implicit conversions, and the representation of their values.
 
 Representation at run time: BOOL as bool; integers, bit strings, enumerated values as int; REAL as a float rounded to 32
 bits, LREAL as float; TIME and LTIME as int of ns, TIME_OF_DAY ns since midnight, DATE and DATE_AND_TIME ns since
@@ -185,7 +185,7 @@ Type = (
 
 
 def plain(kind: Type) -> Type:
-    """Return the type that a value has once it is read: a subrange's is its base."""
+    """Return the type that a value has after it is read: for a subrange, its base type."""
     return kind.base if isinstance(kind, Subrange) else kind
 
 
@@ -199,14 +199,14 @@ def elements(kind: Type) -> int:
 
 
 def nested(kind: Type) -> int:
-    """Return how deep structures, arrays and blocks are nested."""
+    """Return the nesting depth of structures, arrays and blocks in a type."""
     if isinstance(kind, Array):
         return len(kind.ranges) + nested(kind.of)
     return kind.nested if isinstance(kind, Struct | Block) else 0
 
 
 def is_kind(kind: Type, *names: str) -> bool:
-    """Return whether it is elementary of one of these kinds; constants without a type count as int or real."""
+    """Return whether the type is elementary and of one of these kinds. Constants without a type count as int or real."""
     kind = plain(kind)
     if isinstance(kind, AnyInt):
         return "int" in names
@@ -244,12 +244,12 @@ def _widens(source: Elementary, target: Elementary) -> bool:
 
 
 def of_bits(kind: Type | None) -> TypeGuard[Elementary]:
-    """Return whether it is a bit string type or BOOL."""
+    """Return whether the type is a bit string type or BOOL."""
     return isinstance(kind, Elementary) and kind.kind in ("bits", "bool")
 
 
 def takes_bits(target: Type | None, source: AnyInt) -> TypeGuard[Elementary]:
-    """Return whether an integer constant becomes a bit string (or a BOOL) where `target` is demanded."""
+    """Return whether an integer constant becomes a bit string (or a BOOL) if the context demands `target`."""
     return of_bits(target) and fits(source, target)
 
 

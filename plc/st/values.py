@@ -1,4 +1,4 @@
-"""What compiled Structured Text calls at run time: arithmetic of fixed widths, checks, strings, conversions.
+"""The functions that compiled Structured Text calls at run time: arithmetic of fixed widths, checks, strings, conversions.
 
 Integers wrap around like two's complement; division truncates towards zero; REAL rounds to 32 bits after each
 operation. An operation without a result (division by zero, an index outside its array, a root of a negative number)
@@ -36,7 +36,7 @@ class LogicError(FieldtwinError):
 
 
 def real(x: float) -> float:
-    """Return `x` rounded to 32 bits; beyond their range infinity, as in IEC 60559."""
+    """Return `x` rounded to a 32-bit float, or infinity beyond its range, as IEC 60559 requires."""
     try:
         rounded: float = _FLOAT.unpack(_FLOAT.pack(x))[0]
     except OverflowError:
@@ -166,12 +166,12 @@ def set_bit(x: int, bit: int, on: bool) -> int:
 
 
 def shift_left(x: int, n: int, bits: int) -> int:
-    """SHL: zeros are shifted in from the right. A negative count is an error (IEC 61131-3, Table 30)."""
+    """Return `x` shifted left, with zeros from the right (SHL). A negative count is an error (IEC 61131-3, Table 30)."""
     return (x << _count(n)) & ((1 << bits) - 1) if n < bits else 0
 
 
 def shift_right(x: int, n: int, bits: int) -> int:
-    """SHR: zeros are shifted in from the left."""
+    """Return `x` shifted right, with zeros from the left (SHR). A negative count is an error."""
     return x >> _count(n) if n < bits else 0
 
 
@@ -243,13 +243,13 @@ def time_over(ns: int, divisor: float) -> int:
 
 
 def branch(x: int, lows: tuple[int, ...], highs: tuple[int, ...], branches: tuple[int, ...]) -> int:
-    """CASE with many labels: return the branch for `x`, or -1. `lows` are in order."""
+    """Return the branch of a CASE with many labels for `x`, or -1. `lows` are in ascending order."""
     at = bisect_right(lows, x) - 1
     return branches[at] if at >= 0 and x <= highs[at] else -1
 
 
 def pick(selector: int, *choices: Any) -> Any:
-    """MUX: a selector outside the choices is a `LogicError`."""
+    """Return the choice that the selector of a MUX selects. Raises `LogicError` for a selector without a choice."""
     return choices[index(selector, 0, len(choices) - 1)]
 
 
@@ -261,7 +261,7 @@ def right(s: str, length: int) -> str:
 
 
 def find(s: str, what: str) -> int:
-    """Return the position from 1; 0 if it is not found, and for an empty string."""
+    """Return the position of one string in another, from 1; 0 if it is not found, or if it is empty."""
     return s.find(what) + 1 if what else 0
 
 

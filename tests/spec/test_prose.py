@@ -23,6 +23,7 @@ from fieldtwin.emulators.models.sampled_sensor import SampledSensor
 from fieldtwin.emulators.signals import SignalPlayer, SignalTrack
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.files.recording import RecordingReader, shown
+from fieldtwin.twin.site.resolved import read_resolved
 from fieldtwin.twin.site.system import load_system
 
 WITNESS = """
@@ -103,16 +104,15 @@ def test_prose_2_the_prototype_reads_the_plants_configuration_byte_for_byte(dese
     assert prototype.code == 0, prototype.summary["errors"]
     assert deserted.read_bytes() == before
     assert prototype.summary["system_hash"] == plant.summary["system_hash"]
-    for ended in (prototype, plant):
-        read = {
-            path
-            for process, path in ended.opened
-            if " fieldtwin.twin.plant.controller " in process and path.parent == deserted.parent
-        }
-        assert read == {deserted}
+    read = [{path.name for _, path in ended.opened if path.parent == deserted.parent} for ended in (prototype, plant)]
+    assert read == [{"observatory.yaml", "observatory.prototype.yaml"}, {"observatory.yaml"}]
+    for ended in (prototype, plant):  # the run reads the file, and hands what it read to gateway and PLC
+        assert ended.files_of("fieldtwin.twin.plant.controller") == set()
+    handed = [read_resolved(str(ended.run_dir / "system.pickle")) for ended in (prototype, plant)]
+    assert handed[0] == handed[1]
     told = [json.loads((ended.run_dir / "gateway.json").read_text()) for ended in (prototype, plant)]
     for config in told:
-        del config["run_dir"]
+        del config["run_dir"], config["resolved"]  # the folder of the run
     assert {key for key in told[0] if told[0][key] != told[1][key]} == {"mapping", "allow_writes"}
     plcs = [json.loads((ended.run_dir / "plc.json").read_text()) for ended in (prototype, plant)]
     for config in plcs:
@@ -123,7 +123,7 @@ def test_prose_2_the_prototype_reads_the_plants_configuration_byte_for_byte(dese
 
 def test_prose_2_the_plants_run_never_opens_a_prototype_file(deserted: Path, tmp_path: Path) -> None:
     ended = Ended(tmp_path / "run", str(deserted), "--plant", "--for", "1s")
-    assert ended.files_of("fieldtwin.twin.plant.controller") >= {
+    assert {path.name for _, path in ended.opened} >= {
         "observatory.yaml",
         "ctd-reference.yaml",
     }  # the recorder was active
@@ -131,9 +131,13 @@ def test_prose_2_the_plants_run_never_opens_a_prototype_file(deserted: Path, tmp
 
 
 def test_prose_2_what_is_emulated_is_known_to_the_field_side_alone(standby: Ended) -> None:
-    assert "observatory.prototype.yaml" in standby.files_of("fieldtwin.twin.prototype.field_process")
+    """The run reads the prototype file and hands it to the simulated devices; gateway and PLC get nothing of it."""
+    assert "observatory.prototype.yaml" in {path.name for _, path in standby.opened}
     for module in ("fieldtwin.twin.plant.controller", "fieldtwin.plc"):
-        assert "observatory.prototype.yaml" not in standby.files_of(module), module
+        assert standby.files_of(module) == set(), module
+    of_the_prototype = b"fieldtwin.twin.prototype"
+    assert of_the_prototype in (standby.run_dir / "prototype.pickle").read_bytes()
+    assert of_the_prototype not in (standby.run_dir / "system.pickle").read_bytes()
 
 
 def test_prose_2_the_emulated_connection_belongs_to_neither_device_nor_driver() -> None:

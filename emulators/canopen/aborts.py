@@ -11,7 +11,10 @@ from fieldtwin.gateway.core.errors import SdoAborted
 
 
 class Abort(IntEnum):
-    """All codes of the standard. Some have a cause only in a real device: `NodeContext.refusals` can raise them."""
+    """All abort codes of the standard.
+
+    Some have a cause only in a real device; a user can set them with `NodeContext.refusals`.
+    """
 
     TOGGLE = 0x05030000
     TIMEOUT = 0x05040000
@@ -82,7 +85,7 @@ MEANINGS = {
 
 
 def abort(index: int, subindex: int, code: Abort) -> SdoAborted:
-    """Return the error that refuses access to an object, for ``raise abort(...)``."""
+    """Return the error that refuses access to an object, to be raised with ``raise abort(...)``."""
     return SdoAborted(index, subindex, int(code), MEANINGS[code], where="emulated node")
 
 

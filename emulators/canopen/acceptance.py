@@ -19,7 +19,7 @@ _CONSUMER_HEARTBEAT = 0x1016
 
 
 class Acceptance:
-    """Called with a frame; returns whether the node receives it.
+    """The filter: a callable that takes a frame and returns whether the node receives it.
 
     It follows changes of communication objects and of the node ID.
     """

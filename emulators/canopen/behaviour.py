@@ -1,11 +1,11 @@
 """The interface between a node (bytes by index) and a device model (numbers).
 
-A `DeviceModel` is a function of time: from the time, the played values and the values that clients wrote, it determines
-the values of the device's objects and when it must be called again. It must never know frames, SDO or PDOs; the node
-must never know drives.
+A `DeviceModel` is a function of time: from the time, the recorded values and the values that clients wrote, it determines the
+values of the device's objects and the time of its next call. It must never know frames, SDO or PDOs; the node must never know
+drives.
 
-A recording plays the value that the device gave **with its factory settings**. A model converts it to the value that
-the device gives with the live settings. Objects that the model does not mention are passed through.
+A recording holds the values that the device gave **with its factory settings**. A model converts them to the values that the
+device gives with its present settings. Objects that the model does not mention are passed through.
 """
 
 from __future__ import annotations
@@ -58,8 +58,8 @@ class Objects:
 class Situation(msgspec.Struct, frozen=True):
     """The input of a model.
 
-    `written` are the objects that SDO clients or RPDOs wrote just now, changed or not; `errors` are the EMCY codes that
-    are present in the node, whatever raised them.
+    `written` are the objects that SDO clients or RPDOs have just written, even if their value is unchanged. `errors` are the EMCY
+    codes of all errors that are present in the node.
     """
 
     now_ns: int
@@ -74,9 +74,9 @@ class ModelOutput(msgspec.Struct, frozen=True):
     """The output of a model. Objects that the node does not have are ignored; numbers are rounded and limited to their
     type.
 
-    A change of one of `states` is an event for the TPDOs that map it; `readings` change all the time and are not
-    events. `clears` are EMCY codes whose errors are over. `wake_at_ns` is the time of the next call, None if no call is
-    needed.
+    A change of an object in `states` is an event for the TPDOs that map it; changes of `readings` are not events, because they
+    change all the time. `clears` are the EMCY codes of errors that are over. `wake_at_ns` is the time of the next call, None if
+    no call is needed.
     """
 
     states: Mapping[Key, Number] = msgspec.field(default_factory=dict)
@@ -90,7 +90,7 @@ class DeviceModel(ABC):
 
     @abstractmethod
     def power_on(self, situation: Situation) -> None:
-        """Start the device: power-on, or NMT reset node. Objects have their power-on values."""
+        """Start the device after power-on or NMT reset node. Objects have their power-on values."""
 
     def refuse(self, key: Key, value: Number, objects: Objects) -> Abort | None:
         """Return the abort code if an SDO client may not write `value`, else None.
@@ -103,7 +103,7 @@ class DeviceModel(ABC):
     def step(self, situation: Situation) -> ModelOutput:
         """Advance the device to the present time.
 
-        Called when it requested, after writes, and before each read; time never goes back.
+        The node calls this at the requested time, after writes, and before each read; time never goes back.
         """
 
 
@@ -112,7 +112,7 @@ Distort = Callable[[Mapping[Key, bytes], int], dict[Key, bytes]]
 
 
 class Behaviour(Service):
-    """Runs a model inside a node. It is also the node's source of values (see `service.Source`)."""
+    """The connection of a model with its node. It is also the node's source of values (see `service.Source`)."""
 
     def __init__(
         self, model: DeviceModel, source: Source | None, data: NodeData, distort: Distort | None = None
@@ -168,9 +168,7 @@ class Behaviour(Service):
 
     @property
     def due_ns(self) -> int:
-        """Equals `asks_at_ns`, but is immediate if errors have appeared or gone since the last step, which does not
-        wake the node.
-        """
+        """Return the time that the model requested, or 0 if errors have appeared or gone since the last step."""
         return self.asks_at_ns if self._emergency.active == self._seen else 0
 
     def tick(self, now_ns: int) -> None:

@@ -19,7 +19,7 @@ _MUTE = "bus-off"
 
 
 class BusFaults(Service):
-    """Turns events of the controller into silence, emergencies and the reaction of 1029h."""
+    """The node's reaction to events of its controller: silence, emergencies and the reaction of 1029h."""
 
     def __init__(self, core: Core, emergency: emcy.Emergency, react: ErrorReaction) -> None:
         self._core = core
@@ -28,7 +28,7 @@ class BusFaults(Service):
         self.state = CanErrorState.ACTIVE
 
     def reset(self, now_ns: int) -> None:
-        """Keep the controller's state, and report an error that continues again."""
+        """Keep the controller's state at a reset, and report an error that is still present again."""
         if self.state is CanErrorState.PASSIVE:
             self._raise(PASSIVE, now_ns)
 
@@ -51,13 +51,13 @@ class BusFaults(Service):
             self._raise(PASSIVE, now_ns)
 
     def overrun(self, now_ns: int) -> None:
-        """Report that frames were lost because they came faster than they were taken."""
+        """Report that frames were lost because they came faster than the node took them."""
         self._emergency.report(OVERRUN, now_ns, register=emcy.COMMUNICATION)
 
     def heard(self, frame: CanFrame, now_ns: int) -> bool:
-        """Check a data frame.
+        """Return whether the identifier of a received data frame is reserved for this node.
 
-        Returns whether its identifier is reserved for this node: an error that lasts until a reset.
+        Such a frame is an error that lasts until a reset.
         """
         node_id, emcy_id = self._core.node_id, self._core.data.number(0x1014, 0, 1 << 31)
         own = {ERROR_CONTROL + node_id, RESPONSE + node_id} | ({emcy_id} if emcy_id <= 0x7FF else set())

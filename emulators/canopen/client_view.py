@@ -1,4 +1,4 @@
-"""The object dictionary as an SDO client sees it: generic rules first, then those of the object's service.
+"""The object dictionary as an SDO client sees it. Generic rules apply first, then those of the object's service.
 
 It must never know SDO frames.
 """
@@ -25,7 +25,7 @@ class ClientView:
         self._refusals = dict(refusals or {})
 
     def add(self, service: Service) -> None:
-        """Add a service: that of the SDO servers, which are themselves built on this view."""
+        """Add a service after construction: the SDO servers, which themselves use this view."""
         self._services += (service,)
 
     def read(self, index: int, subindex: int, now_ns: int) -> bytes:

@@ -47,7 +47,7 @@ def is_number(data_type: int) -> bool:
 
 
 def is_integer(data_type: int) -> bool:
-    """Return whether it is one of the integer types or BOOLEAN."""
+    """Return whether the type is one of the integer types or BOOLEAN."""
     return data_type in _INTEGER_BYTES
 
 
@@ -83,7 +83,7 @@ def encode(data_type: int, value: int | float) -> bytes:
 
 
 def held_encoder(data_type: int) -> Callable[[int | float], bytes]:
-    """Return an encoder that rounds numbers and limits them to the type, like a device whose registers saturate.
+    """Return an encoder that rounds numbers and limits them to the range of the type, like a device whose registers saturate.
 
     NaN becomes 0 in an integer. Real types accept what `encode` accepts.
     """

@@ -1,4 +1,4 @@
-"""PDOs that a data sheet declares without describing them: ``CompactPDO`` of CiA 306-1 v1.4, 4.5.2.
+"""PDOs that a data sheet declares without their own sections: ``CompactPDO`` of CiA 306-1 v1.4, 4.5.2.
 
 The mask lists the subindices of the communication parameters that the device has: bit 0 for subindex 1, and so on.
 ``NrOfRXPDO`` and ``NrOfTXPDO`` give the number of PDOs. Those without sections are created here without mapped objects,

@@ -1,6 +1,6 @@
 """An electronic data sheet (EDS or DCF, CiA 306-1) as the emulated node's object dictionary: a frozen description.
 
-It has its own parser: the gateway reads data sheets with the `canopen` package, and two independent readers reveal each
+It has its own parser, because the gateway reads data sheets with the `canopen` package, and two independent readers reveal each
 other's mistakes. It must never know live values (`fieldtwin.emulators.canopen.node_data`) or the bus.
 """
 
@@ -53,7 +53,7 @@ _LAST_TYPE = 0x1B
 class Dictionary:
     """A device as its data sheet describes it. It never changes after reading, so that many nodes can share it.
 
-    `node_id` and `bit_rate` (bit/s) are the values that a DCF commissions, 0 for an EDS. `dummies` are the data types
+    `node_id` and `bit_rate` (bit/s) come from a DCF's commissioning section; they are 0 for an EDS. `dummies` are the data types
     that an RPDO may map without an object; `bit_rates` are those that the device supports, in bit/s, empty if the file
     does not list them. `notes` lists the corrections made while reading.
     """
@@ -170,7 +170,7 @@ def _in_range(section: Section, key: str, most: int) -> int:
 
 
 def _check_lists(sections: dict[str, Section], objects: dict[int, DictionaryObject]) -> None:
-    """Note where the lists of objects and the counts of subindices differ from the sections; the sections are used."""
+    """Add notes where the lists of objects and the counts of subindices differ from the sections. The sections are used."""
     listed: set[int] = set()
     for name in _LISTS:
         section = sections.get(name)
@@ -306,8 +306,8 @@ def _read_entry(
 def _read_default(section: Section, data_type: int, value_text: str) -> tuple[bytes, bool, bool]:
     """Return the initial bytes of the object, whether the node ID is added to them, and whether a DCF sets them.
 
-    A value that does not fit its data type (a text in a DOMAIN, 300 in an UNSIGNED8) is noted, and the next one is
-    used: the DefaultValue after a ParameterValue, then the type's zero or the empty string.
+    A value that does not fit its data type (a text in a DOMAIN, 300 in an UNSIGNED8) is noted and replaced: a ParameterValue by
+    the DefaultValue, and a DefaultValue by the type's zero or the empty string.
     """
     texts = [("value", value_text), *((key, section.text(key)) for key in ("ParameterValue", "DefaultValue"))]
     for key, text in texts:

@@ -53,16 +53,16 @@ class Emergency(Service):
             self.report(code, now_ns, register=register, info=info)
 
     def report(self, code: int, now_ns: int, *, register: int = GENERIC, info: bytes = b"") -> None:
-        """Report an error that does not stay active (a PDO that is too short), in history and message only."""
+        """Report an error that does not stay active (such as a PDO that is too short), only in history and message."""
         info = info[:5].ljust(5, b"\0")
         bits = self._update_register() | register | GENERIC
         self._remember(code | int.from_bytes(info[:2], "little") << 16)
         self._emit(code.to_bytes(2, "little") + bytes([bits]) + info, now_ns)
 
     def clear_error(self, code: int, now_ns: int, *, source: str = "") -> None:
-        """Report that an error is repaired: 0000h with the remaining bits of the register.
+        """Report that an error is repaired, with 0000h and the remaining bits of the register.
 
-        No effect if it was not active.
+        This has no effect if the error was not active.
         """
         if self._active.pop((code, source), None) is not None:
             self._tell_active()
@@ -113,7 +113,7 @@ class Emergency(Service):
 
     @property
     def due_ns(self) -> int:
-        """When the next message may be sent."""
+        """Return when the next message may be sent."""
         return self._free_at_ns if self._waiting and not self._core.mutes else NEVER
 
     def _tell_active(self) -> None:
@@ -150,7 +150,7 @@ class Emergency(Service):
         return sorted(sub for sub in found.entries if sub) if found else []
 
     def _remember(self, field: int) -> None:
-        """Add to the history: the newest is at subindex 1; the oldest is dropped."""
+        """Add an error to the history (1003h): the newest is at subindex 1, and the oldest is dropped."""
         data, subs = self._core.data, self._history()
         for sub in reversed(subs[1:]):
             data.put_number(0x1003, sub, data.number(0x1003, sub - 1))

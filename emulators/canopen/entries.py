@@ -16,8 +16,8 @@ VAR, ARRAY, RECORD, DOMAIN_OBJECT = 0x07, 0x08, 0x09, 0x02
 class Entry:
     """One subindex. `default` is in on-wire bytes; with `node_relative` the node ID is added to it.
 
-    `size` is the value's length in bytes, None if the length varies. `low` and `high` are inclusive. `configured`: a
-    DCF sets `default` (its ParameterValue), so it is not the factory value.
+    `size` is the value's length in bytes, None if the length varies. `low` and `high` are inclusive. `configured` says that
+    `default` is the ParameterValue of a DCF and not the factory value.
     """
 
     index: int

@@ -25,7 +25,9 @@ class ErrorReaction:
         self._change_state = change_state
 
     def __call__(self, now_ns: int) -> None:
-        """React: 0 leaves OPERATIONAL for PRE-OPERATIONAL, 1 changes nothing, 2 stops (CiA 301, 7.5.2.32)."""
+        """React by the value of 1029h:01 (CiA 301, 7.5.2.32).
+
+        0: go from OPERATIONAL to PRE-OPERATIONAL. 1: no change. 2: go to STOPPED."""
         reaction = self._core.data.number(0x1029, 1)
         if reaction == 0 and self._core.operational:
             self._change_state(NmtState.PRE_OPERATIONAL, now_ns)
@@ -34,7 +36,7 @@ class ErrorReaction:
 
 
 class HeartbeatProducer(Service):
-    """Sends the state every 1017h milliseconds. A newly written period starts immediately, with a heartbeat."""
+    """The producer that sends the state every 1017h milliseconds. A newly written period begins immediately, with a heartbeat."""
 
     due_ns: int = NEVER
     """When the next heartbeat must be sent."""
@@ -79,7 +81,7 @@ class _Watched:
 
 
 class HeartbeatConsumer(Service):
-    """Monitors the nodes of 1016h, each from its first heartbeat on; a loss causes EMCY 8130h and the reaction of 1029h."""
+    """The monitor of the nodes of 1016h, each from its first heartbeat on. A loss causes EMCY 8130h and the reaction of 1029h."""
 
     due_ns: int = NEVER
     """When the first missing heartbeat is detected."""
@@ -92,7 +94,7 @@ class HeartbeatConsumer(Service):
 
     @property
     def lost(self) -> tuple[int, ...]:
-        """Node IDs whose heartbeat is missing."""
+        """Return the node IDs whose heartbeat is missing."""
         return tuple(sorted(node for node, watched in self._watched.items() if watched.lost))
 
     @property

@@ -15,7 +15,7 @@ _SOURCE = "life guarding"
 
 
 class NodeGuarding(Service):
-    """Answers guarding requests and monitors that they arrive."""
+    """The guarded side: it answers guarding requests and monitors that they arrive."""
 
     due_ns: int = NEVER
     """When the life time ends."""

@@ -1,7 +1,7 @@
 """Layer setting services on the LSS slave: node ID and bit rate by identity (CiA 305 v3.0, clause 6).
 
-Pure: it takes the LSS master's 8 bytes and returns the slave's 8 bytes or None. It must never know the bus or NMT: the
-node applies a new node ID or bit rate, which it reads from `pending_id`, `stored_id` and `pending_rate`.
+Pure: it takes the LSS master's 8 bytes and returns the slave's 8 bytes or None. It must never know the bus or NMT: the node reads
+a new node ID or bit rate from `pending_id`, `stored_id` and `pending_rate`, and applies it.
 """
 
 from __future__ import annotations

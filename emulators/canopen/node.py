@@ -73,14 +73,14 @@ _TARGET = {
 class NodeContext:
     """The parts and settings of a node besides its data sheet.
 
-    `source` plays values, by time and, if it is an `AnswersReads`, by upload. `model` computes the device's behaviour
+    `source` gives values by time and, if it is an `AnswersReads`, for each upload. `model` computes the device's behaviour
     from them and from the values that clients write; `distort` changes the model's output, for faults. `held` is called
     with every value that the objects then have, `given` with the objects that the node has sent. `factory` replaces defaults (a
     serial number). `refusals` are objects that SDO clients get an abort for, regardless of the data sheet.
 
-    `tolerate_short_sdo` accepts SDO requests of fewer than 8 bytes as if padded with zeros, as for old PLCs; by default
-    they are ignored. `sdo_block` is how many segments a client may send in one sub-block, 1 to 127. A TIME producer
-    (1012h) sends its time every `time_period_ms`, 0 for never. `lss` enables or disables LSS, None uses the data sheet;
+    `tolerate_short_sdo` accepts SDO requests of fewer than 8 bytes, which old PLCs send, as if they were padded with zeros; by
+    default they are ignored. `sdo_block` is the number of segments that a client may send in one sub-block, 1 to 127. A TIME
+    producer (1012h) sends its time every `time_period_ms`, 0 for never. `lss` enables or disables LSS, None uses the data sheet;
     `lss_store` is the result of LSS's store command. `journal_size` limits both journals: older entries are dropped.
     """
 
@@ -152,7 +152,7 @@ class CanopenNode:
 
     @property
     def node_id(self) -> int:
-        """The node ID; 255 while the node is unconfigured."""
+        """Return the node ID; 255 while the node is unconfigured."""
         return self._core.node_id
 
     @property
@@ -165,12 +165,12 @@ class CanopenNode:
 
     @property
     def data(self) -> NodeData:
-        """The live values. Change them only with `set_value`, so that TPDOs are triggered."""
+        """Return the live values. Change them only with `set_value`, so that TPDOs are triggered."""
         return self._core.data
 
     @property
     def journal(self) -> deque[SentPdo]:
-        """The TPDOs sent, oldest first, bounded."""
+        """Return the TPDOs sent, oldest first, bounded."""
         return self._core.journal
 
     @property
@@ -180,12 +180,12 @@ class CanopenNode:
 
     @property
     def active_errors(self) -> tuple[int, ...]:
-        """EMCY codes of the errors that are present."""
+        """Return the EMCY codes of the errors that are present."""
         return self._emergency.active
 
     @property
     def bit_rate(self) -> int | None:
-        """The bit rate that LSS activated, in bit/s; None if LSS has not changed it."""
+        """Return the bit rate that LSS activated, in bit/s; None if LSS has not changed it."""
         return self._lss.bit_rate if self._lss else None
 
     def time_of_day(self, now_ns: int) -> TimeOfDay | None:
@@ -205,7 +205,7 @@ class CanopenNode:
     # -- events ---------------------------------------------------------------------------------------------------
 
     def start(self, now_ns: int) -> list[CanFrame]:
-        """Power on (again): power-on values, boot-up message, PRE-OPERATIONAL."""
+        """Power the node on, also repeatedly: power-on values, boot-up message, PRE-OPERATIONAL."""
         self._powered = True
         if self._lss:
             self._lss.power_on()
@@ -236,7 +236,9 @@ class CanopenNode:
         return self._core.take_output()
 
     def bus_state(self, state: CanErrorState, now_ns: int) -> list[CanFrame]:
-        """Process a state change of the CAN controller: error-passive is EMCY 8120h, bus-off is silence and then 8140h."""
+        """Process a state change of the CAN controller.
+
+        Error-passive causes EMCY 8120h. In bus-off the node is silent, and sends 8140h afterwards."""
         if self._powered:
             self._faults.changed(state, now_ns)
         return self.tick(now_ns)
@@ -256,7 +258,7 @@ class CanopenNode:
         return self._tpdos.take_overdue()
 
     def dropped(self, frames: Collection[CanFrame], now_ns: int) -> list[CanFrame]:
-        """Process frames of this node that were withdrawn: count them, and send EMCY 8100h once per SYNC."""
+        """Count frames of this node that were withdrawn, and send EMCY 8100h once per SYNC."""
         if frames:
             self._tpdos.dropped(frames)
             self._sync.late(now_ns)

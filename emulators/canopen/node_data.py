@@ -1,6 +1,6 @@
-"""The live values of one emulated node: bytes by (index, subindex), with what reset restores and 1010h stores.
+"""The live values of one emulated node: bytes by (index, subindex), with the values that reset restores and 1010h stores.
 
-Generic rules only (existence, access, length, limits). The services know what a certain object *means*; this module
+This module has only generic rules (existence, access, length, limits). The services know the *meaning* of objects. This module
 must never know the bus or the time.
 """
 
@@ -99,7 +99,7 @@ class NodeData:
         return number
 
     def put(self, index: int, subindex: int, raw: bytes) -> bool:
-        """Set a value from the device's side, whatever its access. Return whether it changed.
+        """Set a value from the device's side, also of a read-only entry. Return whether it changed.
 
         Raises `UsageError` if the entry does not exist or the length is not that of its type.
         """
@@ -140,7 +140,7 @@ class NodeData:
             raise abort(entry.index, entry.subindex, Abort.TOO_LONG if size > entry.size else Abort.TOO_SHORT)
 
     def reset(self, *, communication_only: bool) -> None:
-        """Restore power-on values: the stored ones, else the factory values (CiA 301, 7.3.2.2.1)."""
+        """Restore the power-on values: the stored values if there are any, else the factory values (CiA 301, 7.3.2.2.1)."""
         self.version += 1
         self._decoded.clear()
         for key, raw in self._factory.items():

@@ -54,9 +54,9 @@ class Mapped:
 
 
 class PdoSettings(msgspec.Struct, frozen=True):
-    """The parameters of one PDO. `valid`: it exists, on an 11-bit identifier (29-bit ones are not supported).
+    """The parameters of one PDO. `valid` says that it exists and has an 11-bit identifier (29 bits are not supported).
 
-    `mapping` holds the entries in use, `length` the number of bytes that they fill. `whole`: each entry is a whole
+    `mapping` holds the entries in use, `length` the number of bytes that they fill. `whole` says that each entry is a whole
     object, so that a PDO is the concatenation of their bytes.
     """
 
@@ -87,19 +87,19 @@ class PdoParameters:
 
     @property
     def settings(self) -> PdoSettings:
-        """The present parameters; they are read again only after a communication object has changed."""
+        """Return the present parameters; they are read again only after a communication object has changed."""
         if self._settings is None or self._settings_of != self._data.version:
             self._settings, self._settings_of = self._read(), self._data.version
         return self._settings
 
     @property
     def cob(self) -> int:
-        """The raw COB-ID entry; a PDO without one does not exist."""
+        """Return the raw COB-ID entry. A PDO without this entry does not exist."""
         return self._data.number(self.index, COB_ID, INVALID)
 
     @property
     def valid(self) -> bool:
-        """As in `PdoSettings`."""
+        """Return whether the PDO is valid, see `PdoSettings`."""
         return not self.cob & (INVALID | EXTENDED)
 
     def _read(self) -> PdoSettings:

@@ -1,9 +1,9 @@
 """Remarks about a data sheet for the user, before its node is started: settings that do not fit the node, and a missing
 model.
 
-A file is often copied from a different node of the plant, so its ParameterValues are that node's COB-IDs. They are
-applied unchanged, because a data sheet is data; `remarks` reports them. Pure; the texts name no command, because the
-caller knows how to override the settings.
+A DCF is often copied from a different node of the plant, so its ParameterValues are that node's COB-IDs. The emulated node uses
+them unchanged, and `remarks` reports them. Pure; the texts name no command, because the caller knows how to override the
+settings.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _NAMED = 6
 
 @dataclass(frozen=True, slots=True)
 class Remark:
-    """One remark. `by_parameter_value`: the DefaultValues alone do not cause it; `model`: it is about the missing model."""
+    """One remark. `by_parameter_value` says that a ParameterValue causes it; `model` says that it is about the missing model."""
 
     text: str
     by_parameter_value: bool = False
@@ -31,7 +31,7 @@ class Remark:
 
 
 def remarks(dictionary: Dictionary, node_id: int, *, has_model: bool) -> list[Remark]:
-    """Return the settings that do not fit a node with this ID. `has_model`: the node has a model of a device profile."""
+    """Return the settings that do not fit a node with this ID. `has_model` says that the node has a model of a device profile."""
     found = [*_of_another_node(dictionary, node_id), *_of_the_cycle(dictionary)]
     if not has_model:
         found.append(_without_model(dictionary))

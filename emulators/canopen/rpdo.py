@@ -1,8 +1,8 @@
 """Receive PDOs: taking values from the bus (CiA 301 v4.2, 7.2.2 and 7.5.2.35 to 36).
 
-A PDO is applied immediately with transmission types 254 and 255, at the next SYNC with 0 to 240. A PDO that is too
-short causes EMCY 8210h and is not applied; of one that is too long, the first bytes are used. If a PDO does not arrive
-again within its event timer, EMCY 8250h is active until it does.
+With transmission types 254 and 255 a PDO is applied immediately, with 0 to 240 at the next SYNC. A PDO that is too short causes
+EMCY 8210h and is not applied. Of a PDO that is too long, the first bytes are used. If a PDO does not arrive again within its
+event timer, EMCY 8250h is active until it arrives.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class _Rpdo:
 
     @property
     def source(self) -> str:
-        """The error source of a timeout."""
+        """Return the error source of a timeout."""
         return f"{self.parameters.index:04X}h"
 
 
@@ -136,7 +136,7 @@ class Rpdos(Service):
         self._emergency.clear_error(emcy.RPDO_TIMEOUT, now_ns, source=rpdo.source)
 
     def _apply(self, rpdo: _Rpdo, payload: bytes, now_ns: int) -> None:
-        """Apply all values or none: a value outside its limits refuses the whole PDO, which is counted."""
+        """Apply all values or none. If a value is outside its limits, the whole PDO is refused and counted."""
         data = self._core.data
         packed, position = int.from_bytes(payload, "little"), 0
         values: list[tuple[Key, bytes]] = []

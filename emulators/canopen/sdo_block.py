@@ -74,7 +74,7 @@ class BlockDownload:
 
 @dataclass(slots=True)
 class BlockUpload:
-    """A transfer to the client. `block` is how many segments the client accepts in one sub-block."""
+    """A transfer to the client. `block` is the number of segments that the client accepts in one sub-block."""
 
     index: int
     subindex: int
@@ -108,7 +108,7 @@ class BlockUpload:
         return self.segments()
 
     def acknowledged(self, data: bytes) -> list[bytes]:
-        """Return the frames to send after the client's acknowledgement, also after an early one. Raises `SdoAborted`."""
+        """Return the frames to send after the client's acknowledgement, which may be early. Raises `SdoAborted`."""
         if not self.sent:
             raise self._abort(Abort.COMMAND)
         number, block = data[1], data[2]

@@ -1,6 +1,6 @@
-"""The SDO servers of a node: the default one and those of 1201h to 127Fh (CiA 301 v4.2, 7.5.2.33).
+"""The SDO servers of a node: the default server and those of 1201h to 127Fh (CiA 301 v4.2, 7.5.2.33).
 
-It must never know transfers (`sdo_server`): it knows which identifiers belong to which server, and counts.
+This module assigns identifiers to servers and counts frames. It must never know transfers (`sdo_server`).
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class SdoChannels(Service):
         return index == DEFAULT or index in self._servers
 
     def check_write(self, index: int, subindex: int, raw: bytes) -> None:
-        """Check that only identifiers of an invalid additional server change; those of the default server never do."""
+        """Check a write to a server's identifiers: only those of an additional server that is marked invalid may change."""
         if subindex not in (_TO_SERVER, _TO_CLIENT):
             return
         if index == DEFAULT:
@@ -59,7 +59,7 @@ class SdoChannels(Service):
             self.reset(now_ns)
 
     def receive(self, can_id: int, data: bytes, now_ns: int) -> bool:
-        """Process a data frame. Returns whether it is a request to one of the servers, answered or not."""
+        """Process a data frame. Return whether it is a request to one of the servers, whether answered or not."""
         for index, server in self._servers.items():
             ids = self._ids(index)
             if ids is not None and ids[0] == can_id:

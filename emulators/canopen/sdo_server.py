@@ -68,9 +68,9 @@ _Transfer = _Download | _Upload | BlockDownload | BlockUpload
 class SdoServer:
     """One SDO channel with one transfer at a time; a new initiate replaces a running transfer.
 
-    While a sub-block of a block download is being received, every frame except an abort is taken as one of its
-    segments: the standard offers no other way to distinguish them. `block` is how many segments a client may send in
-    one sub-block.
+    While a sub-block of a block download is being received, every frame except an abort is taken as one of its segments, because
+    the standard offers no way to distinguish other frames. `block` is the number of segments that a client may send in one
+    sub-block.
     """
 
     def __init__(self, access: ObjectAccess, timeout_ns: int, block: int = MAX_BLOCK) -> None:
@@ -91,17 +91,17 @@ class SdoServer:
 
     @property
     def busy(self) -> bool:
-        """Whether a segmented or block transfer is under way."""
+        """Return whether a segmented or block transfer is under way."""
         return self._transfer is not None
 
     @property
     def in_sub_block(self) -> bool:
-        """Whether frames are taken as segments of a block download."""
+        """Return whether frames are taken as segments of a block download."""
         return isinstance(self._transfer, BlockDownload) and self._transfer.receiving
 
     @property
     def deadline_ns(self) -> int | None:
-        """When `tick` must be called for the running transfer, None if there is none."""
+        """Return when `tick` must be called for the running transfer, None if there is none."""
         return self._deadline_ns if self._prompt_ns is None else self._prompt_ns
 
     def reset(self) -> None:
@@ -111,7 +111,7 @@ class SdoServer:
         self._prompt_ns = None
 
     def request(self, data: bytes, now_ns: int) -> list[bytes]:
-        """Answer one request of exactly 8 bytes; there is no reply to a client's abort or inside a sub-block."""
+        """Answer one request of exactly 8 bytes. A client's abort and frames inside a sub-block get no reply."""
         try:
             replies = self._dispatch(data, now_ns)
         except SdoAborted as e:
@@ -168,7 +168,9 @@ class SdoServer:
         return [b"\x60" + data[1:4] + bytes(4)]
 
     def _room(self, index: int, subindex: int, size: bytes) -> tuple[int | None, int, Abort]:
-        """Return the announced size, the limit, and the abort code for more. Raises `SdoAborted` before any data come."""
+        """Return the announced size, the limit, and the abort code if the limit is exceeded.
+
+        Raises `SdoAborted` if the announced size already exceeds the limit."""
         announced = int.from_bytes(size, "little") if size else None
         own = self._access.begin_write(index, subindex, announced)
         if announced is not None and announced > MAX_TRANSFER_BYTES:
@@ -254,7 +256,7 @@ class SdoServer:
         return []
 
     def _initiate_block_upload(self, data: bytes, now_ns: int) -> list[bytes]:
-        """Start a block upload; a value not longer than the client's threshold (pst) is sent by an ordinary upload."""
+        """Start a block upload. A value that is not longer than the client's threshold (pst) is sent by an ordinary upload."""
         self.reset()
         index, subindex = _MUX.unpack_from(data, 1)
         raw = self._access.read(index, subindex, now_ns)

@@ -1,6 +1,6 @@
-"""Runs an emulated node on a CAN connection: the asynchronous shell around `CanopenNode`.
+"""Run an emulated node on a CAN connection: the asynchronous shell around `CanopenNode`.
 
-It must never know the protocol: it moves frames and waits.
+It must never know the protocol: it only moves frames and waits.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class SendsAtOnce(Protocol):
 async def serve_node(
     connection: CanConnection, node: CanopenNode, clock: Clock, pokes: asyncio.Queue[Poke] | None = None
 ) -> None:
-    """Power the node on and serve it until cancelled. Callables put into `pokes` run in between (`node.set_value`...).
+    """Power the node on and serve it until cancelled. Callables in the queue `pokes` run between events (`node.set_value`...).
 
     Raises `ConnectionLost` if the bus is lost, and the errors of the node. The caller owns the connection, which stays
     open. Late synchronous TPDOs are withdrawn if the connection supports it (`TakesBack`).
@@ -60,7 +60,7 @@ async def serve_node(
 
 
 class _Shell:
-    """Serialises frames and time for a node: the output of one event is sent before the next event is processed.
+    """The serialisation of a node's events: the output of one event is sent before the next event is processed.
 
     If the connection can send immediately and no other event is in progress, the event is processed in the callback
     itself, otherwise by a task that holds the lock.

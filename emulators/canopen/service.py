@@ -1,7 +1,7 @@
 """Common parts of the node's communication objects: the core that they share and the hooks that they implement.
 
-A service is the behaviour of some indices (heartbeat of 1016h and 1017h, the TPDOs of 1800h...). Services know the
-core, but not the SDO server or each other, unless one is passed to a different one's constructor.
+A service implements the behaviour of some indices (heartbeat of 1016h and 1017h, the TPDOs of 1800h...). A service knows the
+core, but neither the SDO server nor another service, unless it is passed to its constructor.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ class Source(Protocol):
     """Values that change by themselves: a recorded or computed signal."""
 
     def __call__(self, now_ns: int, /) -> dict[tuple[int, int], bytes]:
-        """Return on-wire bytes by (index, subindex) at `now_ns`. Must be cheap: called for every TPDO and SDO read.
+        """Return bytes as sent by (index, subindex) at `now_ns`. This must be fast, because every TPDO and SDO read calls it.
 
         A call is not an event: the source's values are sent by event timer, SYNC or remote frame. Use
         `CanopenNode.set_value` for a change that must trigger a TPDO.
@@ -112,10 +112,10 @@ class Source(Protocol):
 
 @runtime_checkable
 class AnswersReads(Protocol):
-    """A source that can also give an object's value for each upload of it, as recorded read by read."""
+    """A source that can also give a value for each single upload of an object, in the order of recorded uploads."""
 
     def answer(self, key: tuple[int, int], now_ns: int, /) -> bytes | None:
-        """Return on-wire bytes for the upload that begins, or None to leave the object unchanged."""
+        """Return bytes as sent for the upload that begins, or None to leave the object unchanged."""
         ...
 
 
@@ -139,7 +139,7 @@ class Core:
 
     @property
     def communicating(self) -> bool:
-        """Whether SDO, SYNC and EMCY are allowed: PRE-OPERATIONAL or OPERATIONAL (CiA 301, table 37)."""
+        """Return whether SDO, SYNC and EMCY are allowed: PRE-OPERATIONAL or OPERATIONAL (CiA 301, table 37)."""
         return self.state in (NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL)
 
     @property
@@ -169,7 +169,7 @@ class Core:
                 self.held(values, now_ns)
 
     def answer(self, key: tuple[int, int], now_ns: int) -> None:
-        """Prepare a client's upload: take the source's values, and the one for this read. Raises what `refresh` raises."""
+        """Prepare a client's upload: take the source's present values and its value for this upload. Raises as `refresh`."""
         self.refresh(now_ns)
         raw = None if self.answers is None else self.answers.answer(key, now_ns)
         if raw is not None:
@@ -189,18 +189,18 @@ NEVER = 1 << 63
 
 
 class Service:
-    """The hooks; each does nothing by default. `check_*` raise `SdoAborted` to refuse."""
+    """The hooks of a service. Each does nothing by default. `check_*` raise `SdoAborted` to refuse."""
 
     @property
     def waits(self) -> bool:
-        """Whether the service can ever be due: without its objects in the data sheet, it never can."""
+        """Return whether the service can ever be due. It never can if the data sheet lacks its objects."""
         return True
 
     @property
     def due_ns(self) -> int:
-        """When `tick` has something to do next.
+        """Return the time (ns) of the next call of `tick`.
 
-        It is read after every event, so a service that waits for one time keeps it as an attribute of this name.
+        The node reads it after every event, so a service that waits for only one time stores it in an attribute of this name.
         """
         return NEVER
 
@@ -209,19 +209,19 @@ class Service:
         return False
 
     def check_read(self, index: int, subindex: int) -> None:
-        """Called before a client's read."""
+        """Check a client's read before it is executed."""
 
     def check_write(self, index: int, subindex: int, raw: bytes) -> None:
-        """Called before a client's write, after length and limits were checked. Live values are still the old ones."""
+        """Check a client's write, after length and limits were checked. The live values are still the old ones."""
 
     def wrote(self, index: int, subindex: int, now_ns: int) -> None:
-        """Called after a client's write."""
+        """React to a client's write that was executed."""
 
     def reset(self, now_ns: int) -> None:
-        """Called after reset node or reset communication: values are back at power-on."""
+        """React to reset node or reset communication. The objects have their power-on values again."""
 
     def state_changed(self, now_ns: int) -> None:
-        """Called after a change of NMT state, except the one to INITIALISING."""
+        """React to a change of the NMT state, except to INITIALISING."""
 
     def tick(self, now_ns: int) -> None:
         """Do what is due. Called once `due_ns` has come."""

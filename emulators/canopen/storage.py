@@ -16,7 +16,10 @@ _ON_COMMAND = 1
 
 
 class Storage(Service):
-    """Acts only on the signatures ``save`` and ``load``; reads return the supported functions."""
+    """The service of 1010h and 1011h.
+
+    It accepts only the signatures ``save`` and ``load``; reads return the supported functions.
+    """
 
     def __init__(self, core: Core) -> None:
         self._core = core

@@ -1,8 +1,8 @@
 """SYNC: consumer, producer, counter and window (CiA 301 v4.2, 7.2.5; 1005h, 1006h, 1007h, 1019h).
 
-A node with a cycle period (1006h) that hears no SYNC for one and a half periods reports 8100h until SYNC returns; the
-standard defines no specific code for that. The window (1007h) limits synchronous PDOs: an RPDO that arrives after it is
-refused, a TPDO that is not on the bus by then is dropped.
+A node with a cycle period (1006h) that hears no SYNC for one and a half periods reports 8100h until SYNC returns; the standard
+defines no specific code for that. The window (1007h) limits synchronous PDOs: an RPDO that arrives after its end is refused, and
+a TPDO that is not on the bus by its end is dropped.
 """
 
 from __future__ import annotations
@@ -22,8 +22,9 @@ _SOURCE = "sync"
 
 
 class Sync(Service):
-    """Calls `on_sync(counter, now_ns)` for each valid SYNC in OPERATIONAL, its own included; `counter` is None without
-    1019h.
+    """The SYNC service. It calls `on_sync(counter, now_ns)` for each valid SYNC in OPERATIONAL, also its own.
+
+    `counter` is None without 1019h.
     """
 
     def __init__(self, core: Core, emergency: emcy.Emergency, on_sync: Callable[[int | None, int], None]) -> None:
@@ -70,8 +71,9 @@ class Sync(Service):
         self._counter = 1
 
     def state_changed(self, now_ns: int) -> None:
-        """Restart the producer's counter at 1 after STOPPED; a SYNC is not missed in STOPPED, where the node does not
-        hear it.
+        """Restart the producer's counter at 1 after STOPPED.
+
+        In STOPPED, where the node receives no SYNC, it does not report a missing one.
         """
         if not self._core.communicating:
             self._send_at_ns = self._missing_at_ns = NEVER
@@ -97,7 +99,7 @@ class Sync(Service):
         return True
 
     def in_window(self, now_ns: int) -> bool:
-        """Return whether a synchronous PDO is in time for this cycle; report the first one that is not."""
+        """Return whether a synchronous PDO is inside the window of this cycle. The first late PDO of a cycle is reported."""
         end_ns = self.window_end_ns
         if end_ns is None or now_ns <= end_ns:
             return True
@@ -112,7 +114,7 @@ class Sync(Service):
 
     @property
     def window_end_ns(self) -> int | None:
-        """When the window of the last SYNC ends; None without a window."""
+        """Return when the window of the last SYNC ends; None without a window."""
         window_ns = self._core.data.number(WINDOW) * _NS_PER_US
         return None if not window_ns or self._last_ns is None else self._last_ns + window_ns
 
@@ -125,7 +127,7 @@ class Sync(Service):
 
     @property
     def due_ns(self) -> int:
-        """When a SYNC is detected as missing, or must be sent."""
+        """Return when a SYNC is detected as missing, or must be sent."""
         return self._missing_at_ns if self._missing_at_ns < self._send_at_ns else self._send_at_ns
 
     @property

@@ -1,8 +1,7 @@
 """TIME: consumer and producer of the network's time of day (CiA 301 v4.2, 7.2.6; 1012h).
 
-Six bytes: milliseconds after midnight in 28 bits, days since 1 January 1984 in 16. The node's own clock is the last
-time received or set, plus the time elapsed since. The application decides when to produce: every `period_ns`, 0 for
-never.
+TIME has six bytes: milliseconds after midnight in 28 bits, and days since 1 January 1984 in 16. The node's own clock shows the
+last time that was received or set, plus the time elapsed since then. The producer sends every `period_ns`; 0: never.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ _SIZE = 6
 
 @dataclass(frozen=True, slots=True)
 class TimeOfDay:
-    """`days` since 1 January 1984 and milliseconds after midnight."""
+    """A time of day: `days` since 1 January 1984, and milliseconds after midnight."""
 
     days: int
     ms: int

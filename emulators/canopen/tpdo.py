@@ -1,8 +1,8 @@
 """Transmit PDOs: when each is sent and with what data (CiA 301 v4.2, 7.2.2 and 7.5.2.37).
 
-Transmission types: 0 at the SYNC after an event, 1 to 240 every n-th SYNC, 252 sampled at SYNC and 253 fresh on a
-remote frame, 254 and 255 on an event. Events are: the event timer, a change of a mapped value, the activation of the
-PDO. Inhibit time and event timer apply only to event-driven PDOs, and both are observed.
+Transmission types: 0 sends at the SYNC after an event, 1 to 240 at every n-th SYNC, 254 and 255 on an event. 252 and 253 send on
+a remote frame: 252 the values sampled at the last SYNC, 253 the present values. Events are: the event timer, a change of a mapped
+value, the activation of the PDO. Inhibit time and event timer apply only to event-driven PDOs.
 
 A PDO that SYNC triggered is late if it still waits for the bus at the end of the synchronous window (1007h):
 `take_overdue` returns its identifier, and the owner of the transmit queue withdraws it.
@@ -95,7 +95,7 @@ class Tpdos(Service):
             self._activate(tpdo, now_ns)
 
     def changed(self, keys: Iterable[Key], now_ns: int) -> None:
-        """Process values that changed inside the device: an event for the PDOs that map them."""
+        """Process values that changed inside the device. A change is an event for the PDOs that map the value."""
         if self._core.operational:
             keys = set(keys)
             for tpdo in self._tpdos:
@@ -116,7 +116,7 @@ class Tpdos(Service):
 
     @property
     def due_ns(self) -> int:
-        """When an event must be sent, or the synchronous window ends."""
+        """Return when an event must be sent, or the synchronous window ends."""
         core, due_ns = self._core, NEVER
         if core.operational and not core.mutes:
             if self._event_of != core.data.version:
@@ -128,12 +128,12 @@ class Tpdos(Service):
         return due_ns
 
     def take_overdue(self) -> frozenset[int]:
-        """Return the identifiers sent because of the last SYNC, after the end of its window; once per SYNC."""
+        """After the end of the window, return the identifiers of the PDOs that the last SYNC triggered; once per SYNC."""
         overdue, self._overdue = self._overdue, frozenset()
         return overdue
 
     def dropped(self, frames: Iterable[CanFrame]) -> None:
-        """Uncount frames, as returned by `CanopenNode`, that never got onto the bus."""
+        """Subtract frames that never got onto the bus from the count of sent frames."""
         for frame in frames:
             self._core.counters.tpdos_late += 1
             self._core.counters.tpdos -= 1
@@ -150,7 +150,7 @@ class Tpdos(Service):
                 self._on_sync(tpdo, counter, now_ns)
 
     def on_remote(self, can_id: int, now_ns: int) -> bool:
-        """Process a remote frame. Returns whether it requests a TPDO of this node; queues an answer if one is allowed."""
+        """Process a remote frame, and queue the answer if the TPDO allows it. Return whether it requests a TPDO of this node."""
         for tpdo in self._tpdos:
             settings = tpdo.parameters.settings
             if settings.valid and settings.can_id == can_id:

@@ -1,9 +1,8 @@
-"""The acoustic channel between processes: one process serves the medium on a Unix socket, the modems of others connect
-to it.
+"""The acoustic channel between processes: one process serves it on a Unix socket, and modems in other processes connect.
 
-A frame is a kind, a length in two bytes (big endian) and that number of bytes: `M` the modem's name, sent first; `S`
-send this packet; `A` the packet was accepted, there is room again; `H` this packet was received. Without the server a
-modem accepts and receives nothing, and keeps running.
+A frame is a kind, a length in two bytes (big endian) and that number of bytes. The kinds are: `M` the modem's name, sent first;
+`S` send this packet; `A` the packet was accepted, and there is room for another; `H` this packet was received. Without the server
+a modem accepts and receives nothing, and keeps running.
 """
 
 from __future__ import annotations
@@ -44,7 +43,9 @@ async def _close(writer: asyncio.StreamWriter) -> None:
 
 
 class AcousticServer:
-    """Serves the medium: ``await server.open(path)``, then ``await server.run()`` in parallel. One connection per modem."""
+    """The server of the channel: ``await server.open(path)``, then ``await server.run()`` in parallel.
+
+    Each modem has one connection."""
 
     def __init__(self, medium: AcousticMedium, clock: Clock) -> None:
         self._medium = medium

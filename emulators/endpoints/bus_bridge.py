@@ -1,4 +1,4 @@
-"""Joins two CAN buses: each frame on one is sent on the other. For the software bus and kernel interfaces.
+"""Join two CAN buses, on the software bus or kernel interfaces: each frame on one bus is also sent on the other bus.
 
 Frames are not sent back, because an end does not receive what it sent itself. Error frames are not forwarded: they
 concern one controller, not a bus. While one bus is full, the frames of the other direction wait in a bounded queue;
@@ -14,7 +14,7 @@ from fieldtwin.gateway.core.errors import FieldtwinError, WireError
 
 
 class CanBridge:
-    """Runs from `start` to `aclose`, or until one of the two buses is lost: `ended` then holds the reason."""
+    """A running bridge, from `start` to `aclose` or until one of the buses is lost; `ended` then holds the reason."""
 
     def __init__(self, one: CanConnection, other: CanConnection) -> None:
         self.forwarded = {str(one.endpoint): 0, str(other.endpoint): 0}
@@ -33,7 +33,7 @@ class CanBridge:
 
     @property
     def lost(self) -> int:
-        """Frames that came faster than the other bus accepted them."""
+        """Return the number of frames that came faster than the other bus accepted them."""
         return self._refused + sum(end.overruns for end in self._ends)
 
     async def aclose(self) -> None:

@@ -24,7 +24,7 @@ from fieldtwin.gateway.core.errors import ConnectionLost, FieldtwinError
 
 
 class BusPort(Protocol):
-    """A participant of the bus. Called from the loop; may not wait."""
+    """A participant of the bus. The event loop calls its methods, which may not wait."""
 
     def on_frame(self, frame: CanFrame) -> bool:
         """Receive a frame of a different node that ended at `frame.t_ns`.
@@ -45,7 +45,7 @@ class BusPort(Protocol):
         ...
 
     def on_settled(self) -> None:
-        """Note that there are no more frames for this instant."""
+        """Note that all frames of this instant have been delivered."""
         ...
 
     def on_bus_closed(self, error: FieldtwinError) -> None:
@@ -54,7 +54,7 @@ class BusPort(Protocol):
 
 
 class _Told(NamedTuple):
-    """An error frame from a controller to its node."""
+    """An error frame that a controller passes to its node."""
 
     t_ns: int
     order: int
@@ -64,7 +64,7 @@ class _Told(NamedTuple):
 
 
 class BusRunner:
-    """Runs a `CanBus` on the running loop. `paced`: frames take their time on the bus; otherwise none.
+    """The runner of a `CanBus` on the running loop. If `paced`, frames take their time on the bus; otherwise they take none.
 
     A late wake-up delays deliveries and never shifts the bus: frames keep their exact times (`frame.t_ns`).
     """
@@ -101,7 +101,7 @@ class BusRunner:
 
     @property
     def data_bitrate(self) -> int:
-        """Bit rate of CAN FD frames with the bit-rate switch, in bit/s."""
+        """Return the bit rate of the data phase of CAN FD frames with the bit-rate switch, in bit/s."""
         return self._bus.data_bitrate
 
     @property
@@ -133,7 +133,7 @@ class BusRunner:
     def submit(self, node: int, frame: CanFrame, *, more: bool = False, counted: bool = True) -> bool:
         """Queue a frame. Return False if the node's transmit queue is full: try again after `on_confirmed`.
 
-        `counted` as in `CanBus`. With `more` the caller has further frames, and calls `settle` after the last.
+        `CanBus.submit` describes `counted`. With `more` the caller has further frames, and calls `settle` after the last one.
         """
         now_ns = self.now_ns()
         taken = self._bus.submit(node, frame, now_ns, counted=counted)
@@ -148,7 +148,7 @@ class BusRunner:
         return taken
 
     def settle(self) -> None:
-        """End a series of submissions with `more`. If frames take no time, they are sent now."""
+        """End a series of calls of `submit` with `more`. If frames take no time, they are sent now."""
         if self._bus.instant and not self._pumping and self._timer is None and self._closed is None:
             self._due_ns = self.now_ns()
             self._pump()
@@ -256,7 +256,8 @@ class BusRunner:
 
 
 class AttachedConnection(TellsOverrun):
-    """A node of the same process. `recv` returns the frames of the other nodes, stamped with their exact end of frame.
+    """The connection of a node in the same process. `recv` returns the other nodes' frames, stamped with their exact end of
+    frame.
 
     Error frames report changes of its controller's state, and overruns.
     """
@@ -272,7 +273,7 @@ class AttachedConnection(TellsOverrun):
     def send_at_once(self, frame: CanFrame) -> bool:
         """Queue `frame` if there is room and no sender waits for room.
 
-        Otherwise return False without an effect or a count.
+        Otherwise return False; nothing is queued or counted.
         """
         if self._lost is not None:
             raise self._loss()

@@ -119,7 +119,7 @@ class SoftBusServer:
 
     @property
     def bound(self) -> Endpoint:
-        """The endpoint with the port that is really open."""
+        """Return the endpoint with the port that is really open."""
         return self._endpoint
 
     @property
@@ -128,7 +128,7 @@ class SoftBusServer:
 
     @property
     def runner(self) -> BusRunner:
-        """The bus model, to which other kinds of ports connect, for example an slcan port."""
+        """Return the bus model, to which other kinds of ports connect, for example an slcan port."""
         return self._runner
 
     def disturb(self, rule: Rule) -> None:
@@ -348,7 +348,7 @@ class _Client(asyncio.Protocol):
             self._transport.close()
 
     def _carry_fd(self) -> None:
-        """Use CAN FD records for this client from now on; the number of frames that may wait for it stays the same."""
+        """Use CAN FD records for this client from now on. The limit of waiting frames stays the same."""
         self._fd, self._record_size = True, FD_RECORD_SIZE
         self._max_outbound_bytes = self._max_outbound_bytes * FD_RECORD_SIZE // RECORD_SIZE
         self._transport.set_write_buffer_limits(high=2 * self._max_outbound_bytes, low=self._max_outbound_bytes)

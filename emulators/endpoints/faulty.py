@@ -1,6 +1,6 @@
 """An emulator's end of a link with fault injection: the bytes in both directions pass through the faults of the bus.
 
-Neither side notices. Time is that of the loop. While no fault is active, bytes pass unchanged.
+Neither side can detect this. The time is that of the loop. While no fault is active, bytes pass unchanged.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ MOST_WAITING = 10_000
 
 
 class FaultyEnd(ByteConnection):
-    """`inner`, an emulator's end, behind `faults`. Close it instead of `inner`."""
+    """A wrapper that injects `faults` into `inner`, an emulator's end. Close this object instead of `inner`."""
 
     def __init__(self, inner: ByteConnection, faults: WireFaults) -> None:
         super().__init__(inner.inbound, inner.endpoint, inner.max_pending)
@@ -63,7 +63,7 @@ class FaultyEnd(ByteConnection):
 
     @property
     def paced(self) -> bool:
-        """Whether the end paces bytes like a line (`PtyEnd`)."""
+        """Return whether the end paces bytes like a line (`PtyEnd`)."""
         return self._pty is not None and self._pty.paced
 
     def read(self) -> Coroutine[Any, Any, bytes]:
@@ -124,7 +124,7 @@ class FaultyEnd(ByteConnection):
         return not (self._faults.active or assembler.pending or (self._free_ns and assembler.way in self._free_ns))
 
     def _heard(self, data: bytes) -> bool:
-        """Process a chunk from the peer; return True if it has been handled."""
+        """Process a chunk from the peer; return True if a fault has handled it."""
         if self._faults.watch is not None:
             self._show(Way.REQUEST, data)
         if self._dead:
@@ -246,7 +246,7 @@ class FaultyEnd(ByteConnection):
     # -- the connection itself ------------------------------------------------------------------------------------------
 
     def _put_in(self, active: Active) -> None:
-        """Schedule the effect of a fault on the connection for the fault's start time."""
+        """Schedule the effect of a fault on the connection at the fault's start time."""
         hang = active.fault.appears() if isinstance(active.fault, WireFault) else None
         if hang is None:
             return

@@ -21,7 +21,7 @@ from fieldtwin.gateway.core.errors import ConnectionLost, FieldtwinError
 
 
 class FaultyCan(CanConnection):
-    """`inner`, the end of node `node`, behind `faults`. Close it instead of `inner`."""
+    """A wrapper that injects `faults` into `inner`, the end of node `node`. Close this object instead of `inner`."""
 
     def __init__(self, inner: CanConnection, faults: WireFaults, node: int) -> None:
         assert isinstance(inner.inbound, CANConnection)

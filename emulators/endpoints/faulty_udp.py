@@ -25,7 +25,7 @@ Heard = tuple[bytes, tuple[str, int]]
 
 
 class FaultyDatagrams(Datagrams):
-    """`inner` behind `faults`. Close it instead of `inner`."""
+    """A wrapper that injects `faults` into the socket `inner`. Close this object instead of `inner`."""
 
     def __init__(self, inner: Datagrams, faults: WireFaults) -> None:
         self._inner = inner
@@ -85,7 +85,7 @@ class FaultyDatagrams(Datagrams):
             self._faults.watch(peer, way, data)
 
     def _later(self, piece: Piece, then: Callable[[bytes, tuple[str, int]], None], peer: tuple[str, int]) -> None:
-        """Call `then` when the piece's time has come, unless the piece has been forwarded already."""
+        """Call `then` when the piece is due, unless the piece has already been forwarded."""
 
         def due() -> None:
             if not self._listening.done() and (piece.gone is None or not piece.gone()):

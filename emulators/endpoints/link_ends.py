@@ -1,4 +1,4 @@
-"""The ends between which an emulated connection forwards bytes: a TCP stream, dialled or accepted, and a serial device.
+"""The ends between which an emulated connection forwards bytes: an outgoing or incoming TCP connection, and a serial device.
 
 They share no code with the gateway's ends (DESIGN.md), so that a mistake in one cannot be hidden by the same mistake in
 the other. A virtual serial port is fieldtwin.emulators.endpoints.pty. These ends know no protocol.
@@ -49,7 +49,7 @@ class TcpEnd(ByteConnection):
     """
 
     def __init__(self, endpoint: Endpoint, door: TcpDoor | None = None) -> None:
-        """Create an unconnected end: use `dial`, or take one from a `TcpDoor`."""
+        """Create an unconnected end. Use `dial`, or take an end from a `TcpDoor`, instead."""
         super().__init__(TCPConnection(), endpoint, MAX_PENDING)
         self.wire = _Wire(self, door)
 
@@ -154,7 +154,7 @@ class _Wire(asyncio.BufferedProtocol):
 
 
 class TcpDoor:
-    """Listens, and accepts one peer at a time, because a serial line has one client.
+    """A listener that accepts one peer at a time, because a serial line has one client.
 
     While a peer is connected, further ones are closed immediately and counted in `refused`. A peer that has half-closed
     or disconnected does not block the next one.
@@ -225,7 +225,7 @@ def _tune(sock: socket.socket) -> None:
 
 
 class TtyEnd(ByteConnection):
-    """A serial device of this computer, raw, at the endpoint's baud rate and frame, opened exclusively."""
+    """A serial device of this computer, opened exclusively in raw mode with the endpoint's baud rate and frame."""
 
     def __init__(self, fd: int, endpoint: Endpoint) -> None:
         super().__init__(RS232Connection(), endpoint, MAX_PENDING)

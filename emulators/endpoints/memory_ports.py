@@ -1,7 +1,6 @@
-"""Ports and connector in memory: where simulated field devices listen, and how a gateway connects to them, on one
-virtual loop.
+"""Ports in memory on one virtual loop: simulated field devices listen on them, and a gateway connects to them.
 
-Endpoints are the same as with real ports, and port 0 becomes consecutive numbers, but nothing is opened.
+Endpoints have the same form as those of real ports, and port 0 becomes consecutive numbers, but nothing is opened.
 """
 
 from __future__ import annotations
@@ -146,7 +145,7 @@ def _key(endpoint: Endpoint) -> str:
 
 
 class _SerialPort:
-    """A permanent line: the field device's end stays the same, however often the gateway's end is opened and closed."""
+    """A serial line whose device end stays the same when the gateway's end is closed and opened again."""
 
     def __init__(self, net: MemoryNet, plant: Endpoint, pace: SerialSettings | None) -> None:
         self._net = net
@@ -191,7 +190,7 @@ class _Listener:
 
     @property
     def clients(self) -> tuple[MemoryEnd, ...]:
-        """The connected clients, oldest first."""
+        """Return the connected clients, oldest first."""
         return tuple(client for client in self._clients if client.lost is None)
 
     async def _serve(self, client: MemoryEnd) -> None:

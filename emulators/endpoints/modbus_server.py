@@ -1,4 +1,4 @@
-"""The asynchronous part of the Modbus server: it connects a connection to a pure server and waits between them.
+"""The asynchronous part of the Modbus server: it moves bytes between a connection and a pure server, and waits.
 
 It knows no frame format. It decides when to read, when to write and when to call `on_frame`.
 """
@@ -50,9 +50,9 @@ async def serve_rtu(
 ) -> None:
     """Serve RTU or ASCII frames on `connection` (a serial line, or a socket in its place) until cancelled or lost.
 
-    `latency_s` is the processing time of the device before each reply, as a constant or a function of the exchange.
-    `echo`: the client also hears what it sends, as with a two-wire adapter that receives its own frames. Returns when
-    the connection is lost, without closing it.
+    `latency_s` is the processing time of the device before each reply, as a constant or a function of the exchange. With `echo`
+    the client also receives the bytes that it sends, as with a two-wire adapter that receives its own frames. Returns when the
+    connection is lost, without closing it.
     """
     line = connection if isinstance(connection, PtyEnd | FaultyEnd) else None
     try:
@@ -96,7 +96,7 @@ async def serve_mbap(
 
 
 def _at_once(slave: MbapSlave, data: bytes, clock: Clock) -> tuple[bytes, bool]:
-    """Return the replies to a chunk, and whether the stream cannot be parsed after it."""
+    """Return the replies to a chunk, and whether the rest of the stream cannot be parsed."""
     return slave.answer(data, clock.monotonic_ns()), slave.desync is not None
 
 
@@ -131,7 +131,7 @@ async def serve_udp(
 
 
 async def _read_or_silence(connection: ByteConnection, slave: LineSlave) -> bytes:
-    """Return the next bytes of an unfinished frame, or nothing after a pause that ends it."""
+    """Return the next bytes of an unfinished frame, or b"" after a pause that ends it."""
     try:
         async with asyncio.timeout(slave.gap_ns / NS_PER_S):
             return await connection.read()

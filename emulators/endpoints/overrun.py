@@ -1,4 +1,4 @@
-"""Emulated CAN ends that report to their node that frames came faster than it took them, as a CAN controller does.
+"""Emulated CAN ends that report to their node that received frames were lost, as a CAN controller does.
 
 The report is an error frame; this module does not know how the node reacts.
 """

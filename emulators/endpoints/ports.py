@@ -1,4 +1,4 @@
-"""The places where emulators can be reached: a field simulator gets its serial ports, listeners and buses here.
+"""The provider of serial ports, listeners and buses, at which the emulators of a field simulator can be reached.
 
 `OsPorts` provides those of the operating system; `fieldtwin.emulators.endpoints.memory_ports` provides ones in memory. A device
 cannot tell the difference.
@@ -50,7 +50,7 @@ class CanPort(Listening, Protocol):
 
     @property
     def runner(self) -> BusRunner | None:
-        """The model of the bus; None if it is not served by this process."""
+        """Return the model of the bus; None if it is not served by this process."""
         ...
 
 
@@ -69,7 +69,7 @@ class Ports(Protocol):
 
 
 class OsPorts:
-    """Virtual serial ports, sockets, the software CAN bus as a TCP server, kernel CAN interfaces."""
+    """The operating system's ports: virtual serial ports, sockets, the software CAN bus over TCP, kernel CAN interfaces."""
 
     async def serial(self, link: Path, plant: Endpoint, pace: SerialSettings | None) -> tuple[ByteConnection, Endpoint]:
         """Return a pty with its link in the file system, and the endpoint that names it."""
@@ -127,4 +127,4 @@ class _KernelBus:
         return None
 
     async def aclose(self) -> None:
-        """Do nothing: the kernel's interface stays."""
+        """Do nothing, because the kernel's interface stays."""

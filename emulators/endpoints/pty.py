@@ -1,8 +1,8 @@
 """A virtual serial port: the emulated device holds the pty's master end, the gateway opens a link to its slave end.
 
-It knows no protocol. It emulates what a real port does and a pty does not: the port stays when no program has it open
-(a spare descriptor of the slave end stays open, because reading would fail with EIO otherwise), bytes pass unchanged
-(raw mode), and with `pace` a request and its reply take the time that the line would need. A pty has no parity.
+It knows no protocol. It adds properties of a real port that a pty lacks: the port stays when no program has it open (a spare
+descriptor of the slave end stays open, because reading would fail with EIO otherwise), bytes pass unchanged (raw mode), and with
+`pace` a request and its reply take the time that the line would need. A pty has no parity.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class PtyEnd(ByteConnection):
 
     @property
     def paced(self) -> bool:
-        """Whether bytes take the time of a line."""
+        """Return whether bytes take the time of a line."""
         return self._inward is not None
 
     @classmethod
@@ -96,7 +96,7 @@ class PtyEnd(ByteConnection):
         return end
 
     async def write(self, data: bytes) -> None:
-        """Send `data`, one writer after the other; with pacing, return when the line would have carried it."""
+        """Send `data`, one writer after the other. With pacing, return when the line would have transferred the data."""
         async with self._writing:
             await self._send(data, self._line_is_ours_ns())
 
@@ -185,7 +185,7 @@ class PtyEnd(ByteConnection):
         self._loop.remove_reader(self._master)
 
     def _unsettle(self) -> None:
-        """Keep the port ready for the next program, whatever the last one set."""
+        """Restore the port's settings for the next program after the last one has changed them."""
         _raise_idle_flags(self._spare)
         self._settle_check = self._loop.call_later(SETTLE_CHECK_S, self._unsettle)
 

@@ -1,8 +1,7 @@
 """A TCP port of the software CAN bus that speaks slcan: each client that opens its channel is a node.
 
-For programs that support neither the bus's records nor python-can's interface ``fieldtwin``: slcand through socat,
-python-can's own ``slcan`` interface with ``socket://HOST:PORT``, terminal programs. `slcan_protocol` implements the
-protocol.
+It serves programs that support neither the bus's records nor python-can's interface ``fieldtwin``: slcand through socat,
+python-can's own ``slcan`` interface with ``socket://HOST:PORT``, terminal programs. `slcan_protocol` implements the protocol.
 """
 
 from __future__ import annotations
@@ -57,7 +56,7 @@ class SlcanPort:
 
     @property
     def bound(self) -> tuple[str, int]:
-        """Host and port that are really open."""
+        """Return host and port that are really open."""
         return self._bound
 
     async def aclose(self) -> None:
@@ -157,7 +156,7 @@ class _Client(asyncio.Protocol):
         return bool(self._node) and self._port.runner.submit(self._node, frame)
 
     def _follow(self) -> None:
-        """Join or leave the bus when the session opens or closes."""
+        """Join or leave the bus if the session has been opened or closed."""
         if self._session.is_open and not self._node:
             try:
                 self._node = self._port.runner.join(self, self._name, listen_only=self._session.listen_only)

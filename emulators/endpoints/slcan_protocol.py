@@ -29,7 +29,10 @@ _HEX = frozenset("0123456789abcdefABCDEF")
 
 
 class SlcanSession:
-    """One client's adapter. `feed` bytes, then `step` until it returns None; `received` turns frames into bytes."""
+    """The adapter of one client.
+
+    Call `feed` with bytes, then `step` until it returns None. `received` turns frames into bytes.
+    """
 
     def __init__(self, bitrate: int) -> None:
         self.is_open = False

@@ -53,7 +53,7 @@ class SocketEnd(ByteConnection, asyncio.BufferedProtocol):
         self._answer: Answer | None = None
 
     async def answer_at_once(self, answer: Answer) -> None:
-        """Answer every chunk within the callback that delivers it, until the connection is lost: a request wakes no task.
+        """Answer every chunk within the callback that delivers it, so that a request wakes no task, until the connection is lost.
 
         `answer` returns the bytes to send, possibly none, and whether to close the connection after them. While the
         client does not read its answers, nothing more is read from it. Always ends by raising `ConnectionLost`.
@@ -164,11 +164,10 @@ class SocketEnd(ByteConnection, asyncio.BufferedProtocol):
 
 
 class SocketListener:
-    """Listens on an endpoint and runs `on_client(connection)` for each client; when that returns, the client is closed.
+    """A listener that runs `on_client(connection)` for each client, and then closes the client.
 
-    When `max_clients` are connected, the next one replaces the one that was silent for longest. Clients on `priority`
-    hosts (addresses) are only replaced by each other; if no client may be replaced, the new one is refused (TG
-    4.2.1.1).
+    When `max_clients` are connected, a new client replaces the client that was silent for longest. Clients on `priority` hosts
+    (addresses) are replaced only by each other. If no client may be replaced, the new client is refused (TG 4.2.1.1).
     """
 
     def __init__(
@@ -218,14 +217,14 @@ class SocketListener:
 
     @property
     def bound(self) -> Endpoint:
-        """The endpoint with the port on which the listener really listens."""
+        """Return the endpoint with the port on which the listener really listens."""
         if self._server is None or not self._server.sockets:
             return self._endpoint
         return self._endpoint.with_address(self._endpoint.host, self._server.sockets[0].getsockname()[1])
 
     @property
     def clients(self) -> tuple[SocketEnd, ...]:
-        """The connected clients, oldest first."""
+        """Return the connected clients, oldest first."""
         return tuple(self._clients)
 
     def connected(self, client: SocketEnd) -> None:
@@ -241,7 +240,7 @@ class SocketListener:
         task.add_done_callback(self._ended)
 
     def _make_room(self, client: SocketEnd) -> bool:
-        """Close the client that was silent for longest, among those that this one may replace."""
+        """Close the client that was silent for longest, among those that the new client may replace."""
         yielding = [c for c in self._clients if c.host not in self.priority]
         if not yielding and client.host in self.priority:
             yielding = self._clients
@@ -285,7 +284,7 @@ class SocketListener:
 
 
 def _keep_alive(sock: socket.socket) -> None:
-    """Detect a client that vanished without closing in 25 s, not in two hours (row MB-064)."""
+    """Detect within 25 s, and not after two hours, that a client vanished without closing (row MB-064)."""
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     if hasattr(socket, "TCP_KEEPIDLE"):

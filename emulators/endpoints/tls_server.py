@@ -18,7 +18,7 @@ _UTF8_STRING, _OCTET_STRING, _BOOLEAN = 0x0C, 0x04, 0x01
 def make_context(endpoint: Endpoint) -> ssl.SSLContext:
     """Return the server's TLS context from the endpoint's ``cert``, ``key`` and ``ca`` (PEM files).
 
-    With ``ca`` only clients with a certificate of that authority are accepted, as MBTLS requires; without it, all are.
+    With ``ca`` only clients with a certificate of that authority are accepted, as MBTLS requires; without it, all clients are.
     Raises `UsageError` without ``cert`` and `Unreachable` for files that cannot be used.
     """
     where = str(endpoint)
@@ -42,7 +42,7 @@ def make_context(endpoint: Endpoint) -> ssl.SSLContext:
 def client_role(certificate: bytes | None) -> str:
     """Return the role in a client's certificate (DER); empty if it has none.
 
-    The handshake has verified the certificate, so its bytes are sound: the extension is found by its object identifier.
+    The handshake has verified the certificate, so its bytes are valid. The extension is found by its object identifier.
     """
     identifier = _oid(ROLE_OID)
     place = (certificate or b"").find(identifier)

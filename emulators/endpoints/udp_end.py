@@ -54,7 +54,7 @@ class UdpEnd(asyncio.DatagramProtocol):
 
     @property
     def bound(self) -> Endpoint:
-        """The endpoint with the port on which the socket really listens."""
+        """Return the endpoint with the port on which the socket really listens."""
         if self._transport is None:
             return self.endpoint
         return self.endpoint.with_address(self.endpoint.host, self._transport.get_extra_info("sockname")[1])

@@ -27,7 +27,7 @@ def lrc(frame: bytes) -> int:
 
 
 class AsciiReceiver:
-    """Cuts frames out of the characters of a serial line. Frames are returned in binary, LRC included.
+    """The receiver of frames in the characters of a serial line. It returns frames in binary, LRC included.
 
     `crc_errors` counts damaged frames: the LRC or a character is wrong, a colon or a pause cut the frame off, or it is
     too long. `noise_bytes` counts the characters of damaged frames and all characters outside of frames.
@@ -44,7 +44,7 @@ class AsciiReceiver:
 
     @property
     def pending(self) -> int:
-        """Number of characters of an incomplete frame, at most `MAX_CHARACTERS`."""
+        """Return the number of characters of an incomplete frame, at most `MAX_CHARACTERS`."""
         return len(self._buffer)
 
     def feed(self, data: bytes, now_ns: int) -> list[bytes]:

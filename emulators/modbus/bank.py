@@ -138,15 +138,16 @@ class _Plan(NamedTuple):
 
 
 class _Zeros(dict[int, int]):
-    """Cells that read as 0 if they were never set."""
+    """A mapping of cells, in which a cell that was never set reads as 0."""
 
     def __missing__(self, address: int) -> int:
         return 0
 
 
 class MapBank(RegisterBank):
-    """Plain cells in declared spans, all zero at first. `undeclared` says what cells outside of the spans do; by
-    default they do not exist (exception 02).
+    """Plain cells in declared spans, all zero at first.
+
+    `undeclared` determines the behaviour of cells outside of the spans; by default they do not exist (exception 02).
 
     `on_write(table, address, values, now_ns)` is called for each valid write of the client before any cell changes. A
     `Refusal` raised there is the device's answer, and nothing changes.

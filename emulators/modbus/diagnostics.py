@@ -24,7 +24,7 @@ CLEAR_OVERRUN = 0x14
 class UnitCounters:
     """Counters since the unit was created.
 
-    `bus_*` count frames on the unit's serial line, the others those for this unit.
+    `bus_*` count all frames on the unit's serial line, the other counters those for this unit.
     """
 
     bus_messages: int = 0

@@ -26,11 +26,11 @@ class EventLog:
 
     @property
     def content(self) -> bytes:
-        """The event bytes, the newest first."""
+        """Return the event bytes, the newest first."""
         return bytes(self._events)
 
     def note(self, event: int) -> None:
-        """Put an event at the front; the 65th event removes the oldest."""
+        """Add an event as the newest. If there are more than 64 events, the oldest is removed."""
         self._events.appendleft(event)
 
     def note_received(self, *, listening: bool = False, broadcast: bool = False, damaged: bool = False) -> None:

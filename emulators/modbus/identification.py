@@ -44,8 +44,8 @@ class Identification:
     def respond(self, pdu: bytes, now_ns: int) -> bytes:
         """Return the answer to a 2Bh request.
 
-        Refuses with 01 a different MEI type, with 03 an invalid code or a wrong length, and with 02 an individual
-        object that does not exist. A stream that is requested from an unknown object on begins at object 0 (AP 6.21).
+        A different MEI type is refused with 01, an invalid code or a wrong length with 03, and an individual object that does not
+        exist with 02. A stream that is requested from an unknown object on begins at object 0 (AP 6.21).
         """
         if len(pdu) < 2 or pdu[1] != MEI_TYPE:
             raise IllegalFunction("MEI type", expected="0Eh", got=pdu[1:2].hex())

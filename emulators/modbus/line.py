@@ -45,7 +45,9 @@ class LineCounters:
 
 
 class Receiver(Protocol):
-    """Cuts frames out of what a line delivers; `feed` returns them without delimiters, with their checksum."""
+    """The interface of a receiver, which finds the frames in the bytes of a line.
+
+    `feed` returns the frames without delimiters, with their checksum."""
 
     gap_ns: int
     frames: int
@@ -77,18 +79,18 @@ class LineSlave(ABC):
 
     @property
     def gap_ns(self) -> int:
-        """The pause after which an unfinished frame cannot continue."""
+        """Return the pause after which an unfinished frame cannot continue."""
         return self._receiver.gap_ns
 
     @property
     def pending(self) -> int:
-        """Bytes of an incomplete frame; feed ``b""`` after `gap_ns` of silence to discard them."""
+        """Return the number of bytes of an incomplete frame; feed ``b""`` after `gap_ns` of silence to discard them."""
         return self._receiver.pending
 
     def feed(self, data: bytes, now_ns: int) -> list[bytes]:
         """Return the replies to the frames that are now complete, in order.
 
-        `now_ns`: when `data` came; it never goes back.
+        `now_ns` is the time at which `data` arrived; it never goes back.
         """
         return [exchange.reply for exchange in self.receive(data, now_ns) if exchange.reply]
 
@@ -107,7 +109,7 @@ class LineSlave(ABC):
         """Return `frame` (unit ID and PDU) as it is sent on the line."""
 
     def as_heard(self, frame: bytes) -> bytes:
-        """Return a received frame as it was on the line."""
+        """Return a received frame in its form on the line."""
         return frame
 
     def _exchange(self, frame: bytes, now_ns: int) -> ServedFrame:

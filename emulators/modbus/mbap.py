@@ -30,9 +30,9 @@ Allow = Callable[[int, bytes], bool]
 class MbapSlave:
     """The units behind one connection. `units` maps a unit ID to its unit.
 
-    A single unit is also reached with the IDs 0 and 255, and echoes them; with `any_unit` it is reached with every ID,
-    like devices that ignore it. A request for an unknown unit ID is answered with exception 0A, as a gateway without a
-    route does. At most `max_in_flight` of the requests that arrive together are executed; the others get exception 06.
+    A single unit also answers requests with the IDs 0 and 255, and echoes them; with `any_unit` it answers every ID, like devices
+    that ignore the ID. A request for an unknown unit ID gets exception 0A, as from a gateway without a route. At most
+    `max_in_flight` of the requests that arrive together are executed; the others get exception 06.
 
     A request that `allow` refuses is not executed and gets exception 01 (MODBUS/TCP Security, 8.3); without `allow` all
     requests are permitted.
@@ -69,7 +69,7 @@ class MbapSlave:
 
     @property
     def pending(self) -> int:
-        """Bytes of an incomplete ADU."""
+        """Return the number of bytes of an incomplete ADU."""
         return len(self._buffer)
 
     def feed(self, data: bytes, now_ns: int) -> list[bytes]:

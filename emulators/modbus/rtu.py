@@ -15,8 +15,9 @@ __all__ = ["LineCounters", "RtuSlave", "ServedFrame"]
 
 
 class RtuSlave(LineSlave):
-    """The units of one RTU line. `units` maps a unit ID (1 to 247) to its unit; after a pause of `gap_ns` no frame
-    continues.
+    """The units of one RTU line.
+
+    `units` maps a unit ID (1 to 247) to its unit. A pause of `gap_ns` ends an unfinished frame.
 
     By default frames are recognised by length and checksum, which tolerates irregular timing. `strict` gives the
     settings of the line; frames are then recognised by the pauses of SL 2.5.1.1 alone, which requires that bytes are

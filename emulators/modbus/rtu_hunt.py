@@ -56,7 +56,7 @@ class Hunt:
 
     @property
     def has_dropped(self) -> bool:
-        """Whether bytes of this search have already been removed from the buffer."""
+        """Return whether bytes of this search have already been removed from the buffer."""
         return self._base > 0
 
     def search(self, buffer: bytearray) -> tuple[int, int] | None:
@@ -77,7 +77,7 @@ class Hunt:
                 return start - self._base, end - self._base
 
     def _candidate(self, buffer: bytearray, horizon: int) -> int | None:
-        """Return the next position to try, skipping bytes that cannot begin a frame of the kind that is searched for."""
+        """Return the next position to try. Bytes that cannot begin a possible frame are skipped."""
         place = self._next
         if place < LOST_AFTER:
             self._next += 1
@@ -121,7 +121,7 @@ class Hunt:
         return shape.length == len(frame) and crc16(frame) == 0
 
     def _advance(self, buffer: bytearray, horizon: int) -> tuple[int, int] | None:
-        """Advance the searches by CRC alone up to `horizon`. If several end there, return the one that ends first."""
+        """Advance the searches that use only the CRC up to `horizon`. Return the frame that ends first, if any."""
         best: tuple[int, int] | None = None
         kept = []
         for search in self._searches:

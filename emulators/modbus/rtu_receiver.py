@@ -1,12 +1,12 @@
-"""Where RTU frames begin and end in what a line delivers, as heard by a server on a shared line.
+"""Find the begin and the end of RTU frames in the bytes of a line, as a server on a shared line receives them.
 
 Frames are recognised by their length and checksum, never by silence alone: USB adapters, ptys and sockets do not
 preserve the pauses of the line (SL 2.5.1.1 describes what a UART sees). A long pause only decides that an unfinished
 frame stays unfinished. Pure: it takes bytes and ``now`` and returns complete frames. It does not know units or replies.
 
-The line also carries requests to and responses from other units, which are distinguished only by trying both lengths.
-The first byte of the buffer is assumed to begin a frame and may hold back later bytes until that frame is complete. If
-it proves to be noise, every following byte is tried (`rtu_hunt`) and only a correct checksum counts.
+The line also carries requests to and responses from other units. To distinguish them, the receiver tries both lengths. It assumes
+that the first byte of the buffer begins a frame, so later bytes may wait until that frame is complete. If the first byte proves
+to be noise, the receiver tries every following byte (`rtu_hunt`), and only a correct checksum counts.
 """
 
 from __future__ import annotations
@@ -38,8 +38,10 @@ _NOISE, _WAIT = 0, -1
 
 
 class RtuReceiver:
-    """Cuts frames out of the bytes of a line. `own` are the unit IDs served here, whose own frames are never heard
-    here; `declared` gives the request lengths of their device-specific functions.
+    """The receiver of frames in the bytes of a line.
+
+    `own` are the unit IDs served here; the line does not return their responses. `declared` gives the request lengths of their
+    device-specific functions.
 
     `crc_errors` counts runs of at least `MIN_FRAME` bytes that belong to no frame, `noise_bytes` every such byte. Both
     are updated when the next frame is found or the line has paused for `gap_ns`; feed ``b""`` to report a pause.
@@ -59,7 +61,7 @@ class RtuReceiver:
 
     @property
     def pending(self) -> int:
-        """Bytes that wait for more, at most `MAX_FRAME`."""
+        """Return the number of bytes that wait for more, at most `MAX_FRAME`."""
         return len(self._buffer)
 
     def feed(self, data: bytes, now_ns: int) -> list[bytes]:
@@ -97,8 +99,7 @@ class RtuReceiver:
         return FIXED_REQUESTS.get(data[1]) == len(data) and is_whole(data)
 
     def _is_a_whole_request_of_a_wrong_length(self) -> bool:
-        """Return whether the bytes between two pauses are one request to our units whose length differs from what its
-        head implies.
+        """Return whether the bytes between two pauses are one request to our units of a length that its head does not imply.
 
         The pauses and the checksum show that it is a complete frame (SL 2.5.1.1). It is therefore refused with
         exception 03 (AP 7: the implied length is incorrect) and not treated as noise.

@@ -64,7 +64,7 @@ def is_whole(frame: bytes) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """The length of a frame, derived from its head. `plausible`: the head makes sense, so waiting for the rest does too.
+    """The length of a frame, derived from its head. If the head is `plausible`, the receiver waits for the rest.
 
     While the head itself is incomplete, `length` is the minimum length, which is more than the bytes received so far.
     """
@@ -89,7 +89,7 @@ _IDENTIFICATION = 0x0E
 
 
 def request_shape(head: bytes | bytearray) -> Shape | None:
-    """Return the shape of a request that begins with `head` (at least unit ID and function); None: only the CRC can tell."""
+    """Return the shape of a request that begins with `head` (unit ID, function, ...); None if only the CRC shows its end."""
     function = head[1]
     if function in FIXED_REQUESTS:
         return Shape(FIXED_REQUESTS[function])
@@ -114,8 +114,8 @@ def request_shape(head: bytes | bytearray) -> Shape | None:
 class Declared:
     """Request lengths that the units of a line declare: unit ID -> function code -> bytes of the request PDU.
 
-    By its checksum alone, one frame in 256 is cut wrongly: a frame whose last byte is 00 looks like a shorter frame
-    followed by a 00. Function 78h of the Renogy Rover is an example.
+    If only the checksum determined the end of a frame, one frame in 256 would be cut wrongly: a frame whose last byte is 00 looks
+    like a shorter frame with a 00 after it. Function 78h of the Renogy Rover is an example.
     """
 
     def __init__(self, lengths: Mapping[int, Mapping[int, int]] | None = None) -> None:
@@ -131,7 +131,7 @@ class Declared:
 
 
 def response_shape(head: bytes | bytearray) -> Shape | None:
-    """Return the shape of a response that begins with `head`; None: only the CRC can tell."""
+    """Return the shape of a response that begins with `head`; None if only the CRC shows its end."""
     function = head[1]
     if function >= 0x80:
         return Shape(5)

@@ -13,10 +13,10 @@ from fieldtwin.gateway.core.endpoint import SerialSettings
 
 
 class StrictReceiver:
-    """Cuts frames at pauses. `gap_ns` is t3.5; the counters are those of `RtuReceiver`.
+    """A receiver that ends frames at pauses. `gap_ns` is t3.5; the counters are those of `RtuReceiver`.
 
-    A chunk is taken as characters without gaps, the last of which was complete at its `now_ns`. A frame is returned
-    once the pause after it is known: with the next byte, or with ``b""``.
+    A chunk counts as characters without gaps, the last of which was complete at its `now_ns`. A frame is returned when the pause
+    after it is known: with the next byte, or with ``b""``.
     """
 
     def __init__(self, settings: SerialSettings) -> None:
@@ -32,7 +32,10 @@ class StrictReceiver:
 
     @property
     def pending(self) -> int:
-        """Bytes of a frame that no pause has ended yet. Bytes beyond the longest frame are counted and not kept."""
+        """Return the number of bytes of a frame that no pause has ended yet.
+
+        Bytes beyond the longest frame are counted and not kept.
+        """
         return self._length
 
     def feed(self, data: bytes, now_ns: int) -> list[bytes]:

@@ -142,24 +142,23 @@ class ModbusUnit:
         self._busy_until_ns = until_ns
 
     def be_busy_behind(self, every: int, for_ns: int) -> None:
-        """After every `every` requests that were not refused as busy, be busy for `for_ns` nanoseconds; 0 means never."""
+        """Be busy for `for_ns` nanoseconds after every `every` requests that were not refused as busy. If `every` is 0, never."""
         self._busy_every, self._busy_for_ns = every, for_ns
 
     def respond(self, pdu: bytes, now_ns: int) -> bytes | None:
         """Execute a request to this unit and return its response, exception responses included.
 
-        Returns None for no answer: in listen-only mode, for the request that starts or ends it, for an empty PDU, and
-        for function codes from 80h. Those are exception responses by AP 4.1, and answering an answer could go on
-        without end.
+        Return None if there is no answer: in listen-only mode, to the request that starts or ends it, to an empty PDU, and to
+        function codes from 80h on. By AP 4.1 those are exception responses, and answering an answer could continue endlessly.
         """
         return self._counted(pdu, now_ns, busy=False)
 
     def refuse_busy(self, pdu: bytes) -> bytes | None:
-        """Do the same as `respond` for a request above the limit of requests in progress: exception 06, nothing executed."""
+        """Answer exception 06 to a request above the limit of requests in progress; execute nothing."""
         return self._counted(pdu, 0, busy=True)
 
     def refuse_function(self, pdu: bytes) -> bytes | None:
-        """Do the same as `respond` for a request that the sender may not make: exception 01, nothing executed."""
+        """Answer exception 01 to a request that the sender may not make; execute nothing."""
         self.counters.requests += 1
         if not pdu or pdu[0] >= 0x80 or self.diagnostics.listen_only:
             self.counters.unanswered += 1

@@ -1,6 +1,6 @@
-"""Joins two CAN buses with faults between them: third-party controllers on the near bus, third-party nodes on the far bus.
+"""Join two CAN buses with faults between them: third-party controllers on the near bus, third-party nodes on the far bus.
 
-A frame from the near side is a request and a frame from the far side a reply; the predefined connection set (CiA 301,
+A frame from the near bus counts as a request and a frame from the far bus as a reply; the predefined connection set (CiA 301,
 7.3.3) gives the node from the identifier. Frames keep their order, except those that a fault delays. Frames are not
 interpreted.
 """
@@ -27,9 +27,9 @@ NMT, NO_NODE = 0x000, 0
 
 
 class CanLink:
-    """Runs from `start` to `aclose`, or until one of the two buses is lost: `ended` then holds the reason.
+    """A running link, from `start` to `aclose` or until one of the buses is lost; `ended` then holds the reason.
 
-    Closes both ends.
+    It closes both ends.
     """
 
     def __init__(self, near: CanConnection, far: CanConnection, faults: WireFaults) -> None:
@@ -91,7 +91,7 @@ class CanLink:
             self.passed[way] += 1
 
     def _appear(self, active: Active) -> None:
-        """Schedule the frames that only the fault sends, on behalf of the node that it aims at."""
+        """Schedule the frames that the fault itself sends, on behalf of the node that it aims at."""
         if not isinstance(active.fault, CanFault) or active.aim.unit is None:
             return
         wait_s = max(0.0, (active.from_ns - self._now_ns()) / NS_PER_S)
@@ -124,7 +124,7 @@ class CanLink:
 
 
 def node_of(frame: CanFrame) -> int:
-    """Return the node that a frame comes from or goes to (CiA 301, 7.3.3); `NO_NODE` for SYNC, time stamps and broadcasts."""
+    """Return the node that sends or receives a frame (CiA 301, 7.3.3); `NO_NODE` for SYNC, time stamps and broadcasts."""
     if frame.extended:
         return NO_NODE
     if frame.can_id == NMT:

@@ -17,7 +17,7 @@ OLDER = "older clients"
 
 @dataclass(slots=True)
 class Counts:
-    """Requests that reached a device, and the replies to them. `open`: the client is connected, so its counts are kept."""
+    """Requests that reached a device, and their replies. While the client is connected (`open`), its counts are kept."""
 
     requests: int = 0
     replies: int = 0
@@ -60,7 +60,7 @@ class ClientCounts:
 
 
 class CountDifference:
-    """Assigns the growth of `totals` since the last call to a client: for a line with one client at a time.
+    """The assignment of traffic to clients on a line that has one client at a time: it assigns the growth of `totals`.
 
     `totals` returns the requests and replies of all devices on the line so far.
     """

@@ -1,4 +1,4 @@
-"""Determines which command of its profile a Modbus request is, from what it reads or writes.
+"""Determine the profile's command for a Modbus request, from the registers that the request reads or writes.
 
 The names are those of the command list (SPEC ruling 12). Pure; like all emulator code, it has its own decoder.
 """
@@ -26,7 +26,7 @@ class CommandNames:
             self._writes += [(profile.inbox.ack, "acknowledge"), (profile.outbox.at, "send")]
 
     def of(self, pdu: bytes) -> str:
-        """Return the name of the command; that with the lowest address if there are several, empty if there is none."""
+        """Return the name of the command. If there are several, return the one with the lowest address; if there is none, ""."""
         request = parse_request(pdu)
         if request is None:
             return ""

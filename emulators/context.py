@@ -21,7 +21,7 @@ MAX_ENTRIES = 500_000
 
 
 class EndOfRecording(Enum):
-    """The behaviour of an emulator at the end of its recording (SPEC ruling 3); named in the prototype file."""
+    """The behaviour of an emulator at the end of its recording (SPEC ruling 3), which the prototype file selects."""
 
     HOLD = "hold"
     LOOP = "loop"
@@ -38,13 +38,13 @@ class EndOfRecording(Enum):
 
 
 class UsedUp(FileInvalid):
-    """The recording has nothing left, and the prototype file says that this is an error."""
+    """The recording has no more entries, and the prototype file says that this is an error."""
 
 
 class Recorded(msgspec.Struct, frozen=True):
     """A recorded response, the time of recording (seconds since the recording's start) and its latency.
 
-    A struct and not a dataclass, because in long recordings the objects are created on access.
+    It is a struct, because it is created at each access to a long recording, and a dataclass takes longer.
     """
 
     t_s: float
@@ -59,9 +59,9 @@ head of a list would take as many steps as there are recordings after it.
 
 
 class _Series:
-    """The recordings of one command, how many were taken, and the last one taken. The list may be shared.
+    """The recordings of one command, the number of those taken, and the last one taken. The list may be shared.
 
-    `whole`: the series was added complete, and nothing is added to it or dropped from it.
+    `whole` says that the series was added as a whole, so nothing is added to it or dropped from it.
     """
 
     __slots__ = ("at", "last", "recorded", "shared", "skip", "when_used_up", "whole")
@@ -93,13 +93,13 @@ class _Series:
 
 
 def _own(series: _Series) -> list[Recorded]:
-    """Return the list of a series that is not shared."""
+    """Return the list of a series, copied if it was shared."""
     assert isinstance(series.recorded, list)
     return series.recorded
 
 
 class VirtualContext:
-    """Recordings by command. `taken` counts the removed (returned) recordings, `dropped` those for which there was no room.
+    """The recordings by command. `taken` counts the recordings that were returned, `dropped` those for which there was no room.
 
     With `commands`, that list is fixed and `take` accepts exactly its items, with or without recordings. Without it,
     the list is derived from the added recordings (ruling 12). A full context drops its oldest entry.
@@ -149,7 +149,7 @@ class VirtualContext:
 
     @property
     def command_list(self) -> tuple[COMMAND, ...]:
-        """The commands that `take` accepts, in the order in which they were added."""
+        """Return the commands that `take` accepts, in the order in which they were added."""
         return tuple(COMMAND(data) for data in (self._series if self._origin is None else self._origin))
 
     def left(self, command: COMMAND) -> int:
@@ -213,8 +213,8 @@ class VirtualContext:
     def take(self, command: COMMAND) -> RECORDING:
         """Return and remove a recording of the context; the command must be in the list (SPEC).
 
-        At the end, `HOLD` returns the last one again, `LOOP` starts over, and `ERROR` raises `UsedUp`, as do the others
-        if nothing was ever recorded. Raises `UnknownCommand`.
+        At the end, `HOLD` returns the last recording again, `LOOP` starts over, and `ERROR` raises `UsedUp`. If nothing was ever
+        recorded, all of them raise `UsedUp`. Raises `UnknownCommand` if the command is not in the list.
         """
         return self.take_recorded(command).response
 

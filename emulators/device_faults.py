@@ -1,6 +1,6 @@
 """The faults of one emulated device outside of a system: `fieldtwin emulate DEVICE --faults FILE`.
 
-Here an aim may not name buses or devices; it may name a register if the device has a profile. Value faults need a
+The aim of such a fault may not name buses or devices; it may name a register if the device has a profile. Value faults need a
 device whose registers are created from its profile.
 """
 
@@ -22,10 +22,7 @@ from fieldtwin.gateway.core.files.profile import DeviceProfile, Tag
 
 
 class DeviceFaults:
-    """The faults as given in the file, checked by `check_device`.
-
-    They begin at `start_ns`, the loop's time in nanoseconds.
-    """
+    """The faults of a file, which `check_device` has checked. Their times count from `start_ns`, in the loop's time."""
 
     def __init__(
         self, said: Iterable[Mapping[str, Any]], profile: DeviceProfile | None, seed: int, start_ns: int
@@ -46,7 +43,7 @@ class DeviceFaults:
         return faults
 
     def on_values(self, distortions: Distortions) -> None:
-        """Put the value faults into a device."""
+        """Inject the value faults into a device."""
         for spec in self._specs:
             if spec.kind.kind is Kind.VALUE:
                 active = self._active(spec)
@@ -75,7 +72,7 @@ class DeviceFaults:
 
 
 def check_device(spec: FaultSpec, profile: DeviceProfile | None, *, values: bool) -> None:
-    """Raise `WrongAim` for a fault that a single device cannot have. `values`: whether its values can be changed."""
+    """Raise `WrongAim` for a fault that a single device cannot have. `values` says whether its values can be changed."""
     aim, kind = spec.aim, spec.kind.kind
     for key, name in (("device", aim.device), ("bus", aim.bus)):
         if name:
@@ -109,7 +106,7 @@ def _tag(aim: Aim, profile: DeviceProfile | None) -> Tag | None:
 
 
 def _place(aim: Aim, profile: DeviceProfile | None) -> tuple[range | None, frozenset[int]]:
-    """Return the addresses that are aimed at, None for all, and the functions of their table."""
+    """Return the addresses at which the fault aims (None for all), and the functions of their table."""
     tag = _tag(aim, profile)
     if tag is not None:
         at = tag.registers

@@ -31,10 +31,9 @@ class DistortedRegisters(RegisterBank):
         tags: Iterable[Tag] | None = None,
         distortions: Distortions | None = None,
     ) -> None:
-        """`tags`: the tags that are distorted here, and then only by faults that name them; by default all tags, by all
-        faults.
+        """Create the bank. If `tags` is given, only these tags are distorted, and only by faults that name them.
 
-        `distortions` may be shared with the object that distorts the other tags.
+        By default all faults distort all tags. `distortions` may be shared with the object that distorts the other tags.
         """
         self._named = tags is not None
         self.distortions = Distortions() if distortions is None else distortions
@@ -75,7 +74,7 @@ class DistortedRegisters(RegisterBank):
         self.bank.write(table, address, values, now_ns)
 
     def _cells(self, tag: Tag, own: list[int], now_ns: int) -> list[int]:
-        """Return the distorted cells of the tag in place of its `own`."""
+        """Return the distorted cells of the tag that replace its `own` cells."""
         by = self._scales.get(tag.name)
         exponent = 0 if by is None else int(raw_of(by, [self._peek(by.registers.table, by.registers.address)]))
         raw = raw_of(tag, own) * tag.scale * 10.0**exponent + tag.offset

@@ -1,4 +1,4 @@
-"""The values that a device holds instead of those of its recording or model: value faults, and values that a user sets."""
+"""Values that replace those of a device's recording or model: value faults, and values that a user sets."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Distortions:
         return bool(self._puts)
 
     def put_in(self, active: Active, tag: str) -> None:
-        """Distort `tag` from now on; ``""``: every tag."""
+        """Distort `tag` from now on, or every tag if it is ``""``."""
         assert isinstance(active.fault, ValueFault)
         self._puts[active.id] = _Put(active, active.fault, tag)
 
@@ -39,14 +39,14 @@ class Distortions:
         return self._puts.pop(id, None) is not None
 
     def of(self, tag: str, *, named: bool = False) -> bool:
-        """Return whether a fault may distort `tag`; with `named` only faults aimed at this tag, not at all tags."""
+        """Return whether a fault may distort `tag`. With `named`, only faults that name this tag count."""
         return any(
             (put.tag == tag or (put.tag == "" and not named)) and put.fault.on(tag) is not None
             for put in self._puts.values()
         )
 
     def apply(self, tag: str, value: float, now_ns: int, *, named: bool = False) -> float:
-        """Return the number that the device holds instead of `value`, in engineering units. `named` as in `of`."""
+        """Return the number that the device holds instead of `value`, in engineering units. `of` describes `named`."""
         for put in self._puts.values():
             if (put.tag != tag and (put.tag != "" or named)) or not in_time(put.active, now_ns):
                 continue
@@ -60,7 +60,10 @@ class Distortions:
         return value
 
     def gave(self, tag: str, now_ns: int, *, named: bool = False) -> None:
-        """Count a strike of each fault that distorts `tag`, because the device has sent the value. `named` as in `of`."""
+        """Count that each fault that distorts `tag` took effect, because the device has sent the value.
+
+        `of` describes `named`.
+        """
         for put in self._puts.values():
             aimed = put.tag == tag or (put.tag == "" and not named)
             if aimed and in_time(put.active, now_ns) and put.fault.on(tag) is not None:

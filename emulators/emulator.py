@@ -1,10 +1,9 @@
 """The paper's emulators: devices that answer from their virtual context instead of the physical environment.
 
-An emulator is a Device and not a Sensor: the real device is a black box of which only the communication is known. This
-module is the device that the paper describes, between the frames of a line (fieldtwin.emulators.modbus.rtu, mbap) and
-the processing of a request by a unit (fieldtwin.emulators.modbus.unit, fieldtwin.emulators.replay). It reads a command
-from its own end of a connection, requires it to be in its list, answers from its context and sends the response. It
-never knows its driver.
+An emulator is a Device and not a Sensor, because the real device is a black box of which only the communication is known. This
+module lies between the frames of a line (fieldtwin.emulators.modbus.rtu, mbap) and the processing of a request by a unit
+(fieldtwin.emulators.modbus.unit, fieldtwin.emulators.replay). An emulator reads a command from its own end of a connection,
+checks that its command list contains it, answers from its context and sends the response. It never knows its driver.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
-"""The values that an emulated device really held: every raw value of every tag, in order. The reference of a prototype run.
+"""The values that an emulated device held: every raw value of every tag, in order.
 
-Every value that the gateway published as good must occur here (bytes as the device would send them). Bounded: the
-oldest entries are dropped and counted, so a checker must fetch entries often enough.
+A prototype run is checked against this journal: it must contain every value that the gateway published as good (bytes as the
+device would send them). The journal is bounded: the oldest entries are dropped and counted, so a checker must fetch entries often
+enough.
 """
 
 from __future__ import annotations
@@ -42,14 +43,14 @@ class DeviceValueLog:
         """Number of the latest entry; numbering starts at 1."""
 
     def keep(self, capacity: int) -> None:
-        """Keep at most `capacity` entries from now on; the newest stay."""
+        """Keep at most `capacity` entries from now on. The oldest entries are dropped."""
         self._tags = deque(self._tags, capacity)
         self._raws = deque(self._raws, capacity)
         self._times = deque(self._times, capacity)
 
     @property
     def dropped(self) -> int:
-        """Number of entries that were dropped."""
+        """Return the number of entries that were dropped."""
         return self.number - len(self._tags)
 
     def note(self, tag: str, raw: bytes, now_ns: int) -> None:
@@ -74,7 +75,7 @@ class DeviceValueLog:
             changed(self._last[tag], 0)
 
     def since(self, number: int) -> list[DeviceValue]:
-        """Return the entries after entry `number`, as far as they are kept."""
+        """Return the entries after entry `number` that are still kept."""
         count = min(self.number - number, len(self._tags))
         numbers = range(self.number, self.number - count, -1)
         newest = zip(numbers, reversed(self._tags), reversed(self._raws), reversed(self._times), strict=False)
@@ -82,5 +83,5 @@ class DeviceValueLog:
 
 
 def share_of(devices: int) -> int:
-    """Return how many entries each of `devices` devices in a process keeps."""
+    """Return how many entries each device may keep if a process has `devices` devices."""
     return min(CAPACITY, max(LEAST, SHARED // max(1, devices)))

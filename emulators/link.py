@@ -47,7 +47,7 @@ class LinkOptions:
 
 
 class EmulatedConnection(TCPConnection):
-    """SPEC row EmulatedConnection: a Connection that is always of type TCP and knows the original protocol.
+    """SPEC row EmulatedConnection: a Connection that is always of type TCP and also stores the original PROTOCOL.
 
     `emulate_write` and `emulate_read` are the identity: they return the bytes unchanged, and count them.
     """
@@ -279,7 +279,7 @@ class Link:
 
     @contextlib.asynccontextmanager
     async def _line_cut(self) -> AsyncIterator[None]:
-        """While there is no carrier, drop and count the bytes from a serial side."""
+        """Drop and count the bytes from a serial side while there is no carrier."""
         tasks = []
         for plug in (self._near, self._far):
             if plug.stays and plug.open_now is not None:

@@ -1,7 +1,7 @@
-"""A device known from a recording of exchanges, with data from its profile: counters, identity, device-specific functions.
+"""A device emulated from a recording of exchanges, with data from its profile: counters, identity, device-specific functions.
 
-Like every emulator, it uses the device's own connection, and it journals what it held: every value that it returned to
-a read. It never knows its driver, or the medium of its connection.
+Like every emulator, it uses the device's own connection and keeps a journal, here of every value that it returned to a read. It
+never knows its driver, or the medium of its connection.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def load_replay(
 ) -> tuple[ExchangeReplay, int]:
     """Return a recording of exchanges with a device of `profile`, and its unit ID in the recording.
 
-    That is the factory's unit ID if it was recorded, else the lowest. Raises `FileInvalid`.
+    The unit ID is the factory's if it was recorded, else the lowest one. Raises `FileInvalid`.
     """
     with RecordingReader(path) as reader:
         exchanges = list(reader.exchanges())
@@ -54,8 +54,8 @@ def load_replay(
 class RecordedDevice(ProfiledReplay):
     """One unit of an emulated line. `kind` is the connection type of the emulated device.
 
-    `identity` gives tags different values from the recorded ones. A request that is not in the profile's command list
-    is answered all the same, and counted in `unlisted`.
+    `identity` gives tags other values than the recorded ones. A request that is not in the profile's command list is also
+    answered, and counted in `unlisted`.
     """
 
     def __init__(
@@ -124,7 +124,7 @@ class RecordedDevice(ProfiledReplay):
 
 
 def _raw(tag: Tag, offset: int, data: bytes) -> bytes:
-    """Return a tag's own bytes from the data of a reply; a bit is one byte."""
+    """Return the bytes of a tag from the data of a reply; a bit is one byte."""
     if tag.registers.table in ("coil", "discrete"):
         return bytes([data[offset // 8] >> offset % 8 & 1])
     return data[2 * offset : 2 * (offset + tag.registers.count)]

@@ -1,4 +1,4 @@
-"""Time-keyed signals: a recorded cast or trajectory, read at the emulator's clock.
+"""Signals over time, such as a recorded cast or trajectory, read at the time of the emulator's clock.
 
 A `SignalTrack` is the recording in memory (arrays of doubles: 65,158 rows of three signals take 2 MB); a `SignalPlayer`
 plays it from a start time, at a speed, and handles its end. Both are pure: the caller passes the time, and neither
@@ -24,9 +24,9 @@ MAX_NUMBERS = 16_000_000
 
 
 class SignalTrack:
-    """Signals over time, linear between rows. Seconds count from the recording's start.
+    """Signals over time, interpolated linearly between rows. Seconds count from the recording's start.
 
-    NaN is "no value", which also applies between a row and a NaN. Two rows with the same time are a step.
+    NaN means "no value"; between a row and a NaN there is no value either. Two rows with the same time form a step.
     """
 
     def __init__(self, names: Iterable[str], rows: Iterable[SignalRow], *, units: Iterable[str] = (), path: str = ""):
@@ -65,17 +65,17 @@ class SignalTrack:
 
     @property
     def nbytes(self) -> int:
-        """Memory that the numbers take, in bytes."""
+        """Return the memory that the numbers take, in bytes."""
         return sum(numbers.buffer_info()[1] * numbers.itemsize for numbers in (self._times, *self._columns))
 
     def at(self, t_s: float, name: str) -> float:
-        """Return the signal `name` at `t_s`; before the first row that row's value, after the last one that one's."""
+        """Return the signal `name` at `t_s`. Before the first row it has the first value, after the last row the last value."""
         return self._interpolate(self._columns[self._column(name)], *self._locate(t_s))
 
     def nearest_s(self, values: Mapping[str, float]) -> float | None:
-        """Return the time of the row nearest to `values`, each distance relative to the range of its signal.
+        """Return the time of the row nearest to `values`, or None if none of them is a signal of this track.
 
-        Returns None if none of them is a signal of this track. Of equally near rows the earliest is used.
+        Each distance is relative to the range of its signal. Of equally near rows the earliest is used.
         """
         distances = array("d", bytes(8 * len(self._times)))
         known = False
@@ -127,10 +127,7 @@ class SignalTrack:
 
 
 class Signals(Protocol):
-    """The signals that a device plays: values by name that follow from the emulator's time.
-
-    A recording, or a simulation.
-    """
+    """The signals of a device: values by name as a function of the emulator's time, from a recording or a simulation."""
 
     names: tuple[str, ...]
     path: str
@@ -153,10 +150,7 @@ class Signals(Protocol):
         ...
 
     def begin_with(self, values: Mapping[str, float], now_ns: int) -> bool:
-        """Set the signals now as near to `values` as possible, and continue from there.
-
-        Return False if that is not possible.
-        """
+        """Continue from the state that is nearest to `values`. Return False if this is not possible."""
         ...
 
     def at(self, now_ns: int, name: str) -> float:
@@ -167,8 +161,8 @@ class Signals(Protocol):
 class SignalPlayer(Signals):
     """A track played from `start_ns` on, `speed` times as fast as recorded. Reading never changes it.
 
-    After the last row: `HOLD` stays on it; `LOOP` continues with the first row, the two being the same instant (a
-    recording made for looping ends with its first values); `ERROR` raises `UsedUp`.
+    After the last row, `HOLD` keeps its values, and `ERROR` raises `UsedUp`. `LOOP` continues with the first row, which counts as
+    the same instant as the last row (a recording for looping ends with its first values).
     """
 
     def __init__(

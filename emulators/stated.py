@@ -1,5 +1,7 @@
-"""The data that a profile states about an emulated device: the cells and the encoding of values in them, the effects of
-reads and writes, and the answers of functions without registers.
+"""The data that a profile states about an emulated device.
+
+These are the cells and the encoding of values in them, the effects of reads and writes, and the answers of functions without
+registers.
 
 Pure; like all emulator code, it has its own encoder. It knows neither banks nor recordings.
 """
@@ -40,7 +42,7 @@ def cells_of(tag: Tag, value: float | str, exponent: int = 0) -> list[int]:
 
 
 def fits(tag: Tag, value: float | str, exponent: int = 0) -> bool:
-    """Return whether the cells of `tag` can hold an engineering value to the nearest step, without truncation or limiting."""
+    """Return whether the cells of `tag` can hold an engineering value, apart from rounding to the nearest step."""
     if isinstance(value, str):
         return len(value.encode("ascii", "replace")) <= 2 * tag.registers.count
     raw = (value - tag.offset) / (tag.scale * 10.0**exponent)
@@ -90,7 +92,7 @@ def bytes_of(tag: Tag, cells: Sequence[int]) -> bytes:
 
 
 def spans_of(profile: DeviceProfile) -> list[Span]:
-    """Return the cells that exist: those of the tags, each once. A cell of several tags has the access of all of them."""
+    """Return the cells of all tags, each once. A cell that belongs to several tags has the access rights of all of them."""
     read: dict[tuple[Table, int], bool] = {}
     written: dict[tuple[Table, int], bool] = {}
     for tag in profile.tags.values():

@@ -41,7 +41,7 @@ class Framing(Enum):
 
     @property
     def streams(self) -> bool:
-        """Whether frames are part of a TCP stream with arbitrary segments, and carry their own length."""
+        """Return whether frames are part of a TCP stream with arbitrary segments, and carry their own length."""
         return self in (Framing.THREAD, Framing.MQTT)
 
 
@@ -70,7 +70,7 @@ class Frame:
 
     @property
     def spared(self) -> bool:
-        """Whether no fault may strike the frame."""
+        """Return whether no fault may strike the frame."""
         return (
             self.framing is Framing.MQTT
             and self.data != b""
@@ -79,7 +79,7 @@ class Frame:
 
     @property
     def function(self) -> int:
-        """The function code without the exception bit."""
+        """Return the function code without the exception bit."""
         return self.pdu[0] & 0x7F if self.pdu else -1
 
 

@@ -35,7 +35,7 @@ class DriveState(Enum):
 
     @property
     def powered(self) -> bool:
-        """Whether the drive function is on: the motor follows set-points or a ramp."""
+        """Return whether the drive function is on: the motor follows set-points or a ramp."""
         return self in (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP, DriveState.FAULT_REACTION)
 
 

@@ -24,7 +24,7 @@ class Motion:
 
     @property
     def duration_s(self) -> float:
-        """The total duration of the ramps in seconds."""
+        """Return the total duration of the ramps in seconds."""
         return sum(duration for duration, _ in self.ramps)
 
     def at(self, t_s: float) -> tuple[float, float]:

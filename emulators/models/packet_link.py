@@ -125,5 +125,5 @@ class PacketLink:
 
     @property
     def waiting(self) -> bool:
-        """True while a packet is under way, or has arrived and not been taken."""
+        """Return whether a packet is under way, or has arrived and not been taken."""
         return bool(self._under_way)

@@ -54,7 +54,7 @@ class PlayedObjects:
 
     @property
     def names(self) -> dict[Key, str]:
-        """The tag of each object that is played."""
+        """Return the tag of each object that is played."""
         return {key: name for name, key, *_ in self._objects}
 
     def __call__(self, now_ns: int) -> dict[Key, bytes]:

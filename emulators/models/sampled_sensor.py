@@ -70,7 +70,7 @@ class SampledSensor(RegisterBank):
 
     @property
     def period_s(self) -> int:
-        """The sampling period as last written."""
+        """Return the sampling period as last written."""
         return self._period_s
 
     def read(self, table: Table, address: int, count: int, now_ns: int) -> Sequence[int]:
@@ -84,7 +84,7 @@ class SampledSensor(RegisterBank):
 
     @property
     def own_tags(self) -> list[Tag]:
-        """The numeric tags that the model fills itself. They are not signals, so their distortions are not sampled."""
+        """Return the numeric tags that the model fills itself. They are not signals, so their distortions are not sampled."""
         signals = {tag.name for tag in self._signals}
         return [tag for tag in self._tags.values() if tag.name not in signals and not tag.is_text]
 

@@ -65,7 +65,7 @@ class Column:
 
     @property
     def normal(self) -> Sequence[int]:
-        """The positions of normal replies."""
+        """Return the positions of normal replies."""
         return [i for i in range(len(self.orders)) if i not in self.odd] if self.odd else range(len(self.orders))
 
     def drop_before(self, order: int) -> int:

@@ -117,7 +117,7 @@ class ExchangeReplay:
 
     @property
     def units(self) -> tuple[int, ...]:
-        """The unit IDs that were recorded."""
+        """Return the unit IDs that were recorded."""
         return tuple(sorted(self._units))
 
     def respond(self, unit_id: int, pdu: bytes) -> Answer:

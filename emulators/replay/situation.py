@@ -49,7 +49,7 @@ class Situations:
 
     @property
     def learned(self) -> int:
-        """The number under which the present recording is kept."""
+        """Return the number under which the present recording is kept."""
         return len(self._known) - 1 if self.now is None else self.now
 
     def rewind(self) -> None:

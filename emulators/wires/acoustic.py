@@ -128,7 +128,7 @@ class AcousticMedium:
 
     @property
     def next_ns(self) -> int | None:
-        """When the next event occurs; None: nothing happens until a modem sends."""
+        """Return when the next event occurs; None: nothing happens until a modem sends."""
         return self._events[0][0] if self._events else None
 
     def neighbours(self, name: str) -> list[str]:

@@ -184,7 +184,7 @@ class CanBus:
 
     @property
     def has_news(self) -> bool:
-        """Whether there are deliveries, notices or faults that have not been taken."""
+        """Return whether there are deliveries, notices or faults that have not been taken."""
         return bool(self._wire.done or self._wire.notices or self._wire.faults)
 
     def take_notices(self) -> list[Notice]:

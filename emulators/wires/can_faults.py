@@ -38,7 +38,7 @@ class Confinement:
 
     @property
     def flags_are_dominant(self) -> bool:
-        """Whether this node's error flag destroys a frame: an error-passive node's flag is recessive."""
+        """Return whether this node's error flag destroys a frame: an error-passive node's flag is recessive."""
         return self.state in (CanErrorState.ACTIVE, CanErrorState.WARNING)
 
     def sent(self) -> None:

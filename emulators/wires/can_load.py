@@ -40,7 +40,7 @@ class BusLoad:
 
     @property
     def frames(self) -> int:
-        """Number of whole frames."""
+        """Return the number of whole frames."""
         return sum(self._by_id.values())
 
     @property

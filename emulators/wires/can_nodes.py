@@ -60,7 +60,7 @@ class Node:
 
     @property
     def flags_are_dominant(self) -> bool:
-        """Whether an error flag of this node destroys a frame."""
+        """Return whether an error flag of this node destroys a frame."""
         return self.faults.flags_are_dominant and not self.listen_only
 
     def as_dict(self, number: int, load: float) -> dict[str, Any]:

@@ -31,12 +31,12 @@ class SerialPacer:
 
     @property
     def t1_5_ns(self) -> int:
-        """The longest pause inside a frame (SL 2.5.1.1)."""
+        """Return the longest pause inside a frame (SL 2.5.1.1)."""
         return T1_5_FAST_NS if self.settings.baudrate > FAST_BAUDRATE else self._half_chars_ns(3)
 
     @property
     def t3_5_ns(self) -> int:
-        """The shortest pause between frames (SL 2.5.1.1)."""
+        """Return the shortest pause between frames (SL 2.5.1.1)."""
         return T3_5_FAST_NS if self.settings.baudrate > FAST_BAUDRATE else self._half_chars_ns(7)
 
     def duration_ns(self, nbytes: int) -> int:

@@ -1,4 +1,4 @@
-"""Faults of a node on a CAN bus: the effect on its frames, and the frames that it sends unprompted.
+"""Faults of a node on a CAN bus: their effect on the node's frames, and the frames that a fault itself sends.
 
 Pure, like all faults: the input is a frame and a random generator, the output is frames with delays.
 """
@@ -19,14 +19,14 @@ HEARTBEAT, EMCY, SDO_REPLY, SDO_REQUEST, SYNC = 0x700, 0x80, 0x580, 0x600, 0x80
 
 @dataclass(frozen=True, slots=True)
 class CanPiece:
-    """A frame to forward, `delay_s` after the frame that it is made from."""
+    """A frame to forward, `delay_s` after the frame from which it was made."""
 
     frame: CanFrame
     delay_s: float = 0.0
 
 
 class CanFault(Fault):
-    """A fault that strikes frames which a node sends (REPLY) or hears (REQUEST). `node` is its node ID."""
+    """A fault that strikes frames which a node sends (REPLY) or receives (REQUEST). `node` is the node ID."""
 
     kind = Kind.CAN
     ways = frozenset((Way.REPLY,))
@@ -40,7 +40,7 @@ class CanFault(Fault):
         """Return the frames that replace `frame`."""
 
     def appears(self, node: int, random: Random) -> tuple[CanPiece, ...]:
-        """Return the frames that the node sends when the fault is put in."""
+        """Return the frames that the node sends when the fault is injected."""
         return ()
 
 

@@ -12,7 +12,7 @@ from fieldtwin.emulators.faults.frames import Frame, Framing, Way, understood
 
 
 class WireFaults:
-    """The faults of one bus. Each of `listeners` is called when a fault is put in."""
+    """The faults of one bus. Each of `listeners` is called when a fault is injected."""
 
     def __init__(self, framing: Framing) -> None:
         self.framing = framing
@@ -35,17 +35,14 @@ class WireFaults:
         return self.active.pop(id, None) is not None
 
     def in_at(self, now_ns: int) -> list[Active]:
-        """Return the faults whose time has come, in the order in which they were put in.
-
-        Remove those whose time is over.
-        """
+        """Return the faults that are active now, in the order in which they were injected, and remove those that are over."""
         over = [id for id, active in self.active.items() if active.until_ns is not None and now_ns >= active.until_ns]
         for id in over:
             del self.active[id]
         return [active for active in self.active.values() if active.from_ns <= now_ns]
 
     def refuses(self, now_ns: int) -> bool:
-        """Return whether a connection that is requested now is refused. Each fault that refuses it is counted as struck."""
+        """Return whether a connection that is requested now is refused. Each fault that refuses it counts as having struck."""
         refusing = [
             a for a in self.active.values() if isinstance(a.fault, WireFault) and a.fault.refuses and in_time(a, now_ns)
         ]
@@ -56,7 +53,7 @@ class WireFaults:
     def decide(self, frame: Frame, now_ns: int) -> FaultEffect | None:
         """Return the effect on the frame, or None if no fault strikes it.
 
-        Faults are applied in the order in which they were put in, except that faults which divide the frame come last.
+        Faults are applied in the order in which they were injected, except that faults which divide the frame come last.
         """
         outcome: FaultEffect | None = None
         if frame.spared:

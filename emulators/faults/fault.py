@@ -34,8 +34,8 @@ class Hang(Enum):
 class Piece:
     """Bytes to forward, `delay_s` after the frame arrived and after all bytes that still wait.
 
-    `overtake`: forward them before bytes that still wait. `gather`: forward them together with bytes that arrive within
-    that time. `back`: return them to the sender.
+    With `overtake` they are forwarded before bytes that still wait, with `gather` together with bytes that arrive within that
+    time. With `back` they are returned to the sender.
     """
 
     data: bytes
@@ -106,7 +106,7 @@ class Nothing(Parameters):
 
 
 class Kind(Enum):
-    """Where a fault can be injected."""
+    """The places at which a fault can be injected."""
 
     BYTES = "serial lines and sockets"
     CAN = "CAN buses"
@@ -139,7 +139,7 @@ class WireFault(Fault):
         """Return the effect on `frame`."""
 
     def appears(self) -> Hang | None:
-        """Return the effect on connections that are open when the fault is put in."""
+        """Return the effect on connections that are open when the fault is injected."""
         return None
 
     refuses: ClassVar[bool] = False
@@ -159,20 +159,20 @@ class ValueFault(Fault):
     ways: ClassVar[frozenset[Way]] = frozenset()
 
     def learn(self, tags: Iterable[Tag]) -> None:
-        """Record the tags of the device that the fault is put into, before it strikes."""
+        """Record the tags of the device into which the fault is injected, before it strikes."""
 
     def on(self, tag: str) -> ValueFault | None:
-        """Return the fault as it strikes `tag`; None if it does not change that tag."""
+        """Return the instance of the fault that strikes `tag`, or None if the fault does not change that tag."""
         return self
 
     @abstractmethod
     def distort(self, value: float, since_s: float, held: float, random: Random) -> float:
-        """Return the replacement of `value`. `since_s`: seconds since the fault began; `held`: the value at that time."""
+        """Return the replacement of `value`. The fault began `since_s` seconds ago, when the value was `held`."""
 
 
 @dataclass
 class Active:
-    """An active fault: what it strikes, from when until when, and how often it has struck."""
+    """An injected fault: its aim, its start and end, and the number of times that it has struck."""
 
     id: str
     fault: Fault
@@ -192,7 +192,7 @@ class Active:
     def strikes(self, frame: Frame, now_ns: int) -> bool:
         """Return whether the fault strikes this frame, and count frames that match its aim.
 
-        The caller counts it in `struck` if that changed the frame: a fault without an effect has tested nothing.
+        If the fault then changes the frame, the caller increases `struck`. A fault without an effect has tested nothing.
         """
         aim = self.aim
         if now_ns < self.from_ns or (self.until_ns is not None and now_ns >= self.until_ns):

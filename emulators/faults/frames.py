@@ -1,4 +1,4 @@
-"""Cuts the bytes of a medium into whole frames, so that a fault can aim at one.
+"""Divide the bytes of a medium into whole frames, so that a fault can aim at single frames.
 
 It supports RTU, ASCII and MBAP frames, datagrams of a digital thread and MQTT packets; other bytes are passed on in the
 chunks in which they arrive.
@@ -56,8 +56,7 @@ class Way(Enum):
 class Frame:
     """One frame. If it is not understood, `pdu` is empty, and `unit` and `function` are -1.
 
-    `address` and `count` are those of the request, also in its reply: the first register or bit, and the quantity; -1:
-    none.
+    `address` (the first register or bit) and `count` are those of the request, also in the frame of its reply; -1: none.
     """
 
     way: Way
@@ -84,7 +83,10 @@ class Frame:
 
 
 class Assembler:
-    """One direction of one connection. `feed` returns the whole frames; `flush` returns the remaining bytes unchanged."""
+    """The parser of one direction of a connection.
+
+    `feed` returns the whole frames; `flush` returns the remaining bytes unchanged.
+    """
 
     def __init__(self, way: Way, framing: Framing) -> None:
         self.way = way
@@ -103,11 +105,11 @@ class Assembler:
         return frames
 
     def flush(self) -> list[Frame]:
-        """Return the remaining bytes as one frame that is not understood."""
+        """Return the remaining bytes as one frame of unknown content."""
         return [self._take(len(self.pending))] if self.pending else []
 
     def _whole(self) -> int:
-        """Return the length of the frame at the front; 0: it is incomplete."""
+        """Return the length of the frame at the front, or 0 if it is incomplete."""
         buffer = self.pending
         if self.framing is Framing.RAW:
             return len(buffer)
@@ -131,7 +133,7 @@ class Assembler:
 
 
 def _mqtt_length(buffer: bytearray) -> int:
-    """Return the length of the packet at the front with its header (MQTT 1.5.5); 0: more bytes are needed to know it."""
+    """Return the length of the MQTT packet at the front with its header (MQTT 1.5.5), or 0 if more bytes are needed."""
     rest = 0
     for at, byte in enumerate(buffer[1:5]):
         rest |= (byte & 0x7F) << 7 * at

@@ -29,7 +29,7 @@ _ABOUT = {
 
 
 def fault_defs() -> dict[str, Any]:
-    """Return the `$defs` that a schema with faults needs: `Fault` (any fault) and the keys of an aim."""
+    """Return the `$defs` of a schema with faults: `Fault` (any fault) and the keys of an aim."""
     aims = Aim.model_json_schema()["properties"]
     return {
         "Fault": {"title": "Fault", "oneOf": [_one(kind) for kind in FAULTS.values()]},

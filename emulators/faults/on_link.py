@@ -55,7 +55,7 @@ def wire_faults(
     start_ns: int,
     check: Callable[[FaultSpec], None] = check_link,
 ) -> WireFaults:
-    """Return the faults of a link, all put in; their times count from `start_ns`. Raises what `check` raises."""
+    """Return the injected faults of a link. Their times count from `start_ns`. Raises the errors of `check`."""
     faults = WireFaults(framing)
     for number, one in enumerate(said, 1):
         spec = parse_fault(dict(one), number=number)

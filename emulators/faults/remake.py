@@ -8,7 +8,7 @@ from fieldtwin.emulators.modbus.rtu_shapes import with_crc
 
 
 def remade(frame: Frame, *, unit: int | None = None, pdu: bytes | None = None) -> bytes:
-    """Return the bytes of `frame` with these parts replaced. A frame that was not understood is returned unchanged."""
+    """Return the bytes of `frame` with these parts replaced. A frame of unknown content is returned unchanged."""
     if not frame.pdu:
         return frame.data
     adu = bytes((frame.unit if unit is None else unit,)) + (frame.pdu if pdu is None else pdu)

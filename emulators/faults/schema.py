@@ -38,7 +38,7 @@ MOST = 10_000
 
 @dataclass(frozen=True, slots=True)
 class FaultSpec:
-    """A fault that may be put in. Times are in seconds of the run; `until_s` None: until it is taken away."""
+    """A fault that may be injected. Times are in seconds of the run. If `until_s` is None, it is active until it is removed."""
 
     id: str
     kind: type[Fault]
@@ -128,7 +128,7 @@ Check = Callable[[FaultSpec], object]
 
 
 def load_faults(path: Path, check: Check | None = None) -> tuple[dict[str, Any], ...]:
-    """Return the faults of a file, checked, as given, each with an ID.
+    """Return the checked faults of a file in its order, each with an ID.
 
     Raises `FileInvalid` with the position in the file.
     """
@@ -162,7 +162,7 @@ def checked(check: Check, spec: FaultSpec, file: YamlFile, loc: tuple[Key, ...])
 
 
 def counted(count: str | int | None) -> range | None:
-    """Return the register or bit counts that ``40``, ``65..125`` or ``65..`` means; None: all. Raises `WrongAim`."""
+    """Return the register or bit counts of a text such as ``40``, ``65..125`` or ``65..``; None: all. Raises `WrongAim`."""
     if count is None:
         return None
     low, dots, high = str(count).partition("..")
@@ -190,7 +190,10 @@ FUNCTIONS_OF = {
 
 
 def addressed(address: str | int) -> tuple[range, frozenset[int]]:
-    """Return the PDU address that ``0x10`` or ``holding:0x10`` means, and the functions of its table. Raises `WrongAim`."""
+    """Return the PDU address of a text such as ``0x10`` or ``holding:0x10``, and the functions of its table.
+
+    Raises `WrongAim`.
+    """
     table, _, number = str(address).rpartition(":")
     try:
         at = int(number, 0)

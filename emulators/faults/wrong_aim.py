@@ -1,4 +1,4 @@
-"""The error for a fault that cannot be put in at the requested place."""
+"""The error for a fault that cannot be injected at the requested place."""
 
 from __future__ import annotations
 

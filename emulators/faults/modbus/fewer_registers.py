@@ -1,4 +1,4 @@
-"""A device that returns fewer registers than the request asked for."""
+"""A device that returns fewer registers than requested."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ class Reorder(WireFault):
         )
 
     def _went(self, frame: Frame) -> bool:
-        """Return whether the frame has already been sent after a later one; otherwise its time is up, and release it."""
+        """Return whether the held frame has already been sent after a later frame. If not, its time is over: release it."""
         if self._held is not frame:
             return True
         self._held = None

@@ -1,4 +1,4 @@
-"""The numbers that a tag can hold on the wire, and those of them that lie outside of its declared range.
+"""The numbers that the registers or object of a tag can hold, and which of them lie outside of its declared range.
 
 Values are in engineering units. Pure. A tag whose scale factor is in a separate register (`scale_by`) has no fixed
 limits: the factor is known only while the device runs.
@@ -22,7 +22,7 @@ _MOST_SENTINELS = 64
 
 
 def numbers(tags: Iterable[Tag]) -> list[Tag]:
-    """Return the tags that a value fault can strike: the readable ones that are numbers."""
+    """Return the tags that a value fault can strike: readable tags that are numbers."""
     return [tag for tag in tags if tag.readable and not tag.is_text]
 
 
@@ -38,7 +38,7 @@ def limits(tag: Tag) -> tuple[float, float] | None:
 
 
 def check_value(tag: Tag, value: float, name: str, hint: str = "") -> None:
-    """Raise `WrongAim` for a number that the type of `tag` cannot carry: the device would hold a different one instead."""
+    """Raise `WrongAim` for a number that the type of `tag` cannot carry, because the device would hold a different number."""
     found = limits(tag)
     if found is None or math.isnan(value) or (math.isinf(value) and tag.type in FLOAT_LIMITS):
         return
@@ -49,7 +49,7 @@ def check_value(tag: Tag, value: float, name: str, hint: str = "") -> None:
 
 
 def beyond(tag: Tag, name: str) -> float:
-    """Return a value outside of the declared range of `tag`: the largest one that its type carries, else the smallest.
+    """Return a value outside of the declared range of `tag`: the largest that its type can carry, or else the smallest.
 
     If no range is declared, it is the largest value of the type. For a tag with a scale factor of its own, infinity
     stands for the largest raw number; the device limits it. Raises `WrongAim` if the type carries no value outside of

@@ -1,6 +1,4 @@
-"""A modem's connection to the acoustic channel: it sends what the registers hand over and puts received packets in the
-mailbox.
-"""
+"""A modem's connection to the acoustic channel: it sends the messages from the registers, and receives for the mailbox."""
 
 from __future__ import annotations
 
@@ -10,8 +8,8 @@ from fieldtwin.emulators.wires.acoustic import AcousticMedium
 class AcousticLink:
     """Both directions of the modem `name` in `medium` (`packet_link.Outgoing` and `Incoming`).
 
-    `times`: how often each packet is sent, `every_ns` apart, for a modem that gets no acknowledgements. The channel may
-    lose any of these copies; `resent` counts the additional ones.
+    Each packet is sent `times` times, `every_ns` apart, because the modem gets no acknowledgements and the channel may lose any
+    of these copies. `resent` counts the additional copies.
     """
 
     def __init__(self, medium: AcousticMedium, name: str, *, times: int = 1, every_ns: int = 0) -> None:

@@ -27,9 +27,9 @@ NO_MODEL = "none"
 
 
 def model_for(dictionary: Dictionary, chosen: str | None = None) -> DeviceModel | None:
-    """Return a new model for the device that the data sheet describes; None for a profile without one.
+    """Return a new model for the device that the data sheet describes; None for a device profile without a model.
 
-    `chosen`: a number of `MODELS` as text, or `NO_MODEL`.
+    `chosen` is the user's choice: a number of `MODELS` as text, or `NO_MODEL`.
     """
     if chosen is not None:
         return None if chosen == NO_MODEL else MODELS[int(chosen)]()

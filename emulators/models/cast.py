@@ -50,7 +50,7 @@ def water_temperature(pressure: float) -> float:
 
 
 def water_salinity(pressure: float) -> float:
-    """Return the practical salinity: fresher water on top, a halocline around 35 dbar, a maximum near 120."""
+    """Return the practical salinity: fresher water on top, a halocline around 35 dbar, a maximum near 120 dbar."""
     maximum = 0.55 * math.exp(-(((pressure - 120.0) / 60.0) ** 2))
     return 35.05 - 1.3 * _above(pressure, 35.0, 9.0) + maximum
 
@@ -82,7 +82,7 @@ def cast_rows(cast: Cast, chance: random.Random) -> Iterator[tuple[float, tuple[
 
 
 def _above(pressure: float, middle: float, width: float) -> float:
-    """Return 1 well above `middle`, 0 well below it."""
+    """Return a smooth step: 1 well above the depth `middle`, 0 well below it."""
     return 0.5 * (1.0 - math.tanh((pressure - middle) / width))
 
 

@@ -1,7 +1,7 @@
 """Value faults of a CANopen node whose values come from a log, from a model, or only from its data sheet and clients.
 
-If no source provides an object, its undistorted value is the one that it held when the fault began, or that a client
-has written since. It is restored when the fault is over. Pure; it must never know frames or SDO.
+If no source provides an object, its undistorted value is the value that it held when the fault began, or that a client has
+written since then. This value is restored when the fault is over. Pure; it must never know frames or SDO.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from fieldtwin.gateway.core.files.profile import Tag
 
 
 class DistortedObjects:
-    """A node's value source around `source`. `data` is set once the node exists.
+    """A node's value source that distorts the values of `source`. `data` is set once the node exists.
 
     With a model, calling it changes nothing: the node calls `over` after the model instead (`NodeContext.distort`).
     """
@@ -33,7 +33,7 @@ class DistortedObjects:
         has_model: bool = False,
         named: bool = False,
     ) -> None:
-        """`named`: only faults that name a tag distort it, not faults that are aimed at all tags."""
+        """Create the source. With `named`, a tag is distorted only by faults that name it, not by faults aimed at all tags."""
         self._named = named
         self.distortions = Distortions(counts_given=True)
         self.data: NodeData | None = None
@@ -51,12 +51,12 @@ class DistortedObjects:
         """The last distorted value of each of them."""
 
     def share(self, distortions: Distortions, names: Mapping[Key, str]) -> None:
-        """Use the `distortions` of a source that distorts the tags of the objects `names` itself."""
+        """Share the `distortions` of a source that itself distorts the tags of the objects `names`."""
         self.distortions, self._played = distortions, names
         distortions.counts_given = True
 
     def given(self, keys: Iterable[Key], now_ns: int) -> None:
-        """The node has sent the values of the objects `keys`: each fault that distorts one of them has struck."""
+        """Note that the node has sent the values of the objects `keys`: each fault that distorts one of them has struck."""
         if not self.distortions:
             return
         for key in keys:
@@ -70,7 +70,7 @@ class DistortedObjects:
         return values if self._has_model else self.over(values, now_ns)
 
     def answer(self, key: Key, now_ns: int) -> bytes | None:
-        """Implement `AnswersReads`."""
+        """Return the distorted value for an upload, see `AnswersReads`."""
         raw = self._source.answer(key, now_ns) if isinstance(self._source, AnswersReads) else None
         known = self._tags.get(key)
         if raw is None or known is None or not self.distortions.of(known[0].name, named=self._named):
@@ -78,7 +78,7 @@ class DistortedObjects:
         return self._distorted(*known, raw, now_ns)
 
     def over(self, values: Mapping[Key, bytes], now_ns: int) -> dict[Key, bytes]:
-        """Return `values` with distorted objects replaced, and with distorted objects that no source provides added."""
+        """Return `values` with distorted objects replaced; distorted objects that no source provides are added."""
         out = dict(values)
         if not self.distortions and not self._own:
             return out
@@ -97,7 +97,7 @@ class DistortedObjects:
         return out
 
     def _beneath(self, key: Key) -> bytes | None:
-        """Return the undistorted value of an object that no source provides; a value that was written since replaces it."""
+        """Return the undistorted value of an object that no source provides. A value that was written later replaces it."""
         if self.data is None or not self.data.has(*key):
             return None
         live = self.data.get(*key)

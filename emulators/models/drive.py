@@ -1,11 +1,10 @@
 """A CiA 402 drive: state machine, profile modes, homing and cyclic synchronous modes, with a motor that follows without
 error.
 
-Objects and bits follow CiA 402-2 and 402-3 (IEC 61800-7-201, -301), as printed in drive makers' manuals. Positions are
-in increments, speeds in increments per second, accelerations in increments per second squared, torques in thousandths
-of the rated torque. A value that the drive cannot determine itself (DC link voltage) comes from a recording; a recorded
-object is never computed. Every error that is present in the node puts the drive in the fault state; the fault reset
-clears it.
+Objects and bits follow CiA 402-2 and 402-3 (IEC 61800-7-201, -301), as printed in drive makers' manuals. Positions are in
+increments, speeds in increments per second, accelerations in increments per second squared, torques in thousandths of the rated
+torque. A value that the model cannot compute (DC link voltage) comes from a recording; a recorded object is never computed. Every
+error that is present in the node puts the drive into the fault state; the fault reset clears the error.
 """
 
 from __future__ import annotations
@@ -164,7 +163,7 @@ class Drive(DeviceModel):
                 self._go(cause, situation.now_ns, situation.objects)
 
     def _obey(self, now_ns: int, objects: Objects) -> None:
-        """Process a new controlword. One controlword can trigger two transitions: switch on and enable operation."""
+        """Process a new controlword. It can trigger two transitions at once: switch on and enable operation."""
         before, self._controlword = self._controlword, objects.whole(od.CONTROLWORD)
         command = command_of(self._controlword, before)
         if command is Cause.FAULT_RESET and self._disconnected(objects):
@@ -225,7 +224,7 @@ class Drive(DeviceModel):
         self._move(Motion(x, v, to_speed(v, speed, acceleration, deceleration or acceleration)), now_ns)
 
     def _move(self, motion: Motion, now_ns: int) -> None:
-        """Start this motion now. It interrupts homing."""
+        """Start a motion now. It interrupts homing."""
         self._motion, self._began_ns, self._homing = motion, now_ns, None
 
     def _slow_down(self, option: int, now_ns: int, objects: Objects) -> None:
@@ -245,7 +244,7 @@ class Drive(DeviceModel):
         self._target = self._queue = None
 
     def _take_up(self, now_ns: int, objects: Objects) -> None:
-        """Start or resume operation: the mode takes control of the motor."""
+        """Start or resume operation: from now on the mode of operation controls the motor."""
         self._target = self._queue = self._wanted = None
         self._acknowledge = self._limited = False
         self._homed = 0
@@ -340,9 +339,9 @@ class Drive(DeviceModel):
             self._move_to(self._target, now_ns)
 
     def _take_set_point(self, before: int, now_ns: int, objects: Objects) -> None:
-        """Handle set-points of profile position: bit 4 offers one, bit 12 acknowledges it until bit 4 is cleared.
+        """Handle set-points of profile position mode: bit 4 offers a set-point, bit 12 acknowledges it until bit 4 is cleared.
 
-        One can wait.
+        One further set-point can wait.
         """
         if not self._controlword & NEW_SET_POINT:
             self._acknowledge = self._queue is not None
@@ -376,7 +375,7 @@ class Drive(DeviceModel):
         self._move(Motion(x, v, ramps), now_ns)
 
     def _distance(self, position: int, x: float) -> float:
-        """Return the distance from the motor's place `x` to a value of 6064h."""
+        """Return the distance from the motor's position `x` to a value of 6064h."""
         shown = x - self._zero
         return position - (shown if abs(shown) < _SPAN / 2 else _wrapped(shown))
 
@@ -445,7 +444,10 @@ def _supported(mode: int, objects: Objects) -> bool:
 
 
 def _rate(objects: Objects, index: int, usual: float = _USUAL) -> float:
-    """Return the value of an acceleration object, or `usual` if the node has none; at least 1, because 0 would never end."""
+    """Return the value of an acceleration object, or `usual` if the node lacks it.
+
+    It is at least 1, because a ramp with 0 never ends.
+    """
     return max(1.0, float(objects.number(index, default=usual)))
 
 

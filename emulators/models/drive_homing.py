@@ -1,4 +1,4 @@
-"""Homing of a CiA 402 drive: the path of each method and the home position (CiA 402-2, IEC 61800-7-201, 6098h).
+"""Homing of a CiA 402 drive: the path and the home position of each method (CiA 402-2, IEC 61800-7-201, 6098h).
 
 Methods 1 to 14 search for a switch and then for an index pulse, 17 to 30 do the same without the index pulse, 33 and 34
 use the next index pulse, 35 and 37 the present position. The whole path is computed when homing begins, so that the
@@ -60,8 +60,9 @@ class Axis:
 
 @dataclass(frozen=True, slots=True)
 class Speeds:
-    """6099h: `search` for the switch and `zero` for the edge or the index pulse, in increments per second; 609Ah:
-    `acceleration`.
+    """The speeds and acceleration of homing.
+
+    6099h: `search` for the switch and `zero` for the edge or the index pulse, in increments per second. 609Ah: `acceleration`.
     """
 
     search: float
@@ -78,7 +79,7 @@ class Way:
 
 
 def plan(method: int, axis: Axis, x: float, v: float, speeds: Speeds) -> Way:
-    """Return the path of a method from place `x` and speed `v`. `method` is one of `METHODS`."""
+    """Return the path of a method from position `x` with speed `v`. `method` is one of `METHODS`."""
     if method in (35, 37):
         stop = Motion(x, v, to_speed(v, 0.0, speeds.acceleration, speeds.acceleration))
         return Way(stop, stop.at(stop.duration_s)[0])
@@ -124,7 +125,10 @@ def _search(method: int, axis: Axis, x: float) -> tuple[list[float], float, bool
 
 
 def _until(distance: float, v: float, speeds: Speeds) -> tuple[Ramp, ...]:
-    """Return ramps that pass an edge at the search speed and then brake to a stop. A motor moving away brakes first."""
+    """Return ramps that pass an edge at the search speed and then brake to a stop.
+
+    A motor that moves away from the edge brakes first.
+    """
     a = speeds.acceleration
     ramps: list[Ramp] = []
     if v * distance < 0:

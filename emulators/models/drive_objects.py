@@ -1,5 +1,4 @@
-"""The objects of a CiA 402 drive that the model reads and writes, its modes of operation, and which of them a data
-sheet has.
+"""The objects and modes of operation of a CiA 402 drive that the model supports, and which of them a data sheet has.
 
 Indices, bits and codes are those of CiA 402-2 and 402-3 (IEC 61800-7-201, -301).
 """
@@ -65,7 +64,7 @@ OPTIONS = {
 
 
 def mode_bits(objects: Objects) -> int:
-    """Return 6502h: the modes of this drive, by bit (mode - 1), which are the data sheet's modes that the model supports.
+    """Return 6502h: the modes of the data sheet that the model supports. Mode n is bit n - 1.
 
     If the data sheet gives 6502h no value, the modes are those that its objects allow.
     """
@@ -75,7 +74,7 @@ def mode_bits(objects: Objects) -> int:
 
 
 def missing_modes(dictionary: Dictionary) -> list[int]:
-    """Return the modes in the data sheet's 6502h that this model lacks, or whose objects the data sheet lacks."""
+    """Return the modes in the data sheet's 6502h that the model does not support, or whose objects the data sheet lacks."""
     entry = dictionary.entry(SUPPORTED_MODES, 0)
     if entry is None or not codec.is_integer(entry.data_type):
         return []

@@ -1,6 +1,6 @@
 """Builds a CANopen node from a profile: data sheet, model, recording and journal.
 
-It must never know buses or clocks: the player that it is given has its own start time.
+It must never know buses or clocks: the signal player that it is given has its own start time.
 """
 
 from __future__ import annotations
@@ -62,10 +62,9 @@ def emulated_node(
 ) -> EmulatedNode:
     """Return the node of a CANopen profile, which plays signals or a log of its bus.
 
-    Without a `recording` it holds the values of the data sheet and those of its model. `identity` gives values by tag
-    that this device has instead of the data sheet's. Raises `FileInvalid` for a data sheet or log that cannot be read
-    and for a tag whose object the data sheet lacks, and `UsageError` for an identity that is not a number and for a log
-    without this node.
+    Without a `recording` it holds the values of the data sheet and those of its model. `identity` maps tags to values that
+    replace those of the data sheet for this device. Raises `FileInvalid` for a data sheet or log that cannot be read and for a
+    tag whose object the data sheet lacks, and `UsageError` for an identity that is not a number and for a log without this node.
     """
     if profile.eds_path is None:
         raise UsageError("a node needs a data sheet", where=profile.path, expected="`eds: FILE.eds` in the profile")

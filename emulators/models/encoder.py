@@ -1,9 +1,9 @@
 """A CiA 406 absolute rotary encoder: code sequence, scaling, preset, and the speed of the shaft.
 
-Objects follow CiA 406 v3.2 for multi-turn encoders, as printed in encoder makers' manuals: operating parameters 6000h,
-measuring units 6001h and total range 6002h, preset 6003h, position 6004h, speed 6030h, offset 6509h. The recording
-plays 6004h as recorded with the factory settings (scaling off, clockwise, no preset), which is the position of the
-shaft in steps, 6501h per turn.
+Objects follow CiA 406 v3.2 for multi-turn encoders, as printed in encoder makers' manuals: operating parameters 6000h, measuring
+units 6001h and total range 6002h, preset 6003h, position 6004h, speed 6030h, offset 6509h. The recording holds 6004h as recorded
+with the factory settings (scaling off, clockwise, no preset). That is the position of the shaft in steps; 6501h is the number of
+steps per turn.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def _physical_range(objects: Objects) -> int:
 
 
 def _range(objects: Objects) -> int:
-    """Return the range: positions run from 0 to one less than this."""
+    """Return the number of positions: they run from 0 to one less than this."""
     if objects.whole(PARAMETERS) & SCALING:
         return max(1, objects.whole(TOTAL_RANGE, default=_physical_range(objects)))
     return _physical_range(objects)

@@ -2,8 +2,7 @@
 
 Objects follow CiA 410 v1.2 as printed in makers' manuals: operating parameter 6011h, preset 6012h, offset 6013h,
 differential offset 6014h of the longitudinal slope 6010h, and the same from 6021h for the lateral 6020h. All are in
-units of 6000h. The recording plays the slopes as recorded with the factory settings, which are the values that the cell
-measures.
+units of 6000h. The recording holds the slopes as recorded with the factory settings, which are the values that the cell measures.
 """
 
 from __future__ import annotations

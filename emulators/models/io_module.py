@@ -95,7 +95,9 @@ class IoModule(DeviceModel):
         return far and bool(at_limit or not limits)
 
     def _set_outputs(self, situation: Situation) -> None:
-        """Set the outputs: as commanded in OPERATIONAL; by 6206h and 6443h after NMT stop or a lost consumer heartbeat."""
+        """Set the outputs to the commanded values in OPERATIONAL, and as 6206h and 6443h state after NMT stop or a lost
+        heartbeat.
+        """
         objects = situation.objects
         failed = situation.nmt is NmtState.STOPPED or HEARTBEAT_LOST in situation.errors
         for sub in objects.channels(DIGITAL_OUT):

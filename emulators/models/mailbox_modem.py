@@ -1,9 +1,8 @@
 """A pair of modems with mailboxes in holding registers, and the link between them (SPEC ruling 17).
 
-Each modem has its own register bank: the plant's on one socket, the remote one on a second. A message that one side
-writes into its outbox travels over the link and appears in the other side's inbox when that is free. A repeated
-sequence number is treated as the same message and not sent twice. Functions of time: a link is advanced when it is read
-or written.
+Each modem has its own register bank on its own socket: one for the plant, one for the remote side. A message that one side writes
+into its outbox travels over the link and appears in the inbox of the opposite side when that inbox is free. A repeated sequence
+number is treated as the same message and not sent twice. Functions of time: a link is advanced when it is read or written.
 """
 
 from __future__ import annotations
@@ -57,7 +56,7 @@ class MailboxModem(RegisterBank):
                 self._note(tag, 0)
 
     def _note(self, tag: Tag, now_ns: int) -> None:
-        """Journal the present value of the registers of `tag`."""
+        """Add the present value of the registers of `tag` to the journal."""
         self.journal.note(tag.name, bytes_of(tag, cells_held(tag, self._cells.peek)), now_ns)
 
     def _state(self, name: str, text: str) -> None:
@@ -89,7 +88,7 @@ class MailboxModem(RegisterBank):
         self.advance(now_ns)
 
     def advance(self, now_ns: int) -> None:
-        """Hand a pending message to the link, take received messages, fill a free inbox, refresh the counters."""
+        """Pass a pending message to the link, take received messages, fill a free inbox, and refresh the counters."""
         if self._pending is not None and self._outgoing.submit(self._pending, now_ns):
             self._pending = None
             self._poke(self._outbox.ack, self._accepted)
@@ -147,7 +146,7 @@ class MailboxModem(RegisterBank):
 
 
 class ModemPair:
-    """Both modems and both directions of the link. `latency_s` is one way."""
+    """Both modems and both directions of the link. `latency_s` is the latency of one direction."""
 
     def __init__(
         self,

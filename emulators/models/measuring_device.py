@@ -1,8 +1,8 @@
 """A CiA 404 measuring device: a field value, its linear conversion to a process value through two points, and taring.
 
-Objects follow CiA 404 (2002, v1.2), analogue input block, as printed in sensor makers' manuals. The field value 6100h
-is the output of the cell, the process value 6130h is in the unit of 6131h, and 7130h and 9130h are the same value as
-integers with 6132h decimal digits. The recording plays one of the three as recorded with the factory scaling.
+Objects follow CiA 404 (2002, v1.2), analogue input block, as printed in sensor makers' manuals. The field value 6100h is the
+output of the cell, the process value 6130h is in the unit of 6131h, and 7130h and 9130h are the same value as integers with 6132h
+decimal digits. The recording holds one of these three objects as recorded with the factory scaling.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def _played(sub: int, situation: Situation) -> float:
 
 
 def _field_value(process: float, sub: int, objects: Objects) -> float:
-    """Return the field value for which the device with its factory settings showed `process`."""
+    """Return the field value for which the device with its factory settings gives the process value `process`."""
     f1, p1, f2, p2 = _line(sub, objects.factory)
     return process if p1 == p2 else f1 + (process - p1) * (f2 - f1) / (p2 - p1)
 
@@ -101,14 +101,14 @@ def _process_value(field: float, sub: int, objects: Objects) -> float:
 
 
 def _line(sub: int, number: Callable[[int, int, Number], Number]) -> tuple[float, float, float, float]:
-    """Return the two points. Without such objects, field value and process value are the same."""
+    """Return the two points of the conversion. Without their objects, field value and process value are equal."""
     first = float(number(POINT_1_FIELD, sub, 0.0)), float(number(POINT_1_PROCESS, sub, 0.0))
     second = float(number(POINT_2_FIELD, sub, 1.0)), float(number(POINT_2_PROCESS, sub, 1.0))
     return *first, *second
 
 
 def _status(process: float, sub: int, objects: Objects) -> int:
-    """Return 6150h: no valid value, or a value outside the measuring span if there is one."""
+    """Return 6150h: whether the value is invalid, or outside of the measuring span if there is a span."""
     if not math.isfinite(process):
         return NOT_VALID
     low, high = float(objects.number(SPAN_START, sub)), float(objects.number(SPAN_END, sub))

@@ -1,7 +1,7 @@
-"""A point that moves with piecewise constant acceleration: its place, and the ramps that bring it to a speed or a place.
+"""A point that moves with piecewise constant acceleration: its position, and the ramps to a given speed or position.
 
-Closed forms, which can be evaluated at any time and never drift. Units are the caller's, time is in seconds. It knows
-no drive and no clock.
+The position is a closed formula of time, so it can be computed for any time and never drifts. The caller chooses the units of
+length; time is in seconds. This module knows no drive and no clock.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ Ramp = tuple[float, float]
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """A motion from place `x` with speed `v` through `ramps`, which then continues with the final speed."""
+    """A motion from position `x` with speed `v` through `ramps`, which then continues with the final speed."""
 
     x: float = 0.0
     v: float = 0.0
@@ -28,7 +28,7 @@ class Motion:
         return sum(duration for duration, _ in self.ramps)
 
     def at(self, t_s: float) -> tuple[float, float]:
-        """Return place and speed `t_s` seconds after the start."""
+        """Return position and speed `t_s` seconds after the start."""
         x, v = self.x, self.v
         for duration, a in self.ramps:
             t = min(t_s, duration)

@@ -1,8 +1,8 @@
 """A slow, lossy link between two modems that delivers every packet once and in order.
 
-Packets are sent one after the other at `bytes_per_s`, arrive `latency_s` after their last byte, and are lost with
-probability `loss`. The sender detects a loss by the missing acknowledgement and resends. Packets are therefore late but
-never lost, unless the link is configured to be worse (`LinkImpairments`). Seeded, and a function of time: the arrival of a
+Packets are sent one after the other at `bytes_per_s`, arrive `latency_s` after their last byte, and are lost with probability
+`loss`. The sender detects a loss by the missing acknowledgement and resends. Packets are therefore late but never lost, unless
+the link is configured with `LinkImpairments`. The link uses a seeded random generator and is a function of time: the arrival of a
 packet is known when it is sent.
 """
 
@@ -42,13 +42,14 @@ class Incoming(Protocol):
 
 
 class ModemEnd(Outgoing, Incoming, Protocol):
-    """Both directions, for one modem."""
+    """Both directions of a link, for one modem."""
 
 
 @dataclass(frozen=True, slots=True)
 class LinkImpairments:
-    """Faults of the link that the modems do not correct, as probabilities per packet: it never arrives, it arrives twice, or it
-    arrives before its predecessor.
+    """Faults of the link that the modems do not correct.
+
+    Each is a probability per packet: it never arrives, it arrives twice, or it arrives before its predecessor.
     """
 
     lost: float = 0.0
@@ -60,7 +61,7 @@ TAME = LinkImpairments()
 
 
 class PacketLink:
-    """One direction. At most `capacity` packets are under way; `submit` refuses more."""
+    """One direction of a link. At most `capacity` packets are in transit; `submit` refuses more."""
 
     def __init__(
         self,
@@ -125,5 +126,5 @@ class PacketLink:
 
     @property
     def waiting(self) -> bool:
-        """Return whether a packet is under way, or has arrived and not been taken."""
+        """Return whether a packet is in transit, or has arrived and was not taken."""
         return bool(self._under_way)

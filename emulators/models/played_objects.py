@@ -18,7 +18,7 @@ Key = tuple[int, int]
 
 
 class PlayedObjects:
-    """A node's value source: called with the time, it returns raw values by (index, subindex).
+    """A node's value source from recorded signals: called with the time, it returns raw values by (index, subindex).
 
     Signals are in engineering units under the names of the tags; scale and offset of the profile and the data type of
     the EDS convert them to object values. Raises `FileInvalid` for a tag whose object the EDS does not have, and if no
@@ -54,7 +54,7 @@ class PlayedObjects:
 
     @property
     def names(self) -> dict[Key, str]:
-        """Return the tag of each object that is played."""
+        """Return the tag of each object that has a recorded signal."""
         return {key: name for name, key, *_ in self._objects}
 
     def __call__(self, now_ns: int) -> dict[Key, bytes]:
@@ -73,7 +73,7 @@ class PlayedObjects:
 
 
 def whole(number: float, data_type: int) -> int:
-    """Return the nearest number that the type holds: a device's converters saturate."""
+    """Return the nearest number that the type can hold, because a device's converters saturate."""
     bounds = integer_range(data_type)
     if bounds is None:
         return round(number)
@@ -85,7 +85,7 @@ def _encode_whole(data_type: int, number: float) -> bytes:
 
 
 class HeldObjects:
-    """Journals the values of a node's objects by the profile's tags: `NodeContext.held` of a node in a prototype run."""
+    """The journal of a node's object values by the profile's tags, used as `NodeContext.held` in a prototype run."""
 
     def __init__(self, tags: Iterable[Tag]) -> None:
         self.journal = DeviceValueLog()

@@ -1,8 +1,8 @@
 """A Modbus device without a recording: its profile defines its registers and functions.
 
-The cells are those of the tags; addresses between them do not exist (exception 02). They hold the values of the
-prototype, 0 by default, and what a client writes. Effects, device-specific functions, identification, files and queues
-are as the profile states. The device changes only with requests: nothing here waits.
+The cells are those of the tags; addresses between them do not exist (exception 02). Cells hold the values of the prototype file
+(0 by default) until a client writes them. Effects, device-specific functions, identification, files and queues are as the profile
+states. The device changes only with requests: nothing here waits.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _WHOLE = re.compile(r"[1-9][0-9]{0,18}|0|0x[0-9a-fA-F]{1,16}")
 
 
 class ProfileRegisters(RegisterBank):
-    """The registers of a device by its profile. `values`: tag -> initial value, in engineering units, or text."""
+    """The registers of a device by its profile. `values` maps tags to initial values, in engineering units or as text."""
 
     def __init__(self, profile: DeviceProfile, values: Mapping[str, float | str], now_ns: int) -> None:
         for name in values:
@@ -89,7 +89,7 @@ class ProfileRegisters(RegisterBank):
 def add_own_functions(unit: ModbusUnit, bank: ProfileRegisters, profile: DeviceProfile) -> None:
     """Let `unit` answer every device-specific function of the profile.
 
-    It answers the one documented request, and gives exception 03 to all others.
+    The unit answers the documented request of each function, and gives exception 03 to all other requests.
     """
     for function in profile.own_functions.values():
         unit.register(function.code, _handler(bank, function), request_length=1 + len(function.request))
@@ -112,7 +112,7 @@ def _exponent(tag: Tag, values: Mapping[str, float | str]) -> int:
 
 
 def _number(tag: Tag, text: float | str) -> float:
-    """Return the number for a value that the prototype gives as one of the profile's words."""
+    """Return the number for a value that the prototype file gives as one of the profile's names."""
     for number, word in tag.values:
         if word == text:
             return number * tag.scale + tag.offset

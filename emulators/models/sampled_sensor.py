@@ -1,9 +1,9 @@
 """A sensor that takes samples: its registers come from a profile, its values from recorded signals.
 
-After a period in seconds is written into the tag that the profile names, a sample is taken every period, the first
-immediately; 0 is standby, a negative period is off. A sample is read from the recording at the emulator's clock, with
-all signals at one instant, which the `instrument_time` register holds in milliseconds if the profile has one. A
-function of time: nothing here waits, and samples that are due are taken at the next access.
+After a client has written a period in seconds into the tag that the profile names, a sample is taken every period, the first one
+immediately. A period of 0 is standby, a negative one is off. A sample holds the values of all signals of the recording at one
+instant of the emulator's clock; the `instrument_time` register holds this instant in milliseconds if the profile has such a
+register. The sensor is a function of time: nothing here waits, and samples that are due are taken at the next access.
 """
 
 from __future__ import annotations
@@ -133,7 +133,7 @@ class SampledSensor(RegisterBank):
             self._next_ns += step_ns
 
     def _sample(self, t_ns: int) -> None:
-        """Take one sample: the signals at the instrument's time, which is the recording's time in whole milliseconds."""
+        """Take one sample of the signals at the instrument's time, which is the recording's time in whole milliseconds."""
         time_ms = round(self._player.position_s(t_ns) * 1000)
         values = self._player.values_at(time_ms / 1000)
         self.samples += 1

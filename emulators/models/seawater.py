@@ -1,8 +1,8 @@
 """Conductivity of seawater from salinity, temperature and pressure: the practical salinity scale of 1978, both ways.
 
-Source: Fofonoff and Millard, "Algorithms for computation of fundamental properties of seawater", UNESCO technical papers
-in marine science 44 (1983), section 1, with its check values in the tests. Valid for salinities of 2 to 42. Temperatures
-are ITS-90; the scale's own are IPTS-68 (t68 = 1.00024 t90). Pure numbers, no state.
+Source: Fofonoff and Millard, "Algorithms for computation of fundamental properties of seawater", UNESCO technical papers in
+marine science 44 (1983), section 1; the tests contain its check values. Valid for salinities of 2 to 42. Temperatures are in
+ITS-90 and are converted to IPTS-68, in which the scale is defined (t68 = 1.00024 t90). Pure.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _MAX_STEPS = 20
 
 
 def salinity(conductivity: float, temperature: float, pressure: float) -> float:
-    """Return the practical salinity from S/m, degC (ITS-90) and dbar."""
+    """Return the practical salinity from conductivity in S/m, temperature in degC (ITS-90) and pressure in dbar."""
     t68 = temperature * T68_PER_T90
     ratio = conductivity / C_35_15_0
     numerator, fixed, slope = _pressure_terms(t68, pressure)
@@ -36,7 +36,7 @@ def salinity(conductivity: float, temperature: float, pressure: float) -> float:
 
 
 def conductivity(salinity_psu: float, temperature: float, pressure: float) -> float:
-    """Return the conductivity in S/m from practical salinity, degC (ITS-90) and dbar."""
+    """Return the conductivity in S/m from practical salinity, temperature in degC (ITS-90) and pressure in dbar."""
     t68 = temperature * T68_PER_T90
     root = _root_of(salinity_psu, t68)
     at_surface = root * root * _polynomial(_RT35, t68)
@@ -48,7 +48,7 @@ def conductivity(salinity_psu: float, temperature: float, pressure: float) -> fl
 
 
 def _pressure_terms(t68: float, pressure: float) -> tuple[float, float, float]:
-    """Return the numerator, and the constant and slope (in the ratio) of the denominator, of the pressure correction."""
+    """Return the terms of the pressure correction: the numerator, and of the denominator the constant and the slope."""
     d1, d2, d3, d4 = _D
     numerator = pressure * _polynomial(_E, pressure)
     return numerator, 1.0 + d1 * t68 + d2 * t68 * t68, d3 + d4 * t68

@@ -1,4 +1,4 @@
-"""A Modbus device with some registers that follow a simulation; the others are as its profile states."""
+"""A Modbus device with some registers that follow a simulation; all others behave as its profile states."""
 
 from __future__ import annotations
 

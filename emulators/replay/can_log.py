@@ -1,4 +1,4 @@
-"""A log of candump as a node's recording: its path and how it is played. It is read when frames are requested."""
+"""A candump log as a node's recording: its path, its speed and its end. The file is read when frames are requested."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from fieldtwin.gateway.core.files.candump import read_log
 
 @dataclass(frozen=True, slots=True)
 class CanLog:
-    """A log file, played `speed` times as fast as it was recorded, and the behaviour after its end."""
+    """A log file, which is played `speed` times as fast as it was recorded, with the behaviour after its end."""
 
     path: Path
     speed: float = 1.0
     at_end: EndOfRecording = EndOfRecording.HOLD
 
     def frames(self) -> Iterator[tuple[int, CanFrame]]:
-        """Yield time in the log in ns, and frame, of all classic frames. Raises `FileInvalid`."""
+        """Yield the time in ns and the frame for every classic frame of the log. Raises `FileInvalid`."""
         return ((t_ns, frame) for t_ns, _, frame in read_log(self.path))

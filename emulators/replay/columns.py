@@ -1,9 +1,9 @@
 """The recorded results of one repeated read: kept in columns, and decoded on access.
 
-A recording of a day contains the same few reads a million times. A `Column` holds the replies to one of them, in one
-situation, as consecutive bytes. `Outcomes` presents them in the form of a virtual context, `CellValues` presents the
-values of one cell from all columns that contain it, in recorded order. A recording therefore needs only its bytes in
-memory, and is usable as soon as it has been read. Pure.
+A recording of a day contains the same few reads a million times. A `Column` holds the replies to one of these reads, in one
+situation (`replay.situation`), as consecutive bytes. `Outcomes` presents a column as a sequence for a virtual context.
+`CellValues` presents the values of one cell from all columns that contain it, in recorded order. A recording therefore needs only
+its bytes in memory, and is usable as soon as it has been read. Pure.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ _WORDS: dict[bytes, RECORDING] = {}
 class Column:
     """The outcomes of `request` while the unit was in `situation`.
 
-    `odd` are the outcomes that are not a normal reply (b"" for silence), by position; every other one has `stride`
-    bytes in `replies`. `orders` are the positions in the whole recording.
+    `odd` holds by position the outcomes that are not a normal reply (b"" for silence); every other outcome has `stride` bytes in
+    `replies`. `orders` are the positions in the whole recording.
     """
 
     __slots__ = ("head", "latencies", "odd", "orders", "replies", "request", "situation", "stride", "times")
@@ -69,7 +69,7 @@ class Column:
         return [i for i in range(len(self.orders)) if i not in self.odd] if self.odd else range(len(self.orders))
 
     def drop_before(self, order: int) -> int:
-        """Drop what was recorded before that position in the recording, and return the number of dropped outcomes."""
+        """Drop the outcomes before this position in the recording, and return their number."""
         count = next((i for i, o in enumerate(self.orders) if o >= order), len(self.orders))
         del self.replies[: count * self.stride], self.orders[:count], self.times[:count], self.latencies[:count]
         self.odd = {i - count: reply for i, reply in self.odd.items() if i >= count}
@@ -127,9 +127,9 @@ class Outcomes(_View):
 
 
 class Merged:
-    """Normal replies of several columns in recorded order, as (column, position) by number.
+    """The normal replies of several columns in recorded order: number -> (column, position).
 
-    The order is computed on first access, once for all cells that these columns share.
+    The order is computed on first access, once for all cells that these columns contain.
     """
 
     def __init__(self, columns: Sequence[Column]) -> None:
@@ -139,7 +139,7 @@ class Merged:
         self._places: Sequence[int] = ()
 
     def at(self, i: int) -> tuple[int, int]:
-        """Return the number of the column and the position in it of the normal reply number `i`."""
+        """Return the column number of the normal reply number `i`, and its position in that column."""
         which = self._which
         if which is None:
             which = self._sort()

@@ -1,9 +1,9 @@
-"""Recorded counters: values in several registers that must never be mixed from different moments, and never run backwards.
+"""Recorded counters: values in several registers, whose registers always come from one moment, and which never run backwards.
 
-Registers of a counter that come from different moments form a number that never existed. A counter's registers
-therefore advance together: a read gets the present value, and the next value only when it reads a register of the
-present value again. Reading it whole or in parts gives the same numbers. Earlier writes do not affect a counter, and at
-the end of its recording it keeps its value, whatever the policy (SPEC ruling 3).
+Registers of a counter that come from different moments form a number that never existed. A counter's registers therefore advance
+together: a read gets the present value, and the counter advances to the next value only when a read contains a register that was
+already read. So reading the counter as a whole or in parts gives the same numbers. Earlier writes do not affect a counter, and at
+the end of its recording it keeps its value under every policy (SPEC ruling 3).
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class CounterSpan:
 
 
 class _Counter:
-    """One counter: assembled while learning, then read register by register."""
+    """One counter. Its values are assembled while the recording is learned, and then read register by register."""
 
     def __init__(self, span: CounterSpan) -> None:
         if not 1 <= span.count <= 4:

@@ -1,7 +1,7 @@
-"""What a recording reveals about its units: reads in columns, writes and their effects, refusals, limits, latency.
+"""Learn the behaviour of units from a recording: values that were read, writes and their effects, refusals, limits, latency.
 
-A `Learner` processes the exchanges once. The result is a virtual context whose commands are cells and shapes of
-requests, and a `LearntUnit` for each unit; `replay` answers from these. Pure.
+A `Learner` processes the exchanges once. The result is a virtual context whose commands are cells and shapes of requests, and a
+`LearntUnit` for each unit; `replay` answers from them. Pure.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class ReplayCounters:
 
 
 class LearntUnit:
-    """The knowledge about one unit besides the recordings themselves."""
+    """The learned properties of one unit, besides the recordings themselves."""
 
     def __init__(self) -> None:
         self.situations = Situations()
@@ -131,7 +131,7 @@ class Learner:
                 unit.write(request, request.values)
 
     def _learn_odd(self, unit: LearntUnit, request: CellRequest, exchange: RecordedExchange) -> None:
-        """Learn a read whose reply is not a normal one."""
+        """Learn a read that did not get a normal reply."""
         reply = exchange.reply or b""
         if requests.is_exception(exchange.request, reply):
             self._learn_refusal(unit, request, Recorded(exchange.t_s, self._response(reply), exchange.latency_s))
@@ -224,7 +224,7 @@ class Learner:
             unit.most_read[function] = max(column.request.count, unit.most_read.get(function, 0))
 
     def _count_on(self, unit_id: int, counted: set[Cell], columns: Sequence[Column]) -> None:
-        """Learn the cells of counters in recorded order, because their values are assembled register by register."""
+        """Learn the cells of counters, in recorded order because their values are assembled register by register."""
         if not counted:
             return
         having = [c for c in columns if any((c.request.table, a) in counted for a in c.request.addresses)]

@@ -1,9 +1,9 @@
 """Replays a recorded CANopen node: its object dictionary and its PDO stream, from a log of the bus.
 
-Values are resolved object by object (SPEC ruling 3), however the next client reads. Uploaded values are returned in
-recorded order, one value for each upload of the object. Values sent in TPDOs are signals, read at the emulator's clock,
-also by SDO. Values that the recorded client wrote are settings: the node starts with the first recorded value and then
-holds what is written. An object that was only ever refused with an abort is refused again. Block transfers are not
+Values are resolved object by object (SPEC ruling 3), so the next client may read in a different order. Uploaded values are
+returned in recorded order, one value for each upload of the object. Values that were sent in TPDOs are signals, read at the time
+of the emulator's clock, also by SDO. Values that the recorded client wrote are settings: the node starts with the first recorded
+value and then holds what is written. An object that was only ever refused with an abort is refused again. Block transfers are not
 evaluated. Pure; it knows no files.
 """
 
@@ -56,7 +56,7 @@ def node_of(log: CanLog, node_id: int) -> int:
 
 
 def recorded_objects(log: CanLog, dictionary: Dictionary, node_id: int) -> RecordedObjects:
-    """Return what a log contains of a node, for a node `node_id`, whose ID may have been different in the log.
+    """Return the recorded objects of a node in a log. The emulated node has the ID `node_id`, which may differ from the log.
 
     Raises `FileInvalid` or `UsageError`.
     """
@@ -74,8 +74,9 @@ class RecordedObjects:
     """A node's value source. `initial` are the values at the start (for `NodeContext.factory`), `refusals` are the
     objects that it aborts (for `NodeContext.refusals`).
 
-    Time begins with the first call and runs `speed` times as fast as recorded. After the log's end signals hold, start
-    again, or raise `UsedUp`, as `when_used_up` says; the same applies to each object whose uploaded values are used up.
+    Time begins with the first call and runs `speed` times as fast as recorded. After the end of the log `when_used_up` determines
+    whether signals hold their value, start again, or raise `UsedUp`; the same applies to each object whose uploaded values are
+    used up.
     """
 
     def __init__(
@@ -164,7 +165,7 @@ class RecordedObjects:
             self._transfer = None
 
     def _response(self, data: bytes) -> None:
-        """Process a response. The node's response completes a download: its acknowledgement, or the next request."""
+        """Process a response of the node. A download is noted when the node has acknowledged all of its bytes."""
         if self._transfer is None:
             return
         command, (key, download, raw) = data[0] >> 5, self._transfer

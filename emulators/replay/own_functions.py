@@ -1,7 +1,7 @@
 """The device-specific functions that a profile declares, on the unit that replays the device.
 
-Such a function has one documented request and one documented reply, and sets registers as the profile states; all other
-requests get exception 03. Like all emulator code, it has its own encoder.
+Such a function has one documented request and one documented reply, and sets registers as the profile states. Other requests of
+the function get exception 03. Like all emulator code, it has its own encoder.
 """
 
 from __future__ import annotations

@@ -121,7 +121,7 @@ class ExchangeReplay:
         return tuple(sorted(self._units))
 
     def respond(self, unit_id: int, pdu: bytes) -> Answer:
-        """Return the answer of the recorded unit to `pdu` (function code and data) now."""
+        """Return the recorded unit's next answer to `pdu` (function code and data)."""
         if not pdu:
             return Answer(None)
         unit = self._units.get(unit_id)
@@ -238,8 +238,7 @@ class ExchangeReplay:
     def _outcome(self, unit: LearntUnit, shape: bytes) -> Recorded | None:
         """Return the outcome of a request of this shape, in recorded order; None if none was recorded.
 
-        Silence is an event and not a state: when the recordings are used up, `HOLD` keeps the last answer, if there was
-        any.
+        Silence is an event and not a state: when the recordings are used up, `HOLD` repeats the last answer that was not silence.
         """
         situations = unit.recorded_in.get(shape)
         if situations is None:
@@ -270,7 +269,7 @@ class ExchangeReplay:
         return all(self._knows(unit_id, unit, (request.table, address)) for address in request.addresses)
 
     def _value(self, unit_id: int, unit: LearntUnit, cell: Cell) -> int:
-        """Return the value of one cell: from its counter, as recorded after the same writes, or as written."""
+        """Return the value of one cell: that of its counter, the value recorded after the same writes, or the written value."""
         if cell in unit.put:
             return unit.put[cell]
         if self.never_recorded is NeverRecorded.INTERPOLATE and not self._knows(unit_id, unit, cell):
@@ -303,7 +302,7 @@ class ExchangeReplay:
         return (known[at - 1], known[at]) if 0 < at < len(known) else None
 
     def _between_all(self, unit_id: int, unit: LearntUnit, request: CellRequest) -> bool:
-        """Return whether all unknown cells lie between known ones and may be interpolated."""
+        """Return whether all unknown cells lie between known cells and may be interpolated."""
         if self.never_recorded is not NeverRecorded.INTERPOLATE:
             return False
         cells = [(request.table, address) for address in request.addresses]

@@ -1,4 +1,4 @@
-"""The writes so far: the part of a device's past on which its recorded answers depend (SPEC ruling 3).
+"""The situation of a device: its past writes, on which its recorded answers depend (SPEC ruling 3).
 
 A situation is the last value written to each cell of one unit since the recording began. Each situation has a number.
 Recordings are kept by situation. A read uses the present situation or, if nothing was recorded in it, the most similar
@@ -21,7 +21,7 @@ MAX_SITUATIONS = 1024
 
 
 class Situations:
-    """Numbers the recorded situations of one unit and follows its writes. Number 0: nothing was written.
+    """The numbered situations of one unit, which follow its writes. In situation 0 nothing was written.
 
     After the recording has been learned, `rewind` returns to its beginning. From then on nothing more is learned, so
     that a client that always writes new values needs no memory.
@@ -88,7 +88,8 @@ class Situations:
     def most_alike(self, candidates: Sequence[int]) -> int:
         """Return the candidate most similar to the present situation; the earliest if there are several.
 
-        Most similar: most cells with the same value, then most cells written at all, then fewest additional writes.
+        The most similar candidate has the most cells with the same value; among equals the most cells that are written at all,
+        then the fewest additional writes.
         """
         if self.now is not None and self.now in candidates:
             return self.now

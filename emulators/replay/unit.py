@@ -26,7 +26,7 @@ class _NoBank(RegisterBank):
 
 
 class ReplayUnit(ModbusUnit):
-    """Unit `unit_id` of a recording, which must contain it. It may be served under any unit ID."""
+    """The unit `unit_id` of a recording, which must contain it. It may be served under any unit ID."""
 
     def __init__(self, replay: ExchangeReplay, unit_id: int, name: str = "", parts: UnitParts | None = None) -> None:
         if unit_id not in replay.units:

@@ -1,8 +1,8 @@
 """Formulas of a simulation: ``speed + (demand - speed) * dt / 0.8``, ``sine(11.5, 0.4, 600) + noise(0.01)``.
 
-They use a small part of Python's expressions. Python's parser reads them, and they are converted to functions of named
-values; no code of the file is ever executed. Everything is a float; a comparison is 1.0 or 0.0. Times are in seconds. A
-result that cannot be computed (a division by zero, the root of a negative number) is NaN, which means "no value".
+They use a small part of Python's expressions. Python's parser reads them, and they are converted to functions of named values; no
+code of the file is ever executed. All values are floats; a comparison gives 1.0 or 0.0. Times are in seconds. A result that
+cannot be computed (a division by zero, the root of a negative number) is NaN, which means "no value".
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ FUNCTIONS = (*sorted([*PLAIN, *OF_TIME]), "noise")
 
 
 class Formula:
-    """A formula, parsed once from `text`. `names`: the names that it uses. Raises `UsageError` for an invalid formula.
+    """A formula, parsed once from `text`. `names` are the names that it uses. Raises `UsageError` for an invalid formula.
 
     `known` are the names that may be used; `noise(SIGMA)` draws from `random`, once for each evaluation.
     """

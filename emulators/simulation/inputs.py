@@ -1,4 +1,4 @@
-"""Converts a value written to a device into a number for a simulation, from the raw bytes in the journal and the tag."""
+"""Convert a value that was written to a device from its raw bytes in the journal into a number for a simulation."""
 
 from __future__ import annotations
 

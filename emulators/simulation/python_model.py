@@ -73,7 +73,7 @@ class PythonModel:
         return out
 
     def _line_of(self, error: Exception) -> str:
-        """Return the line of the user's file at which it failed, as `` in line 7``; empty if the file has no part in it."""
+        """Return the line of the user's file in a traceback, as `` in line 7``; empty if the file does not occur."""
         frames = traceback.extract_tb(error.__traceback__)
         line = next((frame.lineno for frame in reversed(frames) if frame.filename == self._file), None)
         return f" in line {line}" if line is not None else ""

@@ -1,4 +1,4 @@
-"""Signals of a device that come from a simulation: the values of its tags, as if a recording held them."""
+"""Signals of a device that come from a simulation and are used like recorded signals."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from fieldtwin.gateway.core.errors import FileInvalid
 
 
 class SimulatedSignals(Signals):
-    """`plays`: signal -> name in the simulation.
+    """The simulated signals of a device. `plays` maps each signal to a name in the simulation.
 
-    Signals that are not simulated do not exist. `path` is used in messages.
+    Other signals do not exist. `path` is used in messages.
     """
 
     def __init__(self, simulation: Simulation, plays: Mapping[str, str], path: str) -> None:
@@ -24,7 +24,7 @@ class SimulatedSignals(Signals):
         self._plays = dict(plays)
 
     def __len__(self) -> int:
-        """Return 0: a simulation has no rows and is never used up."""
+        """Return 0, because a simulation has no rows and is never used up."""
         return 0
 
     def position_s(self, now_ns: int) -> float:

@@ -25,8 +25,8 @@ Step = Callable[[float, float, Mapping[str, float]], Mapping[str, float]]
 class Simulation:
     """Values by name from `start_ns` on, with a step every `step_ns`; the first step is at `start_ns` itself, with dt 0.
 
-    `start`: the values before the first step, NaN if only the step knows them. `inputs` are the names that `put` may
-    set; they are 0 before. Values are constant between two steps.
+    `start` are the values before the first step, NaN if only the step determines them. `inputs` are the names that `put` may set;
+    they are 0 at first. Values are constant between two steps.
     """
 
     def __init__(
@@ -54,7 +54,7 @@ class Simulation:
         self._values[name] = value
 
     def begin_with(self, values: Mapping[str, float]) -> bool:
-        """Set values for the next step to start with. Return False if the step keeps its own state."""
+        """Set the values with which the next step starts. Return False if the step keeps its own state."""
         known = {name: value for name, value in values.items() if name in self.names}
         self._values.update(known)
         return bool(known) and not self._own_state

@@ -1,9 +1,8 @@
 """Delivers signals between two callbacks of a virtual loop, and not during one.
 
-A signal handler raises its exception in whatever line runs at that moment. If asyncio called that line to wake a task,
-the task is never woken and cannot be ended in order any more. SIGINT and SIGTERM therefore wait until the callback is
-over. A second signal does not wait, because the callback may never end. The first one waits for at most `PATIENCE_S` of
-computing.
+A signal handler raises its exception in the line that happens to run. If that line was to wake a task, the task is never woken
+and can no longer be ended in order. SIGINT and SIGTERM therefore wait until the callback is over, but at most `PATIENCE_S` of
+computing time. A second signal does not wait, because the callback may never end.
 """
 
 from __future__ import annotations
@@ -22,9 +21,9 @@ Handler = Callable[[int, FrameType | None], object]
 
 
 class Interrupts:
-    """While entered, `stop` is called immediately for a signal that has a Python handler; `deliver` then calls the handler.
+    """A context manager that defers signals: a signal with a Python handler calls `stop`, and `deliver` later calls the handler.
 
-    Outside of the main thread, the only one that receives signals, it does nothing.
+    Only the main thread receives signals, so it does nothing in other threads.
     """
 
     def __init__(self, stop: Callable[[], None]) -> None:

@@ -44,11 +44,11 @@ class Escape(Bug):
 
 
 class Deadlock(Bug):
-    """Nothing is ready and no timer is set, or callbacks call each other without end at one instant."""
+    """The error that no callback is ready and no timer is set, or that callbacks call each other without end at one instant."""
 
 
 class _Call(asyncio.Handle):
-    """A handle that is created in fewer steps (`call_soon`): a virtual loop creates very many. It has no debug mode."""
+    """A handle of `call_soon` that is created in fewer steps, because a virtual loop creates very many. It has no debug mode."""
 
     __slots__ = ()
     _callback: Callable[..., object]
@@ -60,7 +60,7 @@ class _Call(asyncio.Handle):
 
 
 class _Timer(asyncio.TimerHandle):
-    """Like `_Call`, with a time."""
+    """A `_Call` with a time."""
 
     __slots__ = ()
     _when: float
@@ -141,7 +141,7 @@ class VirtualLoop(asyncio.AbstractEventLoop):
     def call_at_ns(
         self, when_ns: int, callback: Callable[[*Ts], object], *args: *Ts, context: Context | None = None
     ) -> asyncio.TimerHandle:
-        """Do the same as `call_at`, to the nanosecond. A time in the past is due at this instant, after what is ready."""
+        """Schedule a callback as `call_at` does, with a time in ns. A time in the past is due now, after the ready callbacks."""
         timer = _new(_Timer)
         timer._callback = callback
         timer._args = args
@@ -157,7 +157,7 @@ class VirtualLoop(asyncio.AbstractEventLoop):
         return timer
 
     def sleeper(self, when_ns: int) -> asyncio.Future[None]:
-        """Return a future that is done at `when_ns`, in fewer steps than with `call_at_ns`. A clock's sleep awaits it."""
+        """Return a future that is done at `when_ns`, for a clock's sleep. This takes fewer steps than `call_at_ns`."""
         future: asyncio.Future[None] = asyncio.Future(loop=self)
         self._sequence = sequence = self._sequence + 1
         now_ns = self.now_ns
@@ -167,14 +167,17 @@ class VirtualLoop(asyncio.AbstractEventLoop):
         return future
 
     def alarm(self, delay_s: float) -> asyncio.Future[None]:
-        """Do the same as `sleeper`, in seconds from now (`fieldtwin.gateway.core.concurrency.timeout`).
+        """Return a future that is done after a delay in seconds, see `fieldtwin.gateway.core.concurrency.timeout`.
 
         The caller may set the future earlier.
         """
         return self.sleeper(self.now_ns + round(delay_s * NS_PER_S))
 
     def _compact(self) -> None:
-        """Remove the timers that are no longer needed; do so again when half as many as remain could be over."""
+        """Remove the timers that are no longer needed.
+
+        The next removal is due when about half as many as now remain could be over.
+        """
         self._timers = [entry for entry in self._timers if not _is_over(entry[2])]
         heapify(self._timers)
         self._compact_at = self._sequence + max(_COMPACT_AFTER, len(self._timers) // 2)
@@ -394,7 +397,7 @@ def _is_over(due: _Timer | asyncio.Future[None]) -> bool:
 
 
 def culprit() -> str:
-    """Return the caller: the innermost frame outside of this package and the standard library, and its task."""
+    """Return the code that caused a call: the innermost frame outside of this package and the standard library, and its task."""
     frame: FrameType | None = sys._getframe(1)
     while frame is not None and _is_plumbing(frame):
         frame = frame.f_back

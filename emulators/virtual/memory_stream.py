@@ -1,4 +1,4 @@
-"""Connections in memory: two ends of a byte stream, with the time that bytes take between them.
+"""Connections in memory: two ends of a byte stream, and the transmission time of the bytes.
 
 Bytes written at one end arrive at the other in order and complete, immediately or after the line's character time.
 """
@@ -25,7 +25,7 @@ SENT = Direction.SENT
 
 
 class MemoryWire:
-    """A connection with two ends. `settings`: those of a serial line, whose baud rate applies; None: bytes take no time."""
+    """A connection with two ends. With the `settings` of a serial line, its baud rate applies; with None, bytes take no time."""
 
     def __init__(
         self,
@@ -63,7 +63,7 @@ class MemoryWire:
         self.loop.call_at_ns(pacer.send(now_ns, len(data)), receiver.arrived, data)
 
     def ended(self, direction: Direction) -> None:
-        """Close the writer's side of `direction`: after the bytes in transit, the peer is notified."""
+        """Close the writer's side of `direction`. The peer is notified after the bytes in transit."""
         receiver, pacer = (self.far, self._sent) if direction is SENT else (self.near, self._received)
         lost = ConnectionLost("the other side ended the connection", where=str(receiver.endpoint))
         if pacer is None:
@@ -78,7 +78,7 @@ class MemoryWire:
 
 
 class MemoryEnd(Client):
-    """One end. `direction` is that of its writes, as the gateway sees it."""
+    """One end of a connection. `direction` is the direction of its writes, as seen from the gateway."""
 
     def __init__(self, wire: MemoryWire, direction: Direction, kind: Connection[bytes], endpoint: Endpoint) -> None:
         super().__init__(kind, endpoint, MAX_PENDING)
@@ -91,7 +91,7 @@ class MemoryEnd(Client):
 
     @classmethod
     def again(cls, old: MemoryEnd) -> MemoryEnd:
-        """Return a new end that replaces a closed one, as when a port is opened again."""
+        """Return a new end that replaces a closed end, for a port that is opened again."""
         return cls(old.wire, old.direction, type(old.inbound)(), old.endpoint)
 
     def arrived(self, data: bytes) -> None:

@@ -1,6 +1,6 @@
-"""Seals a virtual run from the outside while it runs: clocks, sleep, sockets, threads, processes.
+"""Prevent a virtual run from using clocks, sleep, sockets, threads and processes of the outside.
 
-The loop itself refuses asyncio's operations; this module covers what code can reach without the loop. Clocks are
+The loop itself refuses asyncio's operations; this module covers the operations that bypass the loop. Clocks are
 attributes of ``time`` and ``datetime``, which are replaced, also in modules that imported them by name
 (`taken_clocks`). The rest is detected by audit events of the interpreter (PEP 578), which cannot be evaded. Only the
 sealed thread is checked.
@@ -67,7 +67,7 @@ def _refuse(name: str) -> None:
 
 
 def _made() -> list[tuple[Any, str, Any, Any]]:
-    """Return the replaced attributes: the module, the name in it, the original and its replacement."""
+    """Return the attributes to replace: the module, the name in it, the original and its replacement."""
     clocks = [(name, 1 << 30) for name in _CLOCKS] + list(_NOW_BY_DEFAULT.items())
     made = [(time, name, getattr(time, name), told_by) for name, told_by in clocks if hasattr(time, name)]
     return [(module, name, real, _guarded(real, told_by)) for module, name, real, told_by in made] + [

@@ -1,4 +1,4 @@
-"""Describes where a task waits, and for what, for the message of a deadlock.
+"""Describe where a task waits and for what, for the message of a deadlock.
 
 It knows nothing about the tasks themselves.
 """

@@ -1,9 +1,9 @@
-"""An acoustic channel for modems: one medium, with each modem at its own position.
+"""An acoustic channel: one medium that all modems share, each at its own position.
 
-Sound reaches all modems within range, at its speed, so a packet is received later at a larger distance. A modem that
-transmits receives nothing (half duplex), two packets that overlap at a receiver are both lost, and others are lost at
-random. A modem with packets to send waits while it transmits or receives. There are no acknowledgements and no
-retransmissions; the users of the modems must handle losses.
+Sound reaches all modems within range, at its speed, so a packet is received later at a larger distance. A modem that transmits
+receives nothing (half duplex), two packets that overlap at a receiver are both lost, and others are lost at random. A modem sends
+its next packet only when it neither transmits nor receives. There are no acknowledgements and no retransmissions; the users of
+the modems must handle losses.
 
 A function of time: events are computed in their order at the next access, and the same seed gives the same losses. It
 knows no modem registers, no sockets, and nothing of the content of packets.
@@ -33,8 +33,8 @@ PAUSE_NS = 200 * NS_PER_MS
 class AcousticProperties:
     """Properties of the medium that all packets share.
 
-    `overhead_bytes`: preamble, addresses and checksum of each packet. `loss`: the share of the packets that each
-    receiver loses at random.
+    `overhead_bytes` are preamble, addresses and checksum of each packet. `loss` is the share of the packets that each receiver
+    loses at random.
     """
 
     range_m: float
@@ -50,7 +50,7 @@ class AcousticProperties:
 
 @dataclass(slots=True)
 class Reception:
-    """A packet as one modem receives it, from `begins_ns` to `ends_ns`. `spoilt`: the reason of its loss, if it is lost."""
+    """A packet as one modem receives it, from `begins_ns` to `ends_ns`. `spoilt` is the reason of its loss, if it is lost."""
 
     payload: bytes
     begins_ns: int
@@ -68,7 +68,7 @@ LOSSES = ("collision", "speaking", "chance", "fault")
 class Counters:
     """Counters of one modem.
 
-    `lost` by cause: ``collision``, ``speaking`` (it transmitted itself), ``chance``, ``fault``.
+    `lost` counts lost packets by cause: ``collision``, ``speaking`` (the modem itself transmitted), ``chance``, ``fault``.
     """
 
     said: int = 0
@@ -98,9 +98,9 @@ class _Modem:
 
 
 class AcousticMedium:
-    """The medium.
+    """The shared medium.
 
-    `places`: the position of each modem in metres, in two or three dimensions. `spoils`: the faults, if any.
+    `places` gives the position of each modem in metres, in two or three dimensions. `spoils` applies the faults, if any.
     """
 
     def __init__(
@@ -128,7 +128,7 @@ class AcousticMedium:
 
     @property
     def next_ns(self) -> int | None:
-        """Return when the next event occurs; None: nothing happens until a modem sends."""
+        """Return the time of the next event (ns); None if nothing happens until a modem sends."""
         return self._events[0][0] if self._events else None
 
     def neighbours(self, name: str) -> list[str]:
@@ -230,7 +230,7 @@ class AcousticMedium:
         heappush(self._events, (t_ns, self._number, modem, reception))
 
     def _way_m(self, one: _Modem, other: _Modem) -> float | None:
-        """Return the distance between them; None if they are out of range."""
+        """Return the distance between two modems in metres; None if they are out of range."""
         way_m = dist(one.at_m, other.at_m)
         return way_m if way_m <= self.water.range_m else None
 

@@ -1,4 +1,4 @@
-"""The effect of one attempt to send on a modelled CAN bus: whether it is a frame or an error, and its effect on all nodes.
+"""One attempt to send on a modelled CAN bus: whether it ends as a frame or as an error, and its effect on all nodes.
 
 This module holds the nodes with their transmit queues and error counters, and the time at which the bus is free again;
 `can_bus` determines when an attempt is due and which nodes take part in its arbitration. Pure; the only times are those
@@ -64,7 +64,7 @@ class Attempts:
         self._others.clear()
 
     def leave(self, number: int) -> None:
-        """Mark a node that receives nothing more."""
+        """Mark a node as having left: it receives nothing more."""
         self.nodes[number].left = True
         self._others.clear()
 
@@ -81,7 +81,7 @@ class Attempts:
         return self.duration_ns(bits - fast) + (fast * NS_PER_S + self.data_bitrate // 2) // self.data_bitrate
 
     def busy(self, frame: CanFrame, bits: int, rest: int) -> tuple[int, int]:
-        """Return how long `bits` of `frame` and `rest` more take, and the equivalent number of bits at the nominal bit
+        """Return how long the first `bits` of `frame` and `rest` further bits take, and that time in bits at the nominal bit
         rate.
 
         The bits after a frame, or after an error in it, are always sent at the nominal bit rate.
@@ -136,7 +136,7 @@ class Attempts:
     def _contend(self, start: Start) -> tuple[CanFrame, list[int]] | None:
         """Resolve an arbitration that several nodes won.
 
-        Return the remaining frame and its senders; None if it ended in an error.
+        Return the remaining frame and its senders; None if the attempt ended in an error.
         """
         heads = {number: self.waiting[number].queue[0] for number in start.rivals}
         by_age = sorted(start.rivals, key=lambda number: heads[number].sequence)

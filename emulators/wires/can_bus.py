@@ -80,7 +80,7 @@ class CanBus:
         """Add a node and return its number. It receives frames that start from now on. Raises `EndpointBusy` if the bus
         is full.
 
-        With `listen_only` it never acknowledges or objects, and may not send.
+        With `listen_only` the node never acknowledges, never sends an error flag, and may not send.
         """
         if len(self._wire.nodes) >= self.max_nodes:
             raise EndpointBusy("the CAN bus is full", expected=f"at most {self.max_nodes} nodes")
@@ -105,8 +105,8 @@ class CanBus:
     def submit(self, node: int, frame: CanFrame, now_ns: int, *, counted: bool = True) -> bool:
         """Queue `frame` for transmission; return False (and queue nothing) while the node's transmit queue is full.
 
-        A refusal is `counted` unless the caller retries this frame. Frames of one node keep their order. In bus-off
-        they wait. Only the bus itself sends error frames: `UsageError`.
+        Set `counted` to False if the caller retries this frame, so that the refusal is not counted. Frames of one node keep their
+        order. In bus-off they wait. Raises `UsageError` for an error frame, because only the bus itself sends those.
         """
         if frame.error:
             raise UsageError("a node cannot send an error frame", got=str(frame))
@@ -200,9 +200,9 @@ class CanBus:
         return faults
 
     def next_event_ns(self) -> int | None:
-        """Return when `advance` will next have a result, as things stand; None if nothing will happen without a submission.
+        """Return the time (ns) at which `advance` will next have a result; None if nothing will happen without a submission.
 
-        A frame submitted meanwhile can change it only if the bus is idle until then; an error brings it forward.
+        A frame that is submitted before changes this time only if the bus is idle until then; an error makes it earlier.
         """
         if self._wire.done:
             return self._wire.done[0].frame.t_ns
@@ -261,9 +261,7 @@ class CanBus:
             self._next = None
 
     def _idles(self, start: Start) -> bool:
-        """Return whether the attempt changes nothing: a lone error-passive node without acknowledgement retries without
-        end.
-        """
+        """Return whether the attempt changes nothing: a lone error-passive node retries without acknowledgement."""
         if self.monitored or self.instant or self._wire.rules or len(start.rivals) != 1 or len(self._wire.waiting) != 1:
             return False
         lone = self._wire.nodes[start.rivals[0]]
@@ -296,7 +294,7 @@ class CanBus:
 
     @property
     def conflicts(self) -> int:
-        """Attempts in which nodes sent one arbitration field with different content."""
+        """Return the number of attempts in which nodes sent one arbitration field with different content."""
         return self._wire.conflicts
 
     @property
@@ -305,16 +303,16 @@ class CanBus:
 
     @property
     def frames(self) -> int:
-        """Frames that were sent on the bus."""
+        """Return the number of frames that were sent on the bus."""
         return self._wire.load.frames
 
     @property
     def bits(self) -> int:
-        """Bits for which the bus was busy."""
+        """Return the number of bits for which the bus was busy."""
         return self._wire.load.bits
 
     def load(self, now_ns: int) -> float:
-        """Return the share of the last second's bits that carried something, 0 to 1 (or more if frames are instant)."""
+        """Return the load of the bus in the last second, 0 to 1 (or more if frames are instant)."""
         return self._wire.load.total(now_ns)
 
     def stats(self, now_ns: int) -> dict[str, Any]:

@@ -39,9 +39,9 @@ class Notice:
 class ErrorFrame:
     """An error frame: an attempt to send `frame` that failed and is repeated.
 
-    `kind` is ``bit`` (the sender read a different level than it sent, including collisions), ``crc``, ``stuff`` (a
-    receiver objected there) or ``ack``. `t_ns` is when the first flag began, `bits` the length of the attempt until the
-    bus was free.
+    `kind` is ``bit`` (the sender read a different level than it sent, including collisions), ``crc`` or ``stuff`` (a receiver
+    detected an error), or ``ack``. `t_ns` is the time at which the first error flag began, `bits` the length of the attempt until
+    the bus was free.
     """
 
     t_ns: int

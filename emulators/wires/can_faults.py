@@ -59,14 +59,14 @@ class Confinement:
         self._judge()
 
     def not_acknowledged(self) -> None:
-        """Count a missing acknowledgement: until error-passive, never beyond (exception 1 of rule c)."""
+        """Count a missing acknowledgement, but only until the node is error-passive (exception 1 of rule c)."""
         if self.state is not CanErrorState.PASSIVE:
             self.send_failed()
 
     def receive_failed(self, *, first: bool) -> None:
         """Count an error during reception.
 
-        `first`: the node objected before the others, and saw their flags after its own.
+        `first` says that the node sent its error flag before the others, and saw their flags after its own.
         """
         self.rec = min(self.rec + (9 if first else 1), _REC_MAX)
         self._judge()
@@ -100,7 +100,7 @@ class Disturbance:
 
 
 class Rule(Protocol):
-    """Called once for each attempt to send a frame that won its arbitration; None: no error."""
+    """A function that is called once for each attempt to send a frame that won its arbitration. It returns None for no error."""
 
     def __call__(self, frame: CanFrame, start_ns: int, senders: tuple[int, ...], /) -> Disturbance | None: ...
 
@@ -112,8 +112,9 @@ def spoil(
     skip: int = 0,
     times: int | None = 1,
 ) -> Rule:
-    """Return a rule that destroys attempts to send frames that `match`: after `skip` good ones, the next `times` (None:
-    all).
+    """Return a rule that destroys attempts to send frames that `match`: after `skip` undisturbed attempts the next `times`.
+
+    If `times` is None, it destroys all further attempts.
 
     An attempt is not a frame: a destroyed frame is sent again, and the rule is called again. `times=32` takes a sender
     without errors to bus-off.

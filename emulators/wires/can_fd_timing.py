@@ -1,7 +1,7 @@
 """The duration of a CAN FD frame on the wire, bit by bit (ISO 11898-1:2015, 10.4.2 and 10.5).
 
-Pure arithmetic on one frame, like `can_timing` for classic frames. The differences: up to 64 bytes; the checksum
-follows a count of the stuff bits and has stuff bits at fixed positions instead of after five equal bits; and with the
+Pure arithmetic on one frame, like `can_timing` for classic frames. CAN FD differs in these points: a frame has up to 64 bytes;
+the checksum follows a count of the stuff bits, and has stuff bits at fixed positions instead of after five equal bits; with the
 bit-rate switch, the bits from ESI to the CRC delimiter are sent at the data bit rate.
 
 The rates change at the sample points of the bits BRS and CRC delimiter. With the same sample point in both phases, that
@@ -27,9 +27,9 @@ def fd_bits(frame: CanFrame) -> str:
 
 
 def data_phase(frame: CanFrame) -> tuple[int, int]:
-    """Return the first bit that is sent at the data bit rate and the first one after those, both counted from start of frame.
+    """Return the first bit that is sent at the data bit rate, and the first bit after the data phase, from start of frame.
 
-    Equal for a frame without the bit-rate switch.
+    Both are equal for a frame without the bit-rate switch.
     """
     if not frame.brs:
         return 0, 0
@@ -62,7 +62,10 @@ def _bits(can_id: int, data: bytes, extended: bool, brs: bool, esi: bool) -> str
 
 
 def _stuff(bits: str) -> tuple[str, int]:
-    """Return `bits` stuffed, and the number of stuff bits; none is added after the last bit, where a fixed one follows."""
+    """Return `bits` with stuff bits, and the number of stuff bits.
+
+    The last bit is never followed by one, because a fixed one follows.
+    """
     out: list[str] = []
     run_of, run, count = "", 0, 0
     for at, bit in enumerate(bits):

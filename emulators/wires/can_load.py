@@ -1,4 +1,4 @@
-"""Traffic of a CAN bus: totals, and the load of the last second, per identifier and per node.
+"""The traffic of a CAN bus: totals, and the load of the last second, by identifier and by node.
 
 The load counts every bit for which the bus was busy: frames with their stuff bits and interframe space, and errors. It
 is assigned to the identifier and the node that were sending. Bounded: beyond `MAX_IDS_COUNTED` identifiers the rest is
@@ -23,7 +23,7 @@ _OTHER = -1
 
 
 class BusLoad:
-    """Counts attempts of any outcome. An identifier is a number, with an additional bit if it is extended.
+    """The counters of all attempts, successful or not. An identifier is a number, with an additional bit if it is extended.
 
     Names and sums are computed on access.
     """
@@ -45,11 +45,11 @@ class BusLoad:
 
     @property
     def by_id(self) -> dict[str, int]:
-        """Whole frames by identifier, named as candump writes it."""
+        """Return the number of whole frames by identifier, in candump's notation."""
         return {_name(key): frames for key, frames in self._by_id.items()}
 
     def count(self, frame: CanFrame, bits: int, end_ns: int, senders: tuple[int, ...], *, whole: bool) -> None:
-        """Count `bits` that were on the wire until `end_ns`; `whole`: they were a frame, not an error."""
+        """Count `bits` that were on the bus until `end_ns`. `whole` says that they were a frame and not an error."""
         key = frame.can_id | _EXTENDED if frame.extended else frame.can_id
         by_id = self._by_id
         if key not in by_id and len(by_id) >= MAX_IDS_COUNTED:
@@ -64,18 +64,18 @@ class BusLoad:
         slot[by_sender] = slot.get(by_sender, 0) + bits
 
     def total(self, now_ns: int) -> float:
-        """Return the share of the last second's bits that carried something, 0 to 1 (or more if frames are instant)."""
+        """Return the load of the bus in the last second, 0 to 1 (or more if frames are instant)."""
         return sum(bits for _, bits in self._last_second(now_ns)) / self._one_s_bits
 
     def by_identifier(self, now_ns: int) -> dict[str, float]:
-        """Return the same, by identifier."""
+        """Return the load of the last second by identifier."""
         summed: Counter[str] = Counter()
         for (key, _), bits in self._last_second(now_ns):
             summed[_name(key)] += bits
         return {name: bits / self._one_s_bits for name, bits in summed.items()}
 
     def by_node(self, now_ns: int) -> dict[int, float]:
-        """Return the same, by node. A frame that nodes sent together counts for each of them."""
+        """Return the load of the last second by node. A frame that several nodes sent together counts for each of them."""
         summed: Counter[int] = Counter()
         for (_, senders), bits in self._last_second(now_ns):
             for node in senders:

@@ -25,10 +25,10 @@ class Pending(msgspec.Struct, frozen=True, gc=False):
 
 
 class Start(msgspec.Struct, frozen=True, gc=False):
-    """The next attempt, if no node submits a frame before its start. `rivals` share one arbitration field, the winning one.
+    """The next attempt, if no node submits a frame before its start.
 
-    `bits` is the length from its start to the end of the longest of their frames; at `end_ns` the attempt can be
-    evaluated.
+    `rivals` are the nodes that share the winning arbitration field. `bits` is the length from the start to the end of the longest
+    of their frames; at `end_ns` the attempt can be evaluated.
     """
 
     start_ns: int
@@ -42,7 +42,7 @@ class Start(msgspec.Struct, frozen=True, gc=False):
 class Node:
     """The state of a node on the bus.
 
-    `hold_ns`: it may not start earlier, because it is suspended or has just left bus-off.
+    The node may not start a frame before `hold_ns`, because its transmission is suspended or it has just left bus-off.
     """
 
     name: str
@@ -89,7 +89,10 @@ class BusOff(dict[int, int]):
         self[number] = RECOVERY_SEQUENCES
 
     def attempt_passed(self, idle_bits: int) -> None:
-        """Count an attempt of any outcome, after `idle_bits` of idle bus: its end is one more recessive sequence."""
+        """Count the recessive sequences of an attempt after `idle_bits` of idle bus.
+
+        The end of the attempt is one more sequence.
+        """
         for number in self:
             self[number] = max(0, self[number] - idle_bits // RECOVERY_BITS - 1)
 
@@ -104,5 +107,5 @@ class BusOff(dict[int, int]):
         return number
 
     def forget(self, number: int) -> None:
-        """Remove a node that has left for good."""
+        """Remove a node that has left the bus."""
         self.pop(number, None)

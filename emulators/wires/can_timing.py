@@ -57,7 +57,7 @@ def plain_bits(frame: CanFrame) -> str:
 
 
 def stuff(bits: str) -> str:
-    """Insert a complementary bit after every five equal ones, stuff bits counting as bits of the next run."""
+    """Insert a complementary bit after every five equal bits. A stuff bit counts as a bit of the next run."""
     out = []
     run_of, run = "", 0
     for bit in bits:
@@ -111,9 +111,9 @@ def _stuffed_length(can_id: int, data: bytes, extended: bool, remote: bool, dlc:
 
 
 def _steps() -> dict[tuple[int, str], tuple[int, int]]:
-    """Return the transitions from state and bit to state and stuff bits.
+    """Return the transitions from (state, bit) to (state, stuff bits).
 
-    A state is 0 (nothing yet), or ten times the level, plus the length of the run, plus one.
+    A state is 0 before the first bit, and later ten times the level, plus the length of the run, plus one.
     """
     steps = {}
     for state in (0, *(10 * level + run + 1 for level in (0, 1) for run in range(1, _STUFF_AFTER))):
@@ -146,10 +146,10 @@ def _tables() -> tuple[list[int], dict[int, list[tuple[int, int]]]]:
 
 
 def arbitration_key(frame: CanFrame) -> int:
-    """Return the arbitration field as a number, dominant bits low: of two frames that start together the lower key wins.
+    """Return the arbitration field as a number. Of two frames that start together, the frame with the lower number wins.
 
-    11-bit data before 11-bit remote before any 29-bit frame of the same base identifier (RTR, SRR and IDE are recessive
-    there); then the extension, then 29-bit data before 29-bit remote.
+    For one base identifier, 11-bit data frames win over 11-bit remote frames, and these win over all 29-bit frames (whose SRR and
+    IDE bits are recessive). Among 29-bit frames the extension decides, then data frames win over remote frames.
     """
     if frame.extended:
         base, extension = frame.can_id >> 18, frame.can_id & 0x3FFFF
@@ -158,7 +158,7 @@ def arbitration_key(frame: CanFrame) -> int:
 
 
 def wire_bits(frame: CanFrame) -> str:
-    """Return all bits of an acknowledged frame as on the wire, start to end of frame; stuffed up to the CRC's end."""
+    """Return all bits of an acknowledged frame from start to end of frame, stuffed up to the end of the CRC."""
     return (fd_bits(frame) if frame.fd else stuff(plain_bits(frame))) + "1" + "0" + "1" + "1" * 7
 
 
@@ -168,7 +168,7 @@ def last_errant_bit(frame: CanFrame) -> int:
 
 
 def crc_objection_bit(frame: CanFrame) -> int:
-    """Return where a receiver that found the CRC wrong starts its error flag: after the acknowledge delimiter."""
+    """Return the bit at which a receiver that found the CRC wrong starts its error flag: after the acknowledge delimiter."""
     return bits_to_end(frame) - 7
 
 
@@ -178,8 +178,7 @@ def acknowledge_bit(frame: CanFrame) -> int:
 
 
 def error_flag_bits(frame: CanFrame, seen: str) -> int:
-    """Return how long dominant error flags are on the wire if the first begins after `seen`, the bits of `frame` up to
-    there.
+    """Return the duration of dominant error flags in bits. The first flag begins after `seen`, the bits of `frame` up to there.
 
     The other nodes detect the error when the first flag's six dominant bits violate the stuffing or the fixed form, and
     reply with six bits of their own: 6 bits if all nodes detect it at once (the last bit of `seen` violated the

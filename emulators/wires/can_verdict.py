@@ -1,9 +1,8 @@
-"""The outcome of one attempt to send, bit by bit (ISO 11898-1, 10.11 and 12.1). Pure: from frames to a verdict.
+"""The outcome of one attempt to send, bit by bit (ISO 11898-1, 10.11 and 12.1). Pure.
 
-Collisions: several nodes won the arbitration with one identifier and different content. All send until the first bit
-that differs; there the bus is dominant, and each node that sent the recessive bit has a bit error. The flag of an
-error-active node destroys the frame for all nodes. An error-passive node gives way, and the others continue to the next
-bit that differs.
+In a collision, several nodes won the arbitration with one identifier and different content. All of them send until the first bit
+that differs. There the bus is dominant, and each node that sent the recessive bit has a bit error. The flag of an error-active
+node destroys the frame for all nodes. An error-passive node stops sending, and the others continue to the next bit that differs.
 """
 
 from __future__ import annotations
@@ -27,10 +26,9 @@ from fieldtwin.gateway.core.canframe import CanFrame
 
 @dataclass(frozen=True, slots=True)
 class CollisionOutcome:
-    """The outcome of a collision: `senders` remain, all with one frame. With `error_bit` it is destroyed, by an error
-    in that bit.
+    """The outcome of a collision: the `senders` that remain all send the same frame.
 
-    `losers` gave way, the last of them at `lost_bit`.
+    If `error_bit` is set, an error in that bit destroys the frame. `losers` stopped sending, the last of them at `lost_bit`.
     """
 
     senders: tuple[int, ...]
@@ -41,10 +39,10 @@ class CollisionOutcome:
 
 @dataclass(frozen=True, slots=True)
 class FailedAttempt:
-    """An error frame. `kind` as in `ErrorFrame`; the first flag begins at bit `flag_at`, and the attempt takes `bits` of
-    the bus.
+    """An attempt that ended in an error frame.
 
-    `first` are receivers that objected before all others. Their counters rise by more.
+    `ErrorFrame` describes `kind`. The first flag begins at bit `flag_at`, and the attempt takes `bits` of the bus. `first` are
+    receivers that sent their error flag before all others; their counters increase by more.
     """
 
     kind: str
@@ -54,8 +52,9 @@ class FailedAttempt:
 
 
 def collide(frames: Mapping[int, CanFrame], destroys: Callable[[int], bool]) -> CollisionOutcome:
-    """Resolve a collision of `frames` by node, with one arbitration field; `destroys`: whether a node's error flag is
-    dominant.
+    """Resolve a collision of `frames` by node, with one arbitration field.
+
+    `destroys` returns whether a node's error flag is dominant.
     """
     bits = {number: wire_bits(frame) for number, frame in frames.items()}
     left = dict(bits)
@@ -76,22 +75,18 @@ def collide(frames: Mapping[int, CanFrame], destroys: Callable[[int], bool]) -> 
 
 
 def collided(frame: CanFrame, error_bit: int) -> FailedAttempt:
-    """Return the verdict if a sender of a different frame read a dominant bit at `error_bit`, where it sent a recessive
-    one.
-    """
+    """Return the outcome if a sender read a dominant bit at `error_bit`, where it sent a recessive bit."""
     return _flagged("bit", frame, wire_bits(frame)[: error_bit + 1])
 
 
 def unacknowledged(frame: CanFrame) -> FailedAttempt:
-    """Return the verdict without an acknowledgement: the sender's flag follows the acknowledge slot, and overlaps no other."""
+    """Return the outcome without an acknowledgement: the sender's flag follows the acknowledge slot and overlaps no other."""
     at = acknowledge_bit(frame) + 1
     return FailedAttempt("ack", at, at + ERROR_FLAG_BITS + ERROR_DELIMITER_BITS + INTERFRAME_BITS)
 
 
 def disturbed(what: Disturbance, frame: CanFrame, victims: Collection[int], *, at_sender: bool) -> FailedAttempt:
-    """Return the verdict if `what` destroys the frame: at the sender (and all nodes), or by flags of `victims` among
-    receivers.
-    """
+    """Return the outcome if `what` destroys the frame, at the sender (and all nodes) or by error flags of `victims`."""
     wire = wire_bits(frame)
     first = frozenset() if at_sender else frozenset(victims)
     if what.at_bit is None:

@@ -1,7 +1,7 @@
 """A model of a serial line: when a character has arrived at the receiver.
 
-Pure arithmetic in integer nanoseconds. It opens nothing, waits for nothing and never sees the value of a byte. A pty or
-an in-memory connection uses it, because the configured baud rate does not slow either of them down.
+Pure arithmetic in integer nanoseconds. It opens nothing, waits for nothing and never sees the value of a byte. Ptys and in-memory
+connections use it, because they themselves ignore the configured baud rate.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ T1_5_FAST_NS, T3_5_FAST_NS = 750_000, 1_750_000
 
 
 class SerialPacer:
-    """One direction of a line with `settings`. Characters are sent one after the other; none is lost, none overtakes.
+    """One direction of a line with `settings`. Characters are sent one after the other; none is lost or overtakes another.
 
     All times are monotonic nanoseconds, rounded up: nothing ever arrives early.
     """
@@ -45,7 +45,7 @@ class SerialPacer:
         return -(-nbytes * numerator // denominator)
 
     def earliest_end(self, now_ns: int, nbytes: int) -> int:
-        """Return when `nbytes` sent at `now_ns` would have arrived, after the characters in transit.
+        """Return the time at which `nbytes` that are sent at `now_ns` would have arrived, after the characters in transit.
 
         Does not occupy the line.
         """
@@ -53,7 +53,7 @@ class SerialPacer:
         return (now_ns if now_ns > busy_ns else busy_ns) + self.duration_ns(nbytes)
 
     def send(self, now_ns: int, nbytes: int) -> int:
-        """Do the same as `earliest_end`, and occupy the line until then."""
+        """Occupy the line with `nbytes` and return the time at which they have arrived, see `earliest_end`."""
         busy_ns = self.busy_until_ns
         numerator, denominator = self._char
         self.busy_until_ns = end_ns = (now_ns if now_ns > busy_ns else busy_ns) - (-nbytes * numerator // denominator)

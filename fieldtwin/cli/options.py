@@ -54,13 +54,14 @@ class Duration(_OfFloat):
         return number * _UNIT_S[unit or "s"]
 
 
-junit_flavour_option = click.option(
-    "--junit-flavour",
-    type=click.Choice(["common", "jenkins"]),  # the values of fieldtwin.reports.junit.Flavour
-    default="common",
-    show_default=True,
-    help="With --junit: jenkins writes only what the schema of Jenkins' xUnit plugin (junit-10.xsd) allows.",
-)
+JUNIT_FLAVOUR: dict[str, Any] = {
+    "type": click.Choice(["common", "jenkins"]),  # the values of fieldtwin.reports.junit.Flavour
+    "default": "common",
+    "show_default": True,
+    "help": "With --junit: jenkins writes only what the schema of Jenkins' xUnit plugin (junit-10.xsd) allows.",
+}
+"""The arguments of `junit_flavour_option`, also for groups of options."""
+junit_flavour_option = click.option("--junit-flavour", **JUNIT_FLAVOUR)
 
 
 class Secret(_OfText):
@@ -101,7 +102,9 @@ def pairs(values: tuple[str, ...], what: str) -> dict[str, str]:
     return out
 
 
-json_option = click.option("--json", "as_json", is_flag=True, help="Print data as JSON on stdout.")
+JSON: dict[str, Any] = {"is_flag": True, "help": "Print data as JSON on stdout."}
+"""The arguments of `json_option`, also for groups of options."""
+json_option = click.option("--json", "as_json", **JSON)
 PROFILES: dict[str, Any] = {
     "multiple": True,
     "type": click.Path(exists=True, file_okay=False, path_type=Path),

@@ -6,12 +6,13 @@ import re
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 import click
 
+from fieldtwin.cli.option_groups import GroupedCommand, group
 from fieldtwin.cli.options import Duration
-from fieldtwin.cli.test.check_device import Check, list_cases, shared
+from fieldtwin.cli.test.check_device import CareOptions, Check
+from fieldtwin.cli.test.check_options import CaseOptions, ResultOptions
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import UsageError
 
@@ -19,23 +20,35 @@ _CELL = re.compile(r"^(holding|coil|input|discrete):(0[xX][0-9A-Fa-f]{1,4}|\d{1,
 _OBJECT = re.compile(r"^([0-9A-Fa-f]{4})h?(?::([0-9A-Fa-f]{1,2}))?$")
 
 
-@click.command("modbus")
+@click.command("modbus", cls=GroupedCommand)
 @click.argument("endpoint", required=False)
-@click.option("--unit", type=click.IntRange(0, 255), default=1, show_default=True, help="Unit ID of the device.")
-@click.option(
-    "--read", "reads", multiple=True, metavar="TABLE:ADDRESS",
-    help="A readable register or bit, such as holding:100 or holding:0x163, if none is near 0, 1, 100, 1000, 40000; repeatable.",
-)  # fmt: skip
-@click.option(
-    "--write", "writes", multiple=True, metavar="TABLE:ADDRESS[+COUNT]",
-    help="A cell that may be written, holding or coil, also in hexadecimal; what was there is put back. Repeatable.",
-)  # fmt: skip
-@click.option(
-    "--timeout", "timeout_s", type=Duration(), default="1s", show_default=True, help="Timeout for each reply."
+@group(
+    "Device",
+    click.option("--unit", type=click.IntRange(0, 255), default=1, show_default=True, help="Unit ID of the device."),
+    click.option(
+        "--read",
+        "reads",
+        multiple=True,
+        metavar="TABLE:ADDRESS",
+        help="A readable register or bit, such as holding:100 or holding:0x163, if none is near 0, 1, 100, 1000, 40000; "
+        "repeatable.",
+    ),
+    click.option(
+        "--write",
+        "writes",
+        multiple=True,
+        metavar="TABLE:ADDRESS[+COUNT]",
+        help="A cell that may be written, holding or coil, also in hexadecimal; what was there is put back. Repeatable.",
+    ),
+    click.option(
+        "--timeout", "timeout_s", type=Duration(), default="1s", show_default=True, help="Timeout for each reply."
+    ),
+    click.option("--echo", is_flag=True, help="The adapter echoes the sent bytes."),
+    click.option("--share-bus", is_flag=True, help="Also run on a line that carries other traffic."),
 )
-@click.option("--echo", is_flag=True, help="The adapter echoes the sent bytes.")
-@click.option("--share-bus", is_flag=True, help="Also run on a line that carries other traffic.")
-@shared
+@group("Limits", care=CareOptions)
+@group("Test cases", choice=CaseOptions)
+@group("Results", files=ResultOptions)
 def modbus(
     endpoint: str | None,
     unit: int,
@@ -44,7 +57,9 @@ def modbus(
     timeout_s: float,
     echo: bool,
     share_bus: bool,
-    **options: Any,
+    care: CareOptions,
+    choice: CaseOptions,
+    files: ResultOptions,
 ) -> int:
     """Test a Modbus device: all test cases of the list that a client can run.
 
@@ -59,22 +74,22 @@ def modbus(
     from fieldtwin.conformance.devices.modbus.cases import CASES
     from fieldtwin.conformance.devices.modbus.session import ModbusOptions, check_modbus, traits_of
 
-    if options["list_only"]:
-        return list_cases(CASES, options["as_json"])
+    if files.list_only:
+        return files.list_cases(CASES)
     if not endpoint:
         raise UsageError("no device to check", expected="an endpoint such as tcp://192.0.2.7:502")
     traits = traits_of(Endpoint.parse(endpoint))
     may_write = {table: (at, count) for table, at, count in map(_cell, writes)}
     if set(may_write) - {"holding", "coil"}:
         raise UsageError("--write", expected="holding:ADDRESS or coil:ADDRESS", got=", ".join(writes))
-    check = Check("modbus", endpoint, unit, options)
+    check = Check("modbus", endpoint, unit, care, choice, files)
     plan = check.plan(CASES, set(may_write), bool(writes))
     to_do = ModbusOptions(
-        endpoint, unit, plan, timeout_s, 1 / options["rate"], echo, share_bus=share_bus,
+        endpoint, unit, plan, timeout_s, 1 / care.rate, echo, share_bus=share_bus,
         given={table: at for table, at, _ in map(_cell, reads)}, may_write=may_write,
     )  # fmt: skip
     on_paper = modbus_dry_run(to_do)
-    if options["dry_run"]:
+    if care.dry_run:
         return check.on_paper(on_paper)
     check.ask(CASES, plan, traits)
     check.estimate(on_paper)
@@ -86,29 +101,47 @@ def modbus(
     return check.done(check.subject(checked, plan, began, writes, timeout_s), checked)
 
 
-@click.command("canopen")
+@click.command("canopen", cls=GroupedCommand)
 @click.argument("endpoint", required=False)
-@click.option("--node", type=click.IntRange(1, 127), help="Node ID of the device.")
-@click.option(
-    "--eds",
-    type=click.Path(exists=True, dir_okay=False, path_type=Path),
-    help="Its data sheet (EDS or DCF), for limits and access rights.",
+@group(
+    "Device",
+    click.option("--node", type=click.IntRange(1, 127), help="Node ID of the device."),
+    click.option(
+        "--eds",
+        type=click.Path(exists=True, dir_okay=False, path_type=Path),
+        help="Its data sheet (EDS or DCF), for limits and access rights.",
+    ),
+    click.option(
+        "--bitrate", type=click.IntRange(10_000, 1_000_000), help="Bit rate in bit/s, if the bus does not define it."
+    ),
+    click.option(
+        "--write",
+        "writes",
+        multiple=True,
+        metavar="INDEX:SUB",
+        help="An object that may be written, such as 2000:00 or 1017:00; what was there is put back. Repeatable.",
+    ),
+    click.option(
+        "--timeout",
+        "timeout_s",
+        type=Duration(),
+        default="500ms",
+        show_default=True,
+        help="Timeout for each SDO reply.",
+    ),
+    click.option(
+        "--boot",
+        "boot_s",
+        type=Duration(),
+        default="10s",
+        show_default=True,
+        help="Timeout for the boot-up after a reset.",
+    ),
+    click.option("--share-bus", is_flag=True, help="Also run on a node that another master uses over SDO."),
 )
-@click.option(
-    "--bitrate", type=click.IntRange(10_000, 1_000_000), help="Bit rate in bit/s, if the bus does not define it."
-)
-@click.option(
-    "--write", "writes", multiple=True, metavar="INDEX:SUB",
-    help="An object that may be written, such as 2000:00 or 1017:00; what was there is put back. Repeatable.",
-)  # fmt: skip
-@click.option(
-    "--timeout", "timeout_s", type=Duration(), default="500ms", show_default=True, help="Timeout for each SDO reply."
-)
-@click.option(
-    "--boot", "boot_s", type=Duration(), default="10s", show_default=True, help="Timeout for the boot-up after a reset."
-)
-@click.option("--share-bus", is_flag=True, help="Also run on a node that another master uses over SDO.")
-@shared
+@group("Limits", care=CareOptions)
+@group("Test cases", choice=CaseOptions)
+@group("Results", files=ResultOptions)
 def canopen(
     endpoint: str | None,
     node: int | None,
@@ -118,7 +151,9 @@ def canopen(
     timeout_s: float,
     boot_s: float,
     share_bus: bool,
-    **options: Any,
+    care: CareOptions,
+    choice: CaseOptions,
+    files: ResultOptions,
 ) -> int:
     """Test a CANopen node: all test cases of the list that a master can run.
 
@@ -132,21 +167,21 @@ def canopen(
     from fieldtwin.conformance.devices.canopen.session import CanopenOptions, check_canopen
     from fieldtwin.conformance.devices.dry_run import canopen_dry_run
 
-    if options["list_only"]:
-        return list_cases(CASES, options["as_json"])
+    if files.list_only:
+        return files.list_cases(CASES)
     if not endpoint or node is None:
         raise UsageError("no node to check", expected="an endpoint such as can:socketcan/can0, and --node")
     if not Endpoint.parse(endpoint).is_can:
         raise UsageError("CANopen needs a CAN bus", expected="such as can:socketcan/can0", got=endpoint)
     may_write = tuple(_object(text) for text in writes)
-    check = Check("canopen", endpoint, node, options)
+    check = Check("canopen", endpoint, node, care, choice, files)
     has = ({"object"} if may_write else set()) | ({"eds"} if eds is not None else set())
     plan = check.plan(CASES, has, bool(writes))
     to_do = CanopenOptions(
-        endpoint, node, plan, bitrate or 0, timeout_s, 1 / options["rate"], boot_s, eds, share_bus, may_write
+        endpoint, node, plan, bitrate or 0, timeout_s, 1 / care.rate, boot_s, eds, share_bus, may_write
     )
     on_paper = canopen_dry_run(to_do)
-    if options["dry_run"]:
+    if care.dry_run:
         return check.on_paper(on_paper)
     check.ask(CASES, plan, frozenset({"can"}))
     check.estimate(on_paper)

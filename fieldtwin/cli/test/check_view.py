@@ -17,7 +17,8 @@ from rich.progress import Progress as Bar
 from rich.table import Table
 
 from fieldtwin.conformance.core.case import OTHER_WIRE, Basis
-from fieldtwin.conformance.core.results import FOUND, called
+from fieldtwin.conformance.core.results import FOUND, called, counts_as_failed
+from fieldtwin.conformance.devices.device_case import DeviceCase
 from fieldtwin.console import stderr, stdout
 from fieldtwin.gateway.core.connection import Direction
 from fieldtwin.results.model import Verdict
@@ -84,14 +85,14 @@ def why(result: CaseResult) -> str:
     return f"required by {result.case.required_by}" if result.deviates else called(result)
 
 
-def print_results(results: Sequence[CaseResult], does: str = "the device", *, all_wires: bool = False) -> None:
-    """Print the results on stdout, each description below `does`; without a terminal one uncut line per case.
+def print_results(results: Sequence[CaseResult], *, all_wires: bool = False) -> None:
+    """Print the results on stdout; without a terminal one uncut line per case.
 
     Cases for other kinds of bus are only counted, unless `all_wires`.
     """
     elsewhere = [] if all_wires else [r for r in results if r.reason == OTHER_WIRE]
     results = [r for r in results if r not in elsewhere]
-    _print_each(results, does)
+    _print_each(results)
     styles = {called(r): style_of(r) for r in results}
     counts = Counter(called(r) for r in results)
     order = ("passed", *FOUND.values(), "error", "inconclusive", "skipped")
@@ -101,7 +102,7 @@ def print_results(results: Sequence[CaseResult], does: str = "the device", *, al
         stderr.print(f"{len(elsewhere)} more test cases are for other kinds of bus", markup=False)
 
 
-def _print_each(results: Sequence[CaseResult], does: str) -> None:
+def _print_each(results: Sequence[CaseResult]) -> None:
     if not stdout.is_terminal:
         for r in results:
             reason = f": {r.reason}" if r.reason else ""
@@ -113,7 +114,7 @@ def _print_each(results: Sequence[CaseResult], does: str) -> None:
         table.add_column("")
         table.add_column("case", no_wrap=True)
         table.add_column("danger", no_wrap=True)
-        table.add_column(does, ratio=2)
+        table.add_column("request" if _of_devices([r.case for r in results]) else "the device", ratio=2)
         table.add_column("result", ratio=3)
         for r in results:
             style, danger = style_of(r), r.case.danger.value
@@ -130,9 +131,20 @@ def _print_each(results: Sequence[CaseResult], does: str) -> None:
         stdout.print(table)
 
 
-def print_cases(
-    cases: Sequence[About], does: str = "what the device does", must: str = "what the master must do"
-) -> None:
+def print_not_counted(results: Sequence[CaseResult], fail_on: frozenset[Basis]) -> None:
+    """Print that failures are not counted, if there are any."""
+    if any(r.verdict.bad and not counts_as_failed(r, fail_on) for r in results):
+        stderr.print(
+            "The standard does not require what robustness and field problem cases ask. "
+            "The exit code does not count them: see --fail-on.", markup=False, soft_wrap=not stderr.is_terminal,
+        )  # fmt: skip
+
+
+def _of_devices(cases: Sequence[About]) -> bool:
+    return any(case.role == "device" for case in cases)
+
+
+def print_cases(cases: Sequence[About]) -> None:
     """Print all cases for `--list`: a table, or without a terminal one line per case."""
     if not stdout.is_terminal:
         for case in cases:
@@ -141,6 +153,8 @@ def print_cases(
             stdout.print(line, markup=False, soft_wrap=True)
         return
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    heads = ("what is sent", "what the device must do")
+    does, must = heads if _of_devices(cases) else ("what the device does", "what the master must do")
     for name in ("case", "basis", "danger", does, must, "source"):
         table.add_column(name, overflow="fold", no_wrap=name == "case")
     for case in cases:
@@ -155,13 +169,14 @@ def print_cases(
 def listed(case: About) -> dict[str, Any]:
     """Return the case for `--list --json`.
 
-    `elsewhere` has its basis and clause on kinds of bus where they differ.
+    `elsewhere` has its basis and clause on kinds of bus where they differ. A case for devices also has its `wires` and
+    `needs`.
     """
     keys = ("id", "title", "clause", "does", "must")
     elsewhere = [{"wire": e.wire, "basis": e.basis.value, "clause": e.clause} for e in case.elsewhere]
     return {k: getattr(case, k) for k in keys} | {
         "basis": case.basis.value, "danger": case.danger.value, "role": case.role, "elsewhere": elsewhere,
-    }  # fmt: skip
+    } | ({"wires": case.wires, "needs": case.needs} if isinstance(case, DeviceCase) else {})  # fmt: skip
 
 
 def print_dry_run(checked: Checked, *, as_json: bool) -> None:

@@ -13,7 +13,7 @@ from typing import Generic, Protocol, TypeVar
 
 from fieldtwin.conformance.clients.probe import Probe
 from fieldtwin.conformance.clients.recorder import Recorder
-from fieldtwin.conformance.core.case import OTHER_WIRE, TRAIL_S, Case, Finding, Impact, inconclusive, skipped
+from fieldtwin.conformance.core.case import OTHER_WIRE, TRAIL_S, Case, CasePlan, Finding, Impact, inconclusive, skipped
 from fieldtwin.conformance.core.evidence import Line, lines
 from fieldtwin.conformance.core.observation import (
     Ended,
@@ -80,21 +80,17 @@ class HostileDevice(Protocol[C_contra]):
 
 
 @dataclass(frozen=True, slots=True)
-class ClientTestOptions:
-    """The options of a run.
+class ClientPlan(CasePlan):
+    """The plan of a run against a master.
 
     `timeout_s` is the master's response timeout, 0 if unknown; `patience_s` is the longest time of any step, `wait_s`
-    the time until the master's first request; `has` the options that some cases need (``echo``); `at_most` the highest
-    impact level; `for_s` the end of the whole run, 0 for none.
+    the time until the master's first request.
     """
 
-    only: frozenset[str] = frozenset()
+    at_most: Impact = Impact.DISRUPT
     timeout_s: float = 0.0
     patience_s: float = 10.0
     wait_s: float = 30.0
-    for_s: float = 0.0
-    has: frozenset[str] = frozenset()
-    at_most: Impact = Impact.DISRUPT
 
 
 @dataclass
@@ -108,7 +104,7 @@ class MasterRun(Generic[C]):
     stage: HostileDevice[C]
     cases: Sequence[C]
     silent: C
-    plan: ClientTestOptions
+    plan: ClientPlan
     traits: frozenset[str]
     probe: Probe | None = None
     tell: Callable[[CaseResult], None] = lambda result: None

@@ -16,7 +16,7 @@ from fieldtwin.conformance.clients.modbus.hostile_server import HostileServer, t
 from fieldtwin.conformance.clients.modbus.pty_line import PtyLine
 from fieldtwin.conformance.clients.probe import Classifier, MarkedOutputProbe, OutputProbe, Probe, RegisterProbe
 from fieldtwin.conformance.clients.program import OnText, Program
-from fieldtwin.conformance.clients.run import C, ClientTestOptions, MasterRun
+from fieldtwin.conformance.clients.run import C, ClientPlan, MasterRun
 from fieldtwin.conformance.core.observation import Event, Word
 from fieldtwin.conformance.core.results import CaseResult
 from fieldtwin.emulators.endpoints.ports import OsPorts
@@ -42,7 +42,7 @@ class Options:
     """
 
     listen: Endpoint
-    plan: ClientTestOptions
+    plan: ClientPlan
     words: tuple[int, int, int]
     probe: str = ""
     stands_for_none: frozenset[str] = frozenset()

@@ -157,6 +157,21 @@ class About:
 
 
 @dataclass(frozen=True, slots=True)
+class CasePlan:
+    """The choice of cases, and the limits of a run.
+
+    `only` are IDs or entries of the test-case list, all if empty; `at_most` is the highest impact level; `has` the inputs
+    and options that some cases need (``holding``, ``coil``, ``object``, ``eds``, ``i-know``, ``echo``); no case begins
+    `for_s` seconds after the start or later, 0 for no limit.
+    """
+
+    only: frozenset[str] = frozenset()
+    at_most: Impact = Impact.READ
+    has: frozenset[str] = frozenset()
+    for_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
 class Case(About):
     """A case for masters, with its check."""
 

@@ -1,18 +1,17 @@
-"""Results of a judgement: waived or not, counted, as JSON and for the reports."""
+"""Results of conformance tests of devices and masters: waived or not, counted, as JSON and for the reports."""
 
 from __future__ import annotations
 
-import shlex
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import date
-from typing import Any
+from typing import Any, TypeVar
 
 from fieldtwin.conformance.core.case import About, Basis, Finding, failed
-from fieldtwin.conformance.core.evidence import Line, reproduce
+from fieldtwin.conformance.core.evidence import Line
 from fieldtwin.conformance.core.waivers import Waivers
-from fieldtwin.results.model import CheckResult, Report, ScenarioResult, Verdict
+from fieldtwin.results.model import CheckResult, ScenarioResult, Verdict
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +40,10 @@ class CaseResult:
         return f"waived: {self.waived} (failed: {self.finding.reason})" if self.waived else self.finding.reason
 
 
-def waive(result: CaseResult, waivers: Waivers, today: date) -> CaseResult:
+R = TypeVar("R", bound=CaseResult)
+
+
+def waive(result: R, waivers: Waivers, today: date) -> R:
     """Apply the waiver of the result, if there is one. An expired waiver is a failure, whatever the finding."""
     waiver = waivers.of(result.case.id, result.case.row)
     if waiver is None:
@@ -85,42 +87,38 @@ def summary(results: Sequence[CaseResult]) -> str:
     return ", ".join(f"{counts[word]} {word}" for word in order if counts[word]) or "no case was chosen"
 
 
-KIND = "fieldtwin check-master"
-VERSION = 1
-
-
-def as_json(about: Mapping[str, Any], results: Sequence[CaseResult], argv: Sequence[str]) -> dict[str, Any]:
-    """Return the whole test of a master. `about` names the test, `argv` is the command line, for `reproduce`."""
+def document(
+    kind: str, version: int, about: Mapping[str, Any], results: Sequence[CaseResult], cases: Sequence[Mapping[str, Any]]
+) -> dict[str, Any]:
+    """Return a whole test as data for JSON. `about` names the test, `cases` are its results (`case_json`)."""
     return {
-        "kind": KIND,
-        "version": VERSION,
+        "kind": kind,
+        "version": version,
         "about": dict(about),
         "counts": dict(Counter(r.verdict.value for r in results)),
         "findings": {basis.value: sum(r.verdict.bad and r.case.basis is basis for r in results) for basis in Basis},
-        "cases": _cases(results, argv),
+        "cases": list(cases),
     }
 
 
-def _cases(results: Sequence[CaseResult], argv: Sequence[str]) -> list[dict[str, Any]]:
-    return [
-        {
-            "id": r.case.id,
-            "title": r.case.title,
-            "clause": r.case.clause,
-            "basis": r.case.basis.value,
-            "role": r.case.role,
-            "danger": r.case.danger.value,
-            "device": r.case.does,
-            "expected": r.case.must,
-            "verdict": r.verdict.value,
-            "reason": r.reason,
-            "waived": bool(r.waived),
-            "took_s": round(r.took_s, 3),
-            "reproduce": reproduce(argv, r.case.id),
-            "wire": [line.as_json() for line in r.wire],
-        }
-        for r in results
-    ]
+def case_json(result: CaseResult, action: str, **more: Any) -> dict[str, Any]:
+    """Return a result as data for JSON. `action` is the key of the checker's action, `more` further keys."""
+    case = result.case
+    return {
+        "id": case.id,
+        "title": case.title,
+        "clause": case.clause,
+        "basis": case.basis.value,
+        "role": case.role,
+        "danger": case.danger.value,
+        action: case.does,
+        "expected": case.must,
+        "verdict": result.verdict.value,
+        "reason": result.reason,
+        "waived": bool(result.waived),
+        "took_s": round(result.took_s, 3),
+        **more,
+    }
 
 
 def for_build(result: CaseResult, fail_on: frozenset[Basis]) -> tuple[Verdict, str]:
@@ -136,25 +134,17 @@ def for_build(result: CaseResult, fail_on: frozenset[Basis]) -> tuple[Verdict, s
     return Verdict.SKIPPED, f"{called(result)} finding: {result.reason}"
 
 
-def as_report(
-    results: Sequence[CaseResult],
-    title: str,
-    argv: Sequence[str],
-    started: str,
-    fail_on: frozenset[Basis] = ONLY_REQUIRED,
-) -> Report:
-    """Return the results as a JUnit report: a scenario for each case, with its frames."""
-    again = shlex.join(["fieldtwin", *argv])
-    scenarios = [_scenario(r, title, argv, fail_on) for r in results]
-    return Report(f"{title}: {summary(results)}", scenarios, started=started, reproduce=again, target=title)
-
-
-def _scenario(result: CaseResult, target: str, argv: Sequence[str], fail_on: frozenset[Basis]) -> ScenarioResult:
+def as_scenario(
+    result: CaseResult, target: str, again: str, fail_on: frozenset[Basis], wire: str = "", evidence: Sequence[str] = ()
+) -> ScenarioResult:
+    """Return a result for a build's test report. `again` is the command that repeats the case, `wire` its frames."""
     case = result.case
     verdict, reason = for_build(result, fail_on)
-    check = CheckResult("1", f"{case.does}: {case.must}", verdict, expected=case.must, got=reason)
+    checks = [CheckResult("1", f"{case.does}: {case.must}", verdict, expected=case.must, got=reason)]
+    if wire:
+        checks.append(CheckResult("wire", wire, verdict))
     return ScenarioResult(
-        f"{case.id} {case.title}", verdict, [check], requirements=(case.row,), target=target, reason=reason,
-        reproduce=reproduce(argv, case.id), took_s=result.took_s, case=case.id, role=case.role, danger=case.danger.value,
-        basis=case.basis.value, clause=case.clause, evidence=tuple(map(str, result.wire)),
+        f"{case.id} {case.title}", verdict, checks, requirements=(case.row,), target=target, reason=reason,
+        reproduce=again, took_s=result.took_s, case=case.id, role=case.role, danger=case.danger.value,
+        basis=case.basis.value, clause=case.clause, evidence=tuple(evidence),
     )  # fmt: skip

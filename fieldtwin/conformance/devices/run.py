@@ -6,10 +6,9 @@ This module depends on no protocol; a connection can be settled, and states its 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
-from fieldtwin.conformance.core.case import OTHER_WIRE, Finding, Impact, failed, inconclusive, skipped
+from fieldtwin.conformance.core.case import OTHER_WIRE, CasePlan, Finding, Impact, failed, inconclusive, skipped
 from fieldtwin.conformance.devices.device_case import DeviceCase, DeviceResult, NotHere, Spoken, Unsaid
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.clock import NS_PER_S, Clock
@@ -23,20 +22,6 @@ MOST_BYTES = 512
 """Maximum number of bytes that are kept of one chunk."""
 MOST_LOST = 3
 """Number of cases before which the device could not be recovered; then the run stops."""
-
-
-@dataclass(frozen=True, slots=True)
-class DeviceTestOptions:
-    """The limits of a check.
-
-    `has`: the inputs that the user gave (``holding``, ``coil``, ``object``, ``eds``, ``i-know``); `at_most` the highest
-    impact level; `for_s` the end of the whole check, 0 for none.
-    """
-
-    only: frozenset[str] = frozenset()
-    at_most: Impact = Impact.READ
-    has: frozenset[str] = frozenset()
-    for_s: float = 0.0
 
 
 class Settling(Protocol):
@@ -79,7 +64,7 @@ class Transcript(Tap):
 W = TypeVar("W", bound=Settling)
 
 
-def why_not(case: DeviceCase[W], plan: DeviceTestOptions, traits: frozenset[str]) -> str:
+def why_not(case: DeviceCase[W], plan: CasePlan, traits: frozenset[str]) -> str:
     """Return the reason for which the case is not run with that plan on that transport; empty if it is run."""
     if case.wires and not traits & set(case.wires):
         return OTHER_WIRE
@@ -103,7 +88,7 @@ HOW_TO_GIVE = {
 async def play(
     wire: W,
     cases: Sequence[DeviceCase[W]],
-    plan: DeviceTestOptions,
+    plan: CasePlan,
     transcript: Transcript,
     clock: Clock,
     tell: Callable[[DeviceResult], None] = lambda result: None,

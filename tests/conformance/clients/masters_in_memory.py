@@ -12,7 +12,7 @@ from fieldtwin.conformance.clients.canopen.hostile_node import HostileNode
 from fieldtwin.conformance.clients.modbus.cases import CASES, SILENT
 from fieldtwin.conformance.clients.modbus.hostile_server import HostileServer, traits, wire_for
 from fieldtwin.conformance.clients.probe import Classifier
-from fieldtwin.conformance.clients.run import ClientTestOptions, MasterRun
+from fieldtwin.conformance.clients.run import ClientPlan, MasterRun
 from fieldtwin.conformance.core.observation import Word
 from fieldtwin.conformance.core.results import CaseResult
 from fieldtwin.emulators.endpoints.memory_ports import MemoryNet
@@ -79,7 +79,7 @@ def judge(
         net, plant, told = MemoryNet(loop), Endpoint.parse(url), Told()
         clock = VirtualClock(loop)
         stage = HostileServer(wire_for(plant.scheme), WORDS, {})
-        plan = ClientTestOptions(frozenset(only), timeout_s=timeout_s, patience_s=5.0)
+        plan = ClientPlan(frozenset(only), timeout_s=timeout_s, patience_s=5.0)
         run = MasterRun(stage, CASES, SILENT, plan, traits(plant.scheme), told if probed else None)
         async with Nursery() as nursery:
             if plant.is_serial:
@@ -143,7 +143,7 @@ def judge_canopen(master: Master, *only: str, timeout_s: float = TIMEOUT_S) -> d
         net, told, clock = MemoryNet(loop), Told(), VirtualClock(loop)
         bus = await net.can_bus(Endpoint.parse("can:fieldtwin/127.0.0.1:0"), 125_000, paced=True)
         stage = HostileNode(WORDS, nodes=(5,))
-        plan = ClientTestOptions(frozenset(only), timeout_s=timeout_s, patience_s=5.0)
+        plan = ClientPlan(frozenset(only), timeout_s=timeout_s, patience_s=5.0)
         run = MasterRun(stage, CANOPEN_CASES, CANOPEN_SILENT, plan, frozenset({"can", "heartbeat"}), told)
         async with Nursery() as nursery:
             nursery.start(stage.serve(await bus.join("nodes")), "nodes")

@@ -22,8 +22,9 @@ from test_strange_masters_judged import environment
 from fieldtwin.cli.test.check_view import listed, print_results, style_of, why
 from fieldtwin.conformance.clients.canopen.cases import CASES as CANOPEN_MASTERS
 from fieldtwin.conformance.clients.modbus.cases import CASES as MODBUS_MASTERS
+from fieldtwin.conformance.clients.results import as_json, as_report
 from fieldtwin.conformance.core.case import OTHER_WIRE, OWN, About, Basis, failed, passed, skipped
-from fieldtwin.conformance.core.results import CaseResult, as_json, as_report, exit_code
+from fieldtwin.conformance.core.results import CaseResult, exit_code
 from fieldtwin.conformance.devices.canopen import cases as canopen_devices
 from fieldtwin.conformance.devices.modbus import cases as modbus_devices
 from fieldtwin.reports.conformance.client import render_master_html

@@ -10,8 +10,9 @@ from xml.etree import ElementTree as ET
 import pytest
 
 from fieldtwin.conformance.clients.modbus.cases import CASES
+from fieldtwin.conformance.clients.results import as_json, as_report
 from fieldtwin.conformance.core.case import Finding, failed, passed, skipped
-from fieldtwin.conformance.core.results import CaseResult, as_json, as_report, exit_code, waive
+from fieldtwin.conformance.core.results import CaseResult, exit_code, waive
 from fieldtwin.conformance.core.waivers import Waivers, read_waivers
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.core.files.yaml_file import parse

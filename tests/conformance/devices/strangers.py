@@ -18,11 +18,10 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from fieldtwin.conformance.core.case import Impact
+from fieldtwin.conformance.core.case import CasePlan, Impact
 from fieldtwin.conformance.devices.device_case import DeviceResult
 from fieldtwin.conformance.devices.modbus.cases import CASES
 from fieldtwin.conformance.devices.modbus.session import ModbusOptions, check_modbus, traits_of
-from fieldtwin.conformance.devices.run import DeviceTestOptions
 from fieldtwin.emulators.endpoints.pty import PtyEnd
 from fieldtwin.gateway.connections.os_connector import OsConnector
 from fieldtwin.gateway.core.connection import ByteConnection
@@ -105,7 +104,7 @@ async def _serve(stack: AsyncExitStack, peer: str, jobs: Sequence[dict[str, Any]
 
 async def _check(wire: str, ids: Sequence[str], port: int, line: PtyEnd | None, after_s: float) -> list[DeviceResult]:
     await asyncio.sleep(after_s)
-    plan = DeviceTestOptions(frozenset(ids), Impact.DISRUPT, frozenset({"holding", "coil", "i-know"}))
+    plan = CasePlan(frozenset(ids), Impact.DISRUPT, frozenset({"holding", "coil", "i-know"}))
     url = f"tcp://127.0.0.1:{port}" if line is None else f"{wire}:/line?baudrate=115200&frame=8N1"
     connector = OsConnector() if line is None else PtyConnector(line)
     options = ModbusOptions(

@@ -11,8 +11,8 @@ import pytest
 from devices_in_memory import on_modbus
 
 from fieldtwin.cli.test.check_device_command import _cell
+from fieldtwin.conformance.core.case import CasePlan
 from fieldtwin.conformance.devices.modbus.session import ModbusOptions, check_modbus
-from fieldtwin.conformance.devices.run import DeviceTestOptions
 from fieldtwin.emulators.endpoints.memory_ports import MemoryNet
 from fieldtwin.emulators.modbus.bank import MapBank, Span
 from fieldtwin.emulators.modbus.unit import ModbusUnit
@@ -43,7 +43,7 @@ def test_cases_of_bits_run_on_the_writable_coil() -> None:
     unit = ModbusUnit(MapBank([Span("holding", 0, 10), Span("coil", 500, 8)]))
 
     async def use(net: MemoryNet, url: str, clock: VirtualClock) -> dict[str, str]:
-        plan = DeviceTestOptions(frozenset({"MB-036c", "MB-049"}), has=frozenset({"coil"}))
+        plan = CasePlan(frozenset({"MB-036c", "MB-049"}), has=frozenset({"coil"}))
         options = ModbusOptions(url, 1, plan, may_write={"coil": (500, 1)}, connector=net, clock=clock)
         return {r.case.id: r.verdict.value for r in (await check_modbus(options)).results}
 

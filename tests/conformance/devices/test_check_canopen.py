@@ -13,10 +13,9 @@ from canopen_slave_rig import NODE
 from nodes_on_a_bus import LONG, Serve, local_node, on_bus, ours
 from support import run
 
-from fieldtwin.conformance.core.case import Impact
+from fieldtwin.conformance.core.case import CasePlan, Impact
 from fieldtwin.conformance.devices.canopen.session import CanopenOptions, check_canopen
 from fieldtwin.conformance.devices.checked import Checked
-from fieldtwin.conformance.devices.run import DeviceTestOptions
 from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
 from fieldtwin.emulators.endpoints.memory_ports import MemoryNet
 from fieldtwin.emulators.virtual.clock import VirtualClock
@@ -27,7 +26,7 @@ from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import NotAllowed
 from fieldtwin.results.model import Verdict
 
-ALL = DeviceTestOptions(at_most=Impact.DISRUPT, has=frozenset({"object", "eds", "i-know"}))
+ALL = CasePlan(at_most=Impact.DISRUPT, has=frozenset({"object", "eds", "i-know"}))
 MAY_WRITE = ((0x2000, 0), (0x2004, 0), (0x1017, 0))
 KNOWN = tomllib.loads((Path(__file__).parents[2] / "vectors" / "check_localnode.toml").read_text())
 
@@ -41,7 +40,7 @@ def eds(tmp_path: Path) -> Path:
     return path
 
 
-def check(serve: Serve, eds: Path, plan: DeviceTestOptions = ALL) -> Checked:
+def check(serve: Serve, eds: Path, plan: CasePlan = ALL) -> Checked:
     async def use(net: MemoryNet, url: str, clock: VirtualClock) -> Checked:
         options = CanopenOptions(
             url, NODE, plan, eds=eds, may_write=MAY_WRITE, connector=net, clock=clock, timeout_s=0.1, boot_s=1.0
@@ -97,9 +96,7 @@ def test_localnode_with_its_threads_on_the_software_bus(eds: Path) -> None:
         network.bus = await asyncio.to_thread(SoftBus, server.bound.path)
         network.connect()
         try:
-            plan = DeviceTestOptions(
-                frozenset(["CO-001a", "CO-008a", "CO-008b", "CO-021", "CO-041"]), Impact.WRITE, ALL.has
-            )
+            plan = CasePlan(frozenset(["CO-001a", "CO-008a", "CO-008b", "CO-021", "CO-041"]), Impact.WRITE, ALL.has)
             options = CanopenOptions(
                 str(server.bound), NODE, plan, eds=eds, may_write=MAY_WRITE, timeout_s=0.3, spacing_s=0.0
             )  # fmt: skip

@@ -8,9 +8,8 @@ from pathlib import Path
 from canopen_slave_rig import NODE
 from nodes_on_a_bus import LONG, on_bus, ours
 
-from fieldtwin.conformance.core.case import Impact
+from fieldtwin.conformance.core.case import CasePlan, Impact
 from fieldtwin.conformance.devices.canopen.session import CanopenOptions, check_canopen
-from fieldtwin.conformance.devices.run import DeviceTestOptions
 from fieldtwin.emulators.canopen.dictionary import parse_eds
 from fieldtwin.emulators.canopen.node import CanopenNode
 from fieldtwin.emulators.canopen.serve import serve_node
@@ -68,7 +67,7 @@ def verdicts(
     eds.write_text(LONG)
 
     async def use(net: MemoryNet, url: str, clock: VirtualClock) -> dict[str, tuple[Verdict, str]]:
-        plan = DeviceTestOptions(frozenset(only), Impact.WRITE, frozenset({"object", "eds"}))
+        plan = CasePlan(frozenset(only), Impact.WRITE, frozenset({"object", "eds"}))
         options = CanopenOptions(
             url, NODE, plan, eds=eds, may_write=may_write, connector=net, clock=clock, timeout_s=0.1, boot_s=0.5
         )  # fmt: skip

@@ -9,9 +9,8 @@ import pytest
 from canopen_slave_rig import NODE
 from nodes_on_a_bus import LONG, on_bus
 
-from fieldtwin.conformance.core.case import Impact
+from fieldtwin.conformance.core.case import CasePlan, Impact
 from fieldtwin.conformance.devices.canopen.session import CanopenOptions, check_canopen
-from fieldtwin.conformance.devices.run import DeviceTestOptions
 from fieldtwin.emulators.canopen.dictionary import parse_eds
 from fieldtwin.emulators.canopen.node import CanopenNode
 from fieldtwin.emulators.canopen.serve import serve_node
@@ -162,7 +161,7 @@ def test_a_wrong_node_fails_the_case_for_its_error(case_id: str, tmp_path: Path)
         await serve_node(connection, node, clock)
 
     async def use(net: MemoryNet, url: str, clock: VirtualClock) -> dict[str, str]:
-        plan = DeviceTestOptions(at_most=Impact.DISRUPT, has=frozenset({"object", "eds", "i-know"}))
+        plan = CasePlan(at_most=Impact.DISRUPT, has=frozenset({"object", "eds", "i-know"}))
         options = CanopenOptions(
             url, NODE, plan, eds=eds, may_write=MAY_WRITE, connector=net, clock=clock, timeout_s=0.1, boot_s=0.5
         )  # fmt: skip

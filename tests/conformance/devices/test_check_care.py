@@ -12,13 +12,12 @@ from click.testing import CliRunner, Result
 from devices_in_memory import make_unit, on_modbus
 
 from fieldtwin.cli.test.check_command import command
-from fieldtwin.conformance.core.case import Impact
+from fieldtwin.conformance.core.case import CasePlan, Impact
 from fieldtwin.conformance.devices.device_case import DeviceResult
 from fieldtwin.conformance.devices.dry_run import canopen_dry_run, modbus_dry_run
 from fieldtwin.conformance.devices.modbus.cases import CASES
 from fieldtwin.conformance.devices.modbus.connection import READS, WRITES, DeviceConnection
 from fieldtwin.conformance.devices.modbus.session import ModbusOptions, check_modbus
-from fieldtwin.conformance.devices.run import DeviceTestOptions
 from fieldtwin.emulators.endpoints.memory_ports import MemoryNet
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.emulators.virtual.clock import VirtualClock
@@ -41,7 +40,7 @@ class Listening(ModbusUnit):
         return super().respond(pdu, now_ns)
 
 
-def check(unit: ModbusUnit, plan: DeviceTestOptions, url: str = URL, **options: Any) -> list[DeviceResult]:
+def check(unit: ModbusUnit, plan: CasePlan, url: str = URL, **options: Any) -> list[DeviceResult]:
     async def use(net: MemoryNet, url: str, clock: VirtualClock) -> list[DeviceResult]:
         to_do = ModbusOptions(url, 1, plan, connector=net, clock=clock, **options)
         return (await check_modbus(to_do)).results
@@ -55,7 +54,7 @@ def check(unit: ModbusUnit, plan: DeviceTestOptions, url: str = URL, **options: 
 def test_without_permission_only_reads_are_sent(url: str) -> None:
     unit = Listening()
     before = bytes(unit.bank.peek("holding", at) & 0xFF for at in range(200))  # type: ignore[attr-defined]
-    results = check(unit, DeviceTestOptions(), url)
+    results = check(unit, CasePlan(), url)
     assert len(unit.asked) > 20
     assert {pdu[0] for pdu in unit.asked} <= READS
     assert before == bytes(unit.bank.peek("holding", at) & 0xFF for at in range(200))  # type: ignore[attr-defined]
@@ -67,7 +66,7 @@ def test_with_write_permission_only_the_given_cells_change_and_are_restored() ->
     unit.bank.poke("holding", 199, 4711)  # type: ignore[attr-defined]
     unit.bank.poke("coil", 3, 1)  # type: ignore[attr-defined]
     held = [unit.bank.peek("holding", at) for at in range(200)]  # type: ignore[attr-defined]
-    plan = DeviceTestOptions(at_most=Impact.WRITE, has=frozenset({"holding", "coil"}))
+    plan = CasePlan(at_most=Impact.WRITE, has=frozenset({"holding", "coil"}))
     results = check(unit, plan, may_write={"holding": (199, 1), "coil": (3, 1)})
     assert {pdu[0] for pdu in unit.asked} <= READS | WRITES
     aimed = {pdu[1:3] for pdu in unit.asked if pdu[0] in WRITES}
@@ -96,7 +95,7 @@ def test_a_wire_refuses_requests_above_the_impact_level() -> None:
 def test_a_missing_device_is_unreachable() -> None:
     async def use(net: MemoryNet, url: str, clock: VirtualClock) -> None:
         with pytest.raises(Unreachable, match="unit 7"):
-            await check_modbus(ModbusOptions(url, 7, DeviceTestOptions(), connector=net, clock=clock))
+            await check_modbus(ModbusOptions(url, 7, CasePlan(), connector=net, clock=clock))
 
     on_modbus("rtu:/virtual/line?baudrate=19200&frame=8E1", use)
 
@@ -111,7 +110,7 @@ def test_nothing_is_sent_on_a_line_with_foreign_traffic() -> None:
             await end.write(bytes.fromhex("05 03 00 00 00 01 85 8E"))
 
     async def use(net: MemoryNet, url: str, clock: VirtualClock) -> None:
-        options = ModbusOptions(url, 1, DeviceTestOptions(), connector=net, clock=clock)
+        options = ModbusOptions(url, 1, CasePlan(), connector=net, clock=clock)
         with pytest.raises(NotAllowed, match="--share-bus"):
             await check_modbus(options)
 
@@ -122,9 +121,7 @@ def test_nothing_is_sent_on_a_line_with_foreign_traffic() -> None:
 def test_a_rate_is_kept() -> None:
     async def use(net: MemoryNet, url: str, clock: VirtualClock) -> float:
         began_ns = clock.monotonic_ns()
-        checked = await check_modbus(
-            ModbusOptions(url, 1, DeviceTestOptions(), spacing_s=0.5, connector=net, clock=clock)
-        )
+        checked = await check_modbus(ModbusOptions(url, 1, CasePlan(), spacing_s=0.5, connector=net, clock=clock))
         sent = len(checked.before) // 2
         assert sent > 5
         return (clock.monotonic_ns() - began_ns) / 1e9 - 0.5 * sent
@@ -178,14 +175,14 @@ def test_a_dry_run_shows_every_case_that_would_run_and_opens_nothing() -> None:
 
 @pytest.mark.parametrize("wire", ["ascii:/x", "tcp://h:1", "rtu+tcp://h:1", "udp://h:1"])
 def test_a_dry_run_on_every_wire(wire: str) -> None:
-    checked = modbus_dry_run(ModbusOptions(wire, 9, DeviceTestOptions()))
+    checked = modbus_dry_run(ModbusOptions(wire, 9, CasePlan()))
     assert [r.case.id for r in checked.results if r.verdict is Verdict.FAILED] == []
 
 
 def test_a_dry_run_of_a_node(tmp_path: Path) -> None:
     from fieldtwin.conformance.devices.canopen.session import CanopenOptions
 
-    plan = DeviceTestOptions(at_most=Impact.DISRUPT, has=frozenset({"object", "i-know"}))
+    plan = CasePlan(at_most=Impact.DISRUPT, has=frozenset({"object", "i-know"}))
     checked = canopen_dry_run(CanopenOptions("can:socketcan/can0", 5, plan, may_write=((0x2000, 0), (0x2100, 3))))
     assert [r.case.id for r in checked.results if r.verdict is Verdict.FAILED] == []
     assert sum(bool(r.spoken) for r in checked.results) > 30

@@ -5,15 +5,14 @@ from __future__ import annotations
 import pytest
 from devices_in_memory import on_modbus
 
-from fieldtwin.conformance.core.case import Impact
+from fieldtwin.conformance.core.case import CasePlan, Impact
 from fieldtwin.conformance.devices.device_case import DeviceResult
 from fieldtwin.conformance.devices.modbus.session import ModbusOptions, check_modbus
-from fieldtwin.conformance.devices.run import DeviceTestOptions
 from fieldtwin.emulators.endpoints.memory_ports import MemoryNet
 from fieldtwin.emulators.virtual.clock import VirtualClock
 from fieldtwin.results.model import Verdict
 
-ALL = DeviceTestOptions(at_most=Impact.DISRUPT, has=frozenset({"holding", "coil", "i-know"}))
+ALL = CasePlan(at_most=Impact.DISRUPT, has=frozenset({"holding", "coil", "i-know"}))
 WIRES = (
     "rtu:/virtual/line?baudrate=19200&frame=8E1",
     "ascii:/virtual/line?baudrate=9600&frame=7E1",
@@ -23,7 +22,7 @@ WIRES = (
 )
 
 
-def check(url: str, plan: DeviceTestOptions = ALL, at: int = 1) -> list[DeviceResult]:
+def check(url: str, plan: CasePlan = ALL, at: int = 1) -> list[DeviceResult]:
     async def use(net: MemoryNet, url: str, clock: VirtualClock) -> list[DeviceResult]:
         options = ModbusOptions(
             url, at, plan, may_write={"holding": (190, 10), "coil": (3, 1)}, connector=net, clock=clock

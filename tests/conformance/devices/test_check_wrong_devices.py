@@ -7,10 +7,9 @@ import pytest
 import wrong_devices as wrong
 from devices_in_memory import on_modbus
 
-from fieldtwin.conformance.core.case import Impact
+from fieldtwin.conformance.core.case import CasePlan, Impact
 from fieldtwin.conformance.devices.device_case import DeviceResult
 from fieldtwin.conformance.devices.modbus.session import ModbusOptions, check_modbus
-from fieldtwin.conformance.devices.run import DeviceTestOptions
 from fieldtwin.emulators.endpoints.memory_ports import MemoryNet
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.emulators.virtual.clock import VirtualClock
@@ -22,7 +21,7 @@ HAS = frozenset({"holding", "coil", "i-know"})
 def check(url: str, unit: ModbusUnit | None = None, serve: wrong.Serve | None = None) -> list[DeviceResult]:
     async def use(net: MemoryNet, url: str, clock: VirtualClock) -> list[DeviceResult]:
         options = ModbusOptions(
-            url, 1, DeviceTestOptions(at_most=Impact.DISRUPT, has=HAS), may_write={"holding": (190, 10), "coil": (3, 1)},
+            url, 1, CasePlan(at_most=Impact.DISRUPT, has=HAS), may_write={"holding": (190, 10), "coil": (3, 1)},
             connector=net, clock=clock,
         )  # fmt: skip
         return (await check_modbus(options)).results

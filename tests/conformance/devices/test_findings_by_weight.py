@@ -18,16 +18,15 @@ from devices_in_memory import make_unit, on_modbus
 from wrong_devices import twisted
 
 from fieldtwin.cli.system.report_command import command as report
+from fieldtwin.cli.test.check_options import CaseOptions
 from fieldtwin.cli.test.check_view import style_of
-from fieldtwin.cli.test.fail_on import bases_of
-from fieldtwin.conformance.core.case import Basis, failed, passed
+from fieldtwin.conformance.core.case import Basis, CasePlan, failed, passed
 from fieldtwin.conformance.core.results import exit_code
 from fieldtwin.conformance.devices.canopen import cases as canopen_cases
 from fieldtwin.conformance.devices.device_case import DeviceCase, DeviceResult
 from fieldtwin.conformance.devices.modbus import cases as modbus_cases
 from fieldtwin.conformance.devices.modbus.session import ModbusOptions, check_modbus
 from fieldtwin.conformance.devices.results import as_json, as_report
-from fieldtwin.conformance.devices.run import DeviceTestOptions
 from fieldtwin.emulators.endpoints.memory_ports import MemoryNet
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.emulators.virtual.clock import VirtualClock
@@ -74,7 +73,7 @@ async def strict_rtu(end: ByteConnection) -> None:
 
 def check_strict(*ids: str) -> list[DeviceResult]:
     async def use(net: MemoryNet, url: str, clock: VirtualClock) -> list[DeviceResult]:
-        plan = DeviceTestOptions(frozenset(ids))
+        plan = CasePlan(frozenset(ids))
         return (await check_modbus(ModbusOptions(url, 1, plan, connector=net, clock=clock))).results
 
     return on_modbus("rtu:/virtual/line?baudrate=19200&frame=8E1", use, serve=strict_rtu)
@@ -107,7 +106,7 @@ def test_only_a_required_case_is_red_and_gives_exit_code_1() -> None:
     page = render_html(SUBJECT, [good, field], "fieldtwin check")
     assert '<span class="pill inconclusive">! field problem</span>' in page
     assert '"pill failed' not in page
-    robust_counts = bases_of("robustness")
+    robust_counts = CaseOptions(None, 0.0, None, "robustness").bases
     assert exit_code([good, robust], robust_counts) == 1
     assert _headline(render_html(SUBJECT, [good, robust], "fieldtwin check", robust_counts)) == "failed"
     assert _headline(render_html(SUBJECT, [good, robust], "fieldtwin check")) == "passed"
@@ -160,7 +159,7 @@ def test_a_request_with_two_errors_may_be_refused_for_either() -> None:
         return b"\x83\x02" if pdu == b"\x03\xff\xff\x00\x7e" else right
 
     async def use(net: MemoryNet, url: str, clock: VirtualClock) -> list[DeviceResult]:
-        options = ModbusOptions(url, 1, DeviceTestOptions(frozenset({"MB-038"})), connector=net, clock=clock)
+        options = ModbusOptions(url, 1, CasePlan(frozenset({"MB-038"})), connector=net, clock=clock)
         return (await check_modbus(options)).results
 
     (found,) = on_modbus("rtu:/virtual/line?baudrate=19200&frame=8E1", use, twisted(refuse_the_address))
@@ -183,7 +182,7 @@ async def one_at_a_time(end: ByteConnection) -> None:
 
 def test_a_server_may_refuse_further_requests_of_a_segment_as_busy() -> None:
     async def use(net: MemoryNet, url: str, clock: VirtualClock) -> list[DeviceResult]:
-        options = ModbusOptions(url, 1, DeviceTestOptions(frozenset({"MB-052"})), connector=net, clock=clock)
+        options = ModbusOptions(url, 1, CasePlan(frozenset({"MB-052"})), connector=net, clock=clock)
         return (await check_modbus(options)).results
 
     (found,) = on_modbus("tcp://127.0.0.1:0", use, serve=one_at_a_time)
@@ -193,7 +192,7 @@ def test_a_server_may_refuse_further_requests_of_a_segment_as_busy() -> None:
 @pytest.mark.parametrize(("url", "basis"), [("tcp://127.0.0.1:0", "standard"), ("rtu+tcp://127.0.0.1:0", "robustness")])
 def test_a_request_byte_by_byte_must_be_answered_only_where_a_header_has_its_length(url: str, basis: str) -> None:
     async def use(net: MemoryNet, url: str, clock: VirtualClock) -> list[DeviceResult]:
-        options = ModbusOptions(url, 1, DeviceTestOptions(frozenset({"MB-051"})), connector=net, clock=clock)
+        options = ModbusOptions(url, 1, CasePlan(frozenset({"MB-051"})), connector=net, clock=clock)
         return (await check_modbus(options)).results
 
     (found,) = on_modbus(url, use)

@@ -7,11 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fieldtwin.commissioning.access.connection import frames_at
+from fieldtwin.conformance.core.case import CasePlan
 from fieldtwin.conformance.devices.canopen.cases import CASES
 from fieldtwin.conformance.devices.canopen.connection import SDO_REQUEST, Key, NodeConnection, Reply
 from fieldtwin.conformance.devices.checked import Checked, shown
 from fieldtwin.conformance.devices.device_case import DeviceResult
-from fieldtwin.conformance.devices.run import DeviceTestOptions, Transcript, play
+from fieldtwin.conformance.devices.run import Transcript, play
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.clock import NS_PER_S, Clock
 from fieldtwin.gateway.core.connection import Connector, Direction, Tap
@@ -37,7 +38,7 @@ class CanopenOptions:
 
     endpoint: str
     node: int
-    plan: DeviceTestOptions
+    plan: CasePlan
     bitrate: int = 0
     timeout_s: float = 0.5
     spacing_s: float = 0.02

@@ -7,12 +7,13 @@ from contextlib import AsyncExitStack
 from dataclasses import dataclass, field
 
 from fieldtwin.commissioning.access.connection import bytes_at
+from fieldtwin.conformance.core.case import CasePlan
 from fieldtwin.conformance.devices.checked import Checked, shown
 from fieldtwin.conformance.devices.device_case import DeviceResult
 from fieldtwin.conformance.devices.modbus.cases import CASES
 from fieldtwin.conformance.devices.modbus.connection import DeviceConnection
 from fieldtwin.conformance.devices.modbus.learn import learn
-from fieldtwin.conformance.devices.run import DeviceTestOptions, Transcript, play
+from fieldtwin.conformance.devices.run import Transcript, play
 from fieldtwin.gateway.core.clock import NS_PER_S, Clock
 from fieldtwin.gateway.core.connection import ByteConnection, Connector, Tap
 from fieldtwin.gateway.core.endpoint import Endpoint
@@ -43,7 +44,7 @@ class ModbusOptions:
 
     endpoint: str
     unit: int
-    plan: DeviceTestOptions
+    plan: CasePlan
     timeout_s: float = 1.0
     spacing_s: float = 0.05
     echo: bool = False

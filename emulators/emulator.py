@@ -82,8 +82,8 @@ def emulator_kind(kind: PROTOCOL, profile: DeviceProfile) -> type[UnitEmulator]:
 class EmulatedUnit(ModbusUnit):
     """A unit of an emulated line whose requests pass through the device's own connection.
 
-    `kind` is the connection type of the emulated device, whatever carries it now. A request that is not in the command
-    list gets the protocol's own answer (SPEC ruling 11), and is counted in `unlisted`.
+    `kind` is the connection type of the emulated device, even if a different medium carries it now. A request that is not in the
+    command list gets the protocol's own answer (SPEC ruling 11), and is counted in `unlisted`.
     """
 
     def __init__(

@@ -213,7 +213,7 @@ class Link:
 
     @property
     def ends(self) -> tuple[Endpoint, Endpoint]:
-        """Near and far endpoint, with the real port if it listens."""
+        """Return the near and the far endpoint, with the real port of an end that listens."""
         return self._near.endpoint, self._far.endpoint
 
     async def open(self) -> None:
@@ -321,7 +321,9 @@ class Link:
             await _cancel(outward, inward)
 
     async def _pump(self, source: ByteConnection, target: ByteConnection, outward: bool) -> FieldtwinError:
-        """Forward one direction, one chunk at a time, so that a slow side holds the other back. Return why it ended."""
+        """Forward one direction and return the reason why it ended.
+
+        It forwards one chunk at a time, so that a slow receiver holds the sender back."""
         forward = self.connection.emulate_write if outward else self.connection.emulate_read
         while True:
             try:

@@ -24,7 +24,7 @@ Peek = Callable[[Table, int], int]
 
 
 def cells_of(tag: Tag, value: float | str, exponent: int = 0) -> list[int]:
-    """Return an engineering value as the cells that it fills; values out of range become the limit.
+    """Return the contents of the cells that encode an engineering value; a value out of range becomes the limit.
 
     `exponent` is the value of the tag's scale-factor register. For a tag that is part of a register, the other bits of
     that register are 0.

@@ -295,7 +295,7 @@ class Program(ABC):
         return [[v.name, v.kind.value] for v in self.variables.values() if v.retain]
 
     def retain_bytes(self) -> int:
-        """Return the largest size of `retained` as MessagePack, whatever the values."""
+        """Return the largest possible size in bytes of `retained` as MessagePack."""
         return sum(9 + 5 + len(v.name.encode()) for v in self.variables.values() if v.retain)
 
     def check(self, name: str, value: Scalar) -> None:

@@ -154,8 +154,8 @@ def _check(result: int) -> None:
 
 
 class StuckAlarm:
-    """Ends a scan that does not end: `stuck_ms` after it was armed, a signal raises `ScanStuck` in the logic,
-    repeatedly.
+    """The guard against a scan that does not end: `stuck_ms` after it was armed, a signal repeatedly raises `ScanStuck` in the
+    logic.
 
     It works in the main thread, because signals arrive there. Logic that never returns to the interpreter (a C function
     that never ends) cannot be ended this way: then the gateway misses the heartbeat and makes the outputs safe.

@@ -3,7 +3,7 @@
 `ControlLogic` implements the row literally: consumers `sensor` and `transmitter`, producers `response` and `command`, a
 period, a data log and the observatory's state machine. It does not interpret payloads, except for the period in a
 command. `Relay` connects it to tags: messages from the mailboxes go to the consumers, and what the producers emit goes
-to outputs. While the transmitter cannot keep up, it waits in a queue of limited length.
+to outputs. While the transmitter cannot keep up, these outputs wait in a queue of limited length.
 
 Neither class may know a protocol, a register or the time of day; `now_ns` is the scan's.
 """

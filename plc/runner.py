@@ -100,7 +100,7 @@ class Runner:
     # -- assembly -----------------------------------------------------------------------------------------------------
 
     def _made(self) -> list[BoundProgram]:
-        """Create the programs anew. Also raises `FileInvalid` if they no longer fit the process image."""
+        """Create new instances of the programs. Also raises `FileInvalid` if they no longer fit the process image."""
         # created with the programs, so that global variables also begin with their initial values
         together: dict[Any, Any] = {}
         programs = [p.bind(self.config.python_path, together) for p in self.config.programs]
@@ -280,8 +280,7 @@ class Runner:
             self._ended, self._restart_ns = StopReason.FAILED, _NEVER_NS
 
     def restart(self, *, cold: bool = False) -> None:
-        """Create the programs anew, with retained variables unless `cold`, and start; a paused PLC stays paused. Forces
-        stay.
+        """Create new instances of the programs, with retained variables unless `cold`, and start. Forces, and a pause, stay.
 
         Raises `FileInvalid`, without any change, if the programs cannot be created (their files may have been edited).
         """

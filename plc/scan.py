@@ -3,10 +3,10 @@
 Each scan uses one consistent snapshot and one frozen time. Pure: `Scan.execute(now_ns)` is given the time, and uses
 only the image and the programs. It must not know a clock, a cycle, a process or a protocol.
 
-When the gateway's heartbeat in the image is older than its limit, or its region is flagged stopped, every input is BAD
-/ GATEWAY_DEAD, whatever quality the image shows. Then, and for every input that is BAD by itself, the input's policy
-decides what the program sees (`InputBinding.if_bad`). A forced input is SIMULATED, whatever the image shows. Messages
-are events, not states: they are passed on unchanged, in order, exactly once, whatever the quality of their tag.
+When the gateway's heartbeat in the image is older than its limit, or its region is flagged stopped, every input is BAD /
+GATEWAY_DEAD, even if the image shows a better quality. For a BAD input the input's policy decides what the program sees
+(`InputBinding.if_bad`). A forced input is always SIMULATED. Messages are events, not states: they are passed on unchanged, in
+order and exactly once, independently of the quality of their tag.
 
 A program that has not started (fieldtwin.plc.start) is not executed, and nothing of it is published. Messages wait
 while a program that takes messages has not started.

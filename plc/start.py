@@ -5,10 +5,10 @@ a program starts, its logic is not executed, its timers do not run, and its outp
 which the program's policy applies. A program that has started stays started: afterwards the input's `if_bad` defines what the
 program sees of a bad input.
 
-Inputs that carry messages are events and have no quality, so no program waits for them. An input that is another
-program's variable counts as good once that program has executed a scan. If two programs read each other, both wait for
-the inputs of both, and the one that runs first sees the other's initial values; so does a reader of a program in a
-SINGLE task.
+Inputs that carry messages are events and have no quality, so no program waits for them. An input that is another program's
+variable counts as good once that program has executed a scan. If two programs read each other's variables, both wait for the
+inputs of both, and the program that runs first sees the initial values of the second one. A program that reads a program in a
+SINGLE task also sees initial values at first.
 
 Pure: the time is passed in. This module must not know a task's cycle or a protocol.
 """

@@ -42,7 +42,7 @@ class Executable(Protocol):
 
 
 class Guard(Protocol):
-    """Guards against a scan that never ends: armed before it, disarmed after it."""
+    """The interface of a guard against a scan that never ends. It is armed before each scan and disarmed after it."""
 
     def arm(self) -> None: ...
 

@@ -25,7 +25,7 @@ class ClientView:
         self._refusals = dict(refusals or {})
 
     def add(self, service: Service) -> None:
-        """Add a service after construction: the SDO servers, which themselves use this view."""
+        """Add a service. It is for the SDO servers, which are created after this view because they use it."""
         self._services += (service,)
 
     def read(self, index: int, subindex: int, now_ns: int) -> bytes:

@@ -14,7 +14,7 @@ VAR, ARRAY, RECORD, DOMAIN_OBJECT = 0x07, 0x08, 0x09, 0x02
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One subindex. `default` is in on-wire bytes; with `node_relative` the node ID is added to it.
+    """One subindex. `default` is in bytes as sent; with `node_relative` the node ID is added to it.
 
     `size` is the value's length in bytes, None if the length varies. `low` and `high` are inclusive. `configured` says that
     `default` is the ParameterValue of a DCF and not the factory value.

@@ -270,7 +270,7 @@ class CanopenNode:
         return self.tick(now_ns)
 
     def set_value(self, index: int, subindex: int, raw: bytes, now_ns: int) -> list[CanFrame]:
-        """Change a value from the device's side (on-wire bytes); a change is an event for TPDOs that map it."""
+        """Change a value (bytes as sent) from the device's side. A change is an event for the TPDOs that map the value."""
         if self._core.data.put(index, subindex, raw):
             self._core.note(now_ns, "set", index, subindex, raw)
             self._tpdos.changed([(index, subindex)], now_ns)

@@ -26,7 +26,7 @@ class TimeOfDay:
     ms: int
 
     def to_bytes(self) -> bytes:
-        """Return TIME_OF_DAY as on the wire."""
+        """Return the six bytes of TIME_OF_DAY."""
         return self.ms.to_bytes(4, "little") + self.days.to_bytes(2, "little")
 
     @classmethod

@@ -128,7 +128,7 @@ class Tpdos(Service):
         return due_ns
 
     def take_overdue(self) -> frozenset[int]:
-        """After the end of the window, return the identifiers of the PDOs that the last SYNC triggered; once per SYNC."""
+        """Return the identifiers of the PDOs that the last SYNC triggered, after the end of its window and once per SYNC."""
         overdue, self._overdue = self._overdue, frozenset()
         return overdue
 

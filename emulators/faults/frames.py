@@ -28,7 +28,7 @@ _SINGLE = frozenset((5, 6, 22, 24))
 
 
 class Framing(Enum):
-    """The frame format of the bytes on a wire. RAW: the format is unknown."""
+    """The frame format of the bytes on a link. RAW: the format is unknown."""
 
     RTU = "rtu"
     ASCII = "ascii"

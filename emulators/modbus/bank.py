@@ -229,7 +229,7 @@ class MapBank(RegisterBank):
                 hooks.written(value, now_ns)
 
     def peek(self, table: Table, address: int) -> int:
-        """Return the value of a cell as the device sees it, whatever its access.
+        """Return the value of a cell from the device's side, also of a cell that a client may not read.
 
         Raises `IllegalAddress` if it does not exist.
         """
@@ -239,7 +239,7 @@ class MapBank(RegisterBank):
             raise IllegalAddress("not a readable cell", where=f"{table}:{address}") from None
 
     def poke(self, table: Table, address: int, *values: int) -> None:
-        """Set cells from the device's side, read-only ones included. Raises `IllegalAddress` or `IllegalValue`."""
+        """Set cells from the device's side, also read-only cells. Raises `IllegalAddress` or `IllegalValue`."""
         limit = 1 if table in BIT_TABLES else 0xFFFF
         for value in values:
             if not 0 <= value <= limit:

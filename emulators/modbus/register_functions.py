@@ -140,7 +140,7 @@ class RegisterFunctions:
     def _require_registers(self, address: int, count: int, most: int) -> None:
         """Check the count (03) before the address (02).
 
-        A single write (most == 1) of half a value is left to the device.
+        A write of a single register (most == 1) that is half of a value is not refused here: the device decides.
         """
         _require_count(count, most)
         pairs = self.limits.even_only and most > 1

@@ -53,7 +53,7 @@ class ModbusUnit:
     """The functions of a unit on a bank.
 
     Without `server_id` (function 11h; `server_data` follows its run indicator), `identification` (2Bh), `files` (14h,
-    15h) or `fifos` (18h) the unit lacks that function; without `limits` it has all the others.
+    15h) or `fifos` (18h) the unit lacks that function. Without `limits` it has all other functions.
 
     Use `respond` for a request to the unit, and `execute_broadcast` for a request to unit 0 of a serial line. Both
     increase `counters`; the line reports its other traffic with `heard`. `latency_s` is the processing time of the last

@@ -81,7 +81,9 @@ class LearntUnit:
 
 
 class Learner:
-    """Fills `context` and `units` from `exchanges`; `counters.misfits` counts replies that fit no request."""
+    """The learning pass that fills `context` and `units` from `exchanges`.
+
+    `counters.misfits` counts replies that fit no request."""
 
     def __init__(
         self, exchanges: Iterable[RecordedExchange], context: VirtualContext, spans: Counters, counters: ReplayCounters

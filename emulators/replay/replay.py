@@ -58,7 +58,7 @@ class Answer:
 
 
 class ExchangeReplay:
-    """Answers requests from recorded exchanges.
+    """A device that answers requests from recorded exchanges.
 
     If a recording contains several units, each answers for itself; a unit that was not recorded stays silent. A
     recorded write is answered as recorded, and changes later reads as recorded. A write of a different value to cells

@@ -169,7 +169,9 @@ class AcousticMedium:
     # -- transmitting ---------------------------------------------------------------------------------------------------
 
     def _try(self, modem: _Modem, t_ns: int) -> None:
-        """Schedule the modem's next attempt at `t_ns`, or when its next packet may be sent; only one attempt is pending."""
+        """Schedule the modem's next attempt at `t_ns`, or later if its next packet may not be sent then.
+
+        A modem has at most one pending attempt."""
         if modem.to_say:
             t_ns = max(t_ns, modem.to_say[0][0])
             if modem.due_ns is None or t_ns < modem.due_ns:

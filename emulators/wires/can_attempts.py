@@ -265,7 +265,7 @@ class Attempts:
             self.forget_if_done(number)
 
     def stop_waiting(self, number: int) -> None:
-        """Exclude a node from arbitration until it is put into `waiting` again."""
+        """Exclude a node from arbitration until it is added to `waiting` again."""
         self.waiting.pop(number, None)
 
     def forget_if_done(self, number: int) -> None:

@@ -130,7 +130,7 @@ class CanBus:
         """Withdraw data frames with `can_ids` (11 bits) from the node's transmit queue, as a controller aborts its
         mailboxes.
 
-        A frame that is on the wire stays. Returns the withdrawn frames in order.
+        A frame that is being sent stays. Returns the withdrawn frames in order.
         """
         self._run(now_ns)
         owner, start = self._node(node), self._upcoming()
@@ -149,7 +149,7 @@ class CanBus:
         return [p.frame for p in taken]
 
     def queued(self, node: int) -> int:
-        """Return the number of frames in the node's transmit queue, the one on the wire included."""
+        """Return the number of frames in the node's transmit queue, including the frame that is being sent."""
         return len(self._node(node).queue)
 
     def count_overrun(self, node: int) -> None:

@@ -33,7 +33,7 @@ class End(Generic[T]):
 
 
 def wire(kind: type[Connection[T]]) -> tuple[End[T], End[T]]:
-    """Return both ends of a new duplex link: two streams of a concrete kind, each end reading what the other writes."""
+    """Return both ends of a new duplex link, which consists of two streams of a concrete kind, one for each direction."""
     there, back = kind(), kind()
     return End(there, back), End(back, there)
 

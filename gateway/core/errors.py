@@ -143,7 +143,7 @@ class EndpointBusy(Unreachable):
 
 
 class ConnectionLost(Unreachable):
-    """An open connection ended: peer gone, cable pulled, bus-off."""
+    """An open connection ended: the peer closed it or disappeared, a cable was pulled, or the CAN controller is bus-off."""
 
 
 class WireError(FieldtwinError):

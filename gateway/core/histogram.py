@@ -25,7 +25,7 @@ _FINE_NS = (
 
 
 class Histogram:
-    """Counts durations in nanoseconds, each in the first bucket whose upper limit it does not exceed.
+    """A histogram of durations in nanoseconds. Each counts in the first bucket whose upper limit it does not exceed.
 
     `limits_ns` are the upper limits of the buckets, ascending and inclusive; one further bucket counts longer
     durations. `counts` has the counts of the buckets, each for its bucket alone, and `count` is their sum. `min_ns`,

@@ -296,8 +296,7 @@ class CanopenDriver(DeviceDriver):
             self.master.subscribe_pdo(cob_id, callback)
 
     async def _take_rpdos(self) -> None:
-        """Map RPDO1 as the system file states, use the other RPDOs as the node or its DCF has them, and read their
-        current values."""
+        """Map RPDO1 as the system file states, take over all other RPDOs from the node or its DCF, and read their values."""
         boot, chosen = self.config.canopen, []
         if boot.rpdo1 is not None:
             objects = [self._entry(self.profile.tags[t]) for t in boot.rpdo1.tags]

@@ -39,9 +39,9 @@ def reorder(data: bytes, order: str) -> bytes:
 def decode(tag: Tag, data: bytes, t_ns: int) -> TagValue:
     """Return the value of `tag` from its register bytes as received.
 
-    Text ends at the first NUL. The registers of a text keep their sequence whatever `order` is; its bytes are swapped
-    if `order` swaps bytes within words. NaN, an invalid digit and a sentinel are bad values, never good ones; a value
-    outside the profile's range is uncertain.
+    Text ends at the first NUL. `order` never changes the sequence of a text's registers; the bytes within them are swapped if
+    `order` says so. NaN, an invalid digit and a sentinel are bad values, never good ones; a value outside the profile's range is
+    uncertain.
     """
     if tag.type in _UNPACK:  # the most frequent case: a number
         return _decode_number(tag, data if tag.order == "ABCD" else reorder(data, tag.order), data, t_ns)

@@ -221,7 +221,7 @@ class GroupPlan:
         """End a pass, in which the device answered or refused every read.
 
         If it refused a read, halves that need not be separate are joined again, and missing tags are left out. If no read is
-        left, one value is still requested: when the device has that value, it may also have the other ones.
+        left, one value is still requested: when the device has that value again, it may also have the missing ones.
         """
         if self._found_any:
             self.plan_again()

@@ -78,7 +78,7 @@ class TagStatus(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class OutputStatus(msgspec.Struct, frozen=True, kw_only=True):
-    """A tag that programs write. `wanted` is the command of `by`, None without one; `held` is what the device has."""
+    """An output. `wanted` is the value that `by` commands, None without a command; `held` is the value in the device."""
 
     tag: str
     wanted: int | float | None

@@ -3,8 +3,8 @@
 It takes effect between two polls, and no poll is lost or doubled. The plant's switch takes effect at once.
 
 Buses, devices, addresses, tags and their bindings must be unchanged: the caller has compared the files
-(`fieldtwin.twin.plant.reloading`). A device has either its old configuration or its new one, never a mixture; stored
-values are decoded anew at once. This module reads no file.
+(`fieldtwin.twin.plant.reloading`). A device has either its old configuration or its new one, never a mixture; stored values are
+decoded again immediately. This module reads no file.
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ def is_line(attribute: str) -> bool:
 
 
 class Assignments(ast.NodeTransformer):
-    """Adds the assignments of lines to a class whose outputs are the attributes `outputs` of ``self``."""
+    """The pass that adds the assignments of lines to a class whose outputs are the attributes `outputs` of ``self``."""
 
     def __init__(self, outputs: frozenset[str]) -> None:
         self._outputs = outputs

@@ -33,7 +33,9 @@ _LOGIC = {"AND": "&", "&": "&", "OR": "|", "XOR": "^", "AND_THEN": "and", "OR_EL
 
 
 class Expressions:
-    """Compiles expressions in one POU's scope: `symbols` by name in lower case, then the environment's."""
+    """The compiler of expressions in the scope of one POU: names are looked up in `symbols` (in lower case), then in the
+    environment.
+    """
 
     def __init__(self, env: Environment, symbols: dict[str, Symbol], out: Writer, pou: str = "") -> None:
         self.env = env
@@ -465,7 +467,7 @@ class Expressions:
         self.assign(argument.target, value, argument.pos)
 
     def assign(self, ref: t.Ref, value: Value, pos: t.Pos) -> None:
-        """Write an assignment. An assignment to a bit of a variable keeps the other bits."""
+        """Write an assignment. An assignment to a bit of a variable keeps all other bits."""
         if ref.selectors and isinstance(ref.selectors[-1], t.Bit):
             whole = self.writable(t.Ref(ref.pos, ref.name, ref.selectors[:-1]))
             self._bit(whole, ref.selectors[-1])
@@ -523,7 +525,7 @@ class Expressions:
         return reference
 
     def take_back(self, cells: dict[str, str], pos: t.Pos) -> None:
-        """After the call, assign the values in the cells back to the variables."""
+        """Assign the values in the cells back to the variables after the call."""
         for code, cell in cells.items():
             self.out.line(f"{code} = {cell}.v", pos)
 

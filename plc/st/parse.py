@@ -98,8 +98,9 @@ def _pos(where: Meta | Token) -> t.Pos:
 
 @v_args(meta=True)
 class _Build(Transformer_NonRecursive[Token, Any]):
-    """Builds the tree bottom up: children are nodes already, tokens are still tokens. It is not recursive, so it has no
-    limit of nesting."""
+    """The transformer that builds the tree bottom up: children are already nodes, tokens are still tokens.
+
+    It is not recursive, so the nesting depth has no limit."""
 
     def NAME(self, token: Token) -> Token:
         if len(token) > MAX_NAME:

@@ -10,7 +10,7 @@ from typing import Any
 
 
 class Cell:
-    """Refers to a function's own variable, for the duration of a call."""
+    """A reference to a function's own variable, for the duration of a call."""
 
     __slots__ = ("v",)
 
@@ -19,7 +19,7 @@ class Cell:
 
 
 class Member:
-    """Refers to an attribute: a variable of a program or block, a global variable, a member of a structure."""
+    """A reference to an attribute: a variable of a program or block, a global variable, or a member of a structure."""
 
     __slots__ = ("_name", "_owner")
 
@@ -36,7 +36,7 @@ class Member:
 
 
 class Element:
-    """Refers to an element of an array: the one that the index selected when the call began."""
+    """A reference to an element of an array: the element that the index selected when the call began."""
 
     __slots__ = ("_at", "_owner")
 
@@ -53,7 +53,7 @@ class Element:
 
 
 class Cut:
-    """Refers to a string that is shorter than the VAR_IN_OUT: an assigned value is cut to `length` characters."""
+    """A reference to a string that is shorter than the VAR_IN_OUT: an assigned value is cut to `length` characters."""
 
     __slots__ = ("_length", "_of")
 

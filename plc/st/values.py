@@ -104,8 +104,9 @@ def beyond(taken: range) -> int:
 
 
 def unaltered(taken: range, control: Callable[[], int]) -> Iterator[int]:
-    """Yield the values of a control variable that POUs called in the loop can access. Raises `LogicError` if one
-    altered it."""
+    """Yield the values of a FOR's control variable, and raise `LogicError` if a POU that the loop called has changed the
+    variable.
+    """
     for value in taken:
         yield value
         if control() != value:

@@ -152,7 +152,7 @@ def shown(path: Path) -> str:
 
 
 class RecordingReader:
-    """Reads a recording: `header` is available immediately, then `exchanges()` or `rows()` once, in the file's order.
+    """The reader of a recording. `header` is available immediately; then call `exchanges()` or `rows()` once.
 
     At the end, `truncated` says whether the last line was cut off, and `lines` holds the number of complete lines. Use the reader
     as a context manager. Raises `FileInvalid` for a file that does not exist, is not a recording, or is damaged.
@@ -278,7 +278,7 @@ class RecordingReader:
 
 
 class RecordingWriter:
-    """Appends records to a new file, each with one write. Use it as a context manager.
+    """The writer of a new recording, which appends each record with one write. Use it as a context manager.
 
     The file must not exist: a recording is never overwritten. A full disk raises `FileInvalid`, and the file is cut
     back to its last complete record.

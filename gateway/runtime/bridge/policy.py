@@ -96,8 +96,10 @@ _FARTHEST = (ILLEGAL_ADDRESS, ILLEGAL_FUNCTION, NO_PATH)
 
 @dataclass(frozen=True)
 class Policy:
-    """An allow-list: a request passes when one rule allows all of it. Without `allow_writes`, no request that may
-    change a unit passes, whatever the rules allow."""
+    """An allow-list: a request passes when one rule allows all of it.
+
+    Without `allow_writes`, no request that may change a unit passes, even if a rule allows it.
+    """
 
     rules: tuple[AllowRule, ...] = (AllowRule(),)
     allow_writes: bool = False

@@ -6,7 +6,7 @@ others are held back. Adjacent registers are written with one request, and objec
 members are written in the group's order, each write after the previous one was confirmed. If a communication error interrupts the
 writes, it is reported, and the whole group is written again.
 
-The safe state is independent of groups: safe values are written one by one, whatever the programs want.
+The safe state is independent of groups: safe values are written one by one.
 """
 
 from __future__ import annotations

@@ -54,16 +54,6 @@ class Duration(_OfFloat):
         return number * _UNIT_S[unit or "s"]
 
 
-JUNIT_FLAVOUR: dict[str, Any] = {
-    "type": click.Choice(["common", "jenkins"]),  # the values of fieldtwin.reports.junit.Flavour
-    "default": "common",
-    "show_default": True,
-    "help": "With --junit: jenkins writes only what the schema of Jenkins' xUnit plugin (junit-10.xsd) allows.",
-}
-"""The arguments of `junit_flavour_option`, also for groups of options."""
-junit_flavour_option = click.option("--junit-flavour", **JUNIT_FLAVOUR)
-
-
 class Secret(_OfText):
     """A secret: ``@FILE`` for the first line of a file, or an environment variable.
 

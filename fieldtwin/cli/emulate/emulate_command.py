@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 import click
 
+from fieldtwin.cli.emulate.emulate_options import OneDeviceOptions, RecordingOptions, SystemOptions
 from fieldtwin.cli.option_groups import GroupedCommand, group
-from fieldtwin.cli.options import Secret, pairs
+from fieldtwin.cli.options import pairs
 from fieldtwin.cli.template_question import SourceOptions
 from fieldtwin.gateway.core.errors import UsageError
-from fieldtwin.run.processes.field_contact import DEFAULT_CONTROL_PORT
 from fieldtwin.twin.site.data_files import data_root, find
 
 if TYPE_CHECKING:
@@ -20,129 +20,15 @@ if TYPE_CHECKING:
 
 @click.command("emulate", cls=GroupedCommand)
 @click.argument("what")
-@group(
-    "One device",
-    click.option(
-        "--on",
-        "endpoints",
-        multiple=True,
-        metavar="ENDPOINT",
-        help="For a device or recording: the endpoint to listen on.",
-    ),
-    click.option(
-        "--unit", type=click.IntRange(1, 247), default=None, help="For a device: its unit ID; default: the profile's."
-    ),
-    click.option(
-        "--node",
-        type=click.IntRange(1, 255),
-        default=None,
-        help="For a CANopen device or data sheet: its node ID; 255: none yet, an LSS master assigns it.",
-    ),
-    click.option(
-        "--bitrate",
-        type=click.IntRange(10_000, 1_000_000),
-        default=None,
-        help="For a CANopen device: bit/s of the software bus; default 125000 for a new bus.",
-    ),
-    click.option(
-        "--values",
-        multiple=True,
-        metavar="TAG=VALUE|FILE",
-        help="For a Modbus profile: initial register values, 0 by default; no recording is replayed. FILE: a YAML mapping.",
-    ),
-    click.option(
-        "--faults",
-        "faults_file",
-        type=click.Path(exists=True, dir_okay=False),
-        help="For a Modbus device or recording: inject these faults (see fieldtwin faults).",
-    ),
-    click.option("--seed", type=int, default=1, help="With --faults: seed of random choices; default: 1."),
-    click.option(
-        "--any-unit",
-        is_flag=True,
-        help="For one Modbus device on TCP, TLS or UDP: answer to every unit ID, as some devices do.",
-    ),
-    click.option(
-        "--model",
-        type=click.Choice(["401", "402", "404", "406", "410", "none"]),
-        default=None,
-        help="For a CANopen device: the CiA profile whose model computes its objects. Default: from object 1000h.",
-    ),
-    click.option(
-        "--defaults", is_flag=True, help="For a CANopen device: start with the DefaultValues, not with ParameterValues."
-    ),
-)
-@group(
-    "Recording",
-    click.option(
-        "--recording",
-        "recordings",
-        multiple=True,
-        metavar="[DEVICE=]FILE",
-        help="Replay this recording; for a data sheet: a log of candump -L.",
-    ),
-    click.option("--speed", type=float, default=0.0, help="Speed factor for recordings."),
-    click.option(
-        "--unknown",
-        type=click.Choice(["exception", "silence", "interpolate"]),
-        default=None,
-        help="For a recording: the answer to a request that was not recorded. Default: exception.",
-    ),
-    click.option(
-        "--at-end",
-        type=click.Choice(["hold", "loop", "error"]),
-        default=None,
-        help="For a recording: at the end of its values, hold the last one (default), begin again, or answer with exception 04.",
-    ),
-)
-@group(
-    "System",
-    click.option(
-        "--prototype-file",
-        type=click.Path(exists=True, dir_okay=False, path_type=Path),
-        help="For a system: use this prototype file.",
-    ),
-    click.option(
-        "--listen", multiple=True, metavar="BUS=ENDPOINT", help="For a system: endpoint for the emulators of a bus."
-    ),
-    click.option(
-        "--control",
-        default=f"127.0.0.1:{DEFAULT_CONTROL_PORT}",
-        show_default=True,
-        metavar="HOST:PORT",
-        help="For a system: control address, for `fieldtwin run --field`.",
-    ),
-    click.option(
-        "--token",
-        type=Secret(),
-        default="",
-        metavar="@FILE",
-        help="Token that --control requires from its clients; needed if not on loopback. Or FIELDTWIN_EMULATE_TOKEN.",
-    ),
-    click.option("--instance", default="", help="Name of the run directory; default: the system's name and -field."),
-)
+@group("One device", device=OneDeviceOptions)
+@group("Recordings", replay=RecordingOptions)
+@group("System", field=SystemOptions)
 @group("Profiles and templates", sources=SourceOptions)
 def command(
     what: str,
-    endpoints: tuple[str, ...],
-    unit: int | None,
-    node: int | None,
-    bitrate: int | None,
-    model: str | None,
-    defaults: bool,
-    recordings: tuple[str, ...],
-    speed: float,
-    unknown: str | None,
-    at_end: str | None,
-    values: tuple[str, ...],
-    faults_file: str | None,
-    seed: int,
-    any_unit: bool,
-    prototype_file: Path | None,
-    listen: tuple[str, ...],
-    control: str,
-    token: str,
-    instance: str,
+    device: OneDeviceOptions,
+    replay: RecordingOptions,
+    field: SystemOptions,
     sources: SourceOptions,
 ) -> int:
     """Emulate WHAT: a system, a device profile, a recording, or an EDS or DCF file. A plain name is a profile, else a system.
@@ -165,107 +51,105 @@ def command(
       fieldtwin emulate bus.log --node 5 --on can:fieldtwin/127.0.0.1:29536
     """
     kind, path = _kind(what, sources.profiles)
-    if kind != "recording" and (unknown or at_end):
+    if kind != "recording" and (replay.unknown or replay.at_end):
         raise UsageError("--unknown and --at-end need a recording", got=f"a {kind}")
-    if (values or faults_file or any_unit) and kind not in ("device", "recording"):
+    if (device.values or device.faults_file or device.any_unit) and kind not in ("device", "recording"):
         raise UsageError(
             "--values, --faults and --any-unit are for a single Modbus device or recording",
             got=f"a {kind}",
             hint="a system's prototype file has `values`, and `fieldtwin run --faults` puts faults in",
         )
-    of_node = (model, defaults) != (None, False)
-    if of_node and kind not in ("device", "data sheet"):
+    if (device.model, device.defaults) != (None, False) and kind not in ("device", "data sheet"):
         raise UsageError("--model and --defaults are for a CANopen device or data sheet", got=f"a {kind}")
-    if kind == "system":
-        if endpoints or (unit, node, bitrate) != (None, None, None):
-            raise UsageError(
-                "--on, --unit, --node and --bitrate need a single device",
-                hint="a system's endpoints are in its prototype file",
-            )
-        from fieldtwin.gateway.wallclock import run as run_precise
-        from fieldtwin.run.emulate.field import FieldOptions, run_field
-        from fieldtwin.run.template import system_file
+    if kind != "system":
+        return _emulate_one(kind, path, device, replay)
+    if device.endpoints or (device.unit, device.node, device.bitrate) != (None, None, None):
+        raise UsageError(
+            "--on, --unit, --node and --bitrate need a single device",
+            hint="a system's endpoints are in its prototype file",
+        )
+    from fieldtwin.gateway.wallclock import run as run_precise
+    from fieldtwin.run.emulate.field import FieldOptions, run_field
+    from fieldtwin.run.template import system_file
 
-        agreed = system_file(str(path), sources.ask(), prototype_file=prototype_file, profiles=sources.profiles)
-
-        return run_precise(
-            run_field(
-                FieldOptions(
-                    system=Path(agreed),
-                    prototype_file=prototype_file,
-                    recordings=pairs(recordings, "--recording"),
-                    speed=speed,
-                    listen=pairs(listen, "--listen"),
-                    control=control,
-                    token=token,
-                    instance=instance,
-                    profiles=sources.profiles,
-                )
+    return run_precise(
+        run_field(
+            FieldOptions(
+                system=Path(
+                    system_file(
+                        str(path), sources.ask(), prototype_file=field.prototype_file, profiles=sources.profiles
+                    )
+                ),
+                prototype_file=field.prototype_file,
+                recordings=pairs(replay.recordings, "--recording"),
+                speed=replay.speed,
+                listen=field.listen,
+                control=field.control,
+                token=field.token,
+                instance=field.instance,
+                profiles=sources.profiles,
             )
         )
+    )
+
+
+def _emulate_one(kind: str, path: Path, device: OneDeviceOptions, replay: RecordingOptions) -> int:
+    """Emulate a device, a recording, a data sheet or a log until a signal ends it. Return the exit status."""
     from fieldtwin.emulators.context import EndOfRecording
     from fieldtwin.emulators.models.emulated_node import NodeOptions
     from fieldtwin.emulators.replay.replay import NeverRecorded
     from fieldtwin.run.emulate.device import run_device
     from fieldtwin.run.processes.event_loop import run as run_loop
 
+    unit, node, endpoints = device.unit, device.node, device.endpoints
     if not endpoints:
         raise UsageError(
             "the endpoint to listen on is missing",
             expected="--on pty:PATH, --on tcp://HOST:PORT or, CANopen, --on can:fieldtwin/127.0.0.1:29536",
         )
-    options = NodeOptions(model, not defaults) if of_node else None
-    if len(recordings) > 1:
+    of_node = (device.model, device.defaults) != (None, False)
+    options = NodeOptions(device.model, not device.defaults) if of_node else None
+    if len(replay.recordings) > 1:
         raise UsageError("one device replays one recording")
+    recording = Path(replay.recordings[0]) if replay.recordings else None
     if kind == "data sheet":
         if unit is not None:
             raise UsageError("a data sheet has no unit ID", hint="--node")
         from fieldtwin.run.emulate.data_sheet import run_data_sheet
 
-        log = Path(recordings[0]) if recordings else None
-        return run_loop(run_data_sheet(path, endpoints, node, bitrate, log, options))
+        return run_loop(run_data_sheet(path, endpoints, node, device.bitrate, recording, options))
     if kind == "log":
-        if unit is not None or recordings:
+        if unit is not None or recording is not None:
             raise UsageError("a log needs no --recording, and has no unit ID", expected="--node")
         from fieldtwin.run.emulate.data_sheet import run_log
 
-        return run_loop(run_log(path, endpoints, node, bitrate))
+        return run_loop(run_log(path, endpoints, node, device.bitrate))
     if unit is not None and node is not None:
         raise UsageError("a device has a unit ID or a node ID, not both")
-    extras = _extras(kind, path, values, recordings, faults_file, seed, any_unit)
-    unit = node if unit is None else unit
-    recording = Path(recordings[0]) if recordings else None
-    serial = any(endpoint.startswith("pty:") for endpoint in endpoints)
     return run_loop(
         run_device(
-            kind, path, endpoints, unit, recording, speed or 1.0, bitrate, unknown=NeverRecorded(unknown or "exception"),
-            at_end=EndOfRecording(at_end or "hold"), options=options, extras=extras,
+            kind, path, endpoints, node if unit is None else unit, recording, replay.speed or 1.0, device.bitrate,
+            unknown=NeverRecorded(replay.unknown or "exception"), at_end=EndOfRecording(replay.at_end or "hold"),
+            options=options, extras=_extras(kind, path, device, recording),
         ),
-        serial=serial,
+        serial=any(endpoint.startswith("pty:") for endpoint in endpoints),
     )  # fmt: skip
 
 
-def _extras(
-    kind: str,
-    path: Path,
-    values: tuple[str, ...],
-    recordings: tuple[str, ...],
-    faults_file: str | None,
-    seed: int,
-    any_unit: bool,
-) -> Extras | None:
+def _extras(kind: str, path: Path, device: OneDeviceOptions, recording: Path | None) -> Extras | None:
     """Return the optional parts of a Modbus device, or None. Raises `UsageError` and `FileInvalid`."""
     from fieldtwin.emulators.device_faults import check_device
     from fieldtwin.emulators.faults.schema import load_faults
     from fieldtwin.gateway.core.files.profile import load_profile
     from fieldtwin.run.emulate.device import Extras
 
-    if not (values or faults_file or any_unit):
+    values, faults = device.values, device.faults_file
+    if not (values or faults or device.any_unit):
         return None
     profile = load_profile(path) if kind == "device" else None
     if profile is not None and profile.protocol != "modbus":
         raise UsageError("--values, --faults and --any-unit are for a Modbus device", got=profile.name)
-    if values and (profile is None or recordings or profile.inbox is not None):
+    if values and (profile is None or recording is not None or profile.inbox is not None):
         raise UsageError(
             "--values gives a device its registers from its profile",
             expected="a profile of registers, without --recording",
@@ -277,10 +161,8 @@ def _extras(
         if unknown is not None:
             raise UsageError(f"{profile.name} has no tag {unknown!r}", expected=", ".join(profile.tags))
     stated = held is not None
-    said = (
-        load_faults(Path(faults_file), lambda spec: check_device(spec, profile, values=stated)) if faults_file else ()
-    )
-    return Extras(held, said, seed, any_unit)
+    said = load_faults(Path(faults), lambda spec: check_device(spec, profile, values=stated)) if faults else ()
+    return Extras(held, said, device.seed, device.any_unit)
 
 
 def _values(said: tuple[str, ...]) -> dict[str, float | str]:

@@ -1,4 +1,7 @@
-"""The options that all commands of `fieldtwin check` have, for devices and for masters, and the use of their values."""
+"""The options that all commands of `fieldtwin check` have, for devices and for masters, and the use of their values.
+
+`fieldtwin test` shares those for JUnit.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fieldtwin.cli.option_groups import option
-from fieldtwin.cli.options import JSON, JUNIT_FLAVOUR, Duration
+from fieldtwin.cli.options import JSON, Duration
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.core.files.nearest import nearest
 
@@ -83,12 +86,24 @@ class CaseOptions:
 
 
 @dataclass(frozen=True)
-class ResultOptions:
+class JunitOptions:
+    """The JUnit file of a test, None for none, and its flavour (`fieldtwin.reports.junit.Flavour`)."""
+
+    junit: Path | None = option("--junit", type=_FILE, help="Write the verdicts as JUnit XML.")
+    junit_flavour: str = option(
+        "--junit-flavour",
+        type=click.Choice(["common", "jenkins"]),
+        default="common",
+        show_default=True,
+        help="With --junit: jenkins writes only what the schema of Jenkins' xUnit plugin (junit-10.xsd) allows.",
+    )
+
+
+@dataclass(frozen=True)
+class ResultOptions(JunitOptions):
     """The output of a conformance test."""
 
     html: Path | None = option("--html", type=_FILE, help="Write a report with every frame.")
-    junit: Path | None = option("--junit", type=_FILE, help="Write the verdicts as JUnit XML.")
-    junit_flavour: str = option("--junit-flavour", **JUNIT_FLAVOUR)
     out: Path | None = option(
         "-o", "--out", type=_FILE, help="Write the JSON to a file; that of a device is for `fieldtwin report`."
     )

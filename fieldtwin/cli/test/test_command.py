@@ -21,8 +21,10 @@ from rich.table import Table
 from fieldtwin.__about__ import __version__
 from fieldtwin.cli.campaign_options import CampaignOptions
 from fieldtwin.cli.option_groups import GroupedCommand, group
-from fieldtwin.cli.options import Secret, json_option, junit_flavour_option
+from fieldtwin.cli.options import json_option
 from fieldtwin.cli.template_question import SourceOptions
+from fieldtwin.cli.test.check_options import JunitOptions
+from fieldtwin.cli.test.target_options import TargetOptions
 from fieldtwin.conformance.core.case import Impact
 from fieldtwin.console import show_warnings, stdout
 from fieldtwin.gateway.core.errors import UsageError
@@ -49,52 +51,7 @@ class _WithCommand(GroupedCommand):
 
 @click.command("test", cls=_WithCommand)
 @click.argument("files", nargs=-1, type=click.Path(exists=True))
-@group(
-    "Target",
-    click.option(
-        "--target",
-        type=click.Choice(["virtual", "local", "compose", "real"]),
-        default="virtual",
-        show_default=True,
-        help="Where to run: virtual time, processes on this host, containers, a plant.",
-    ),
-    click.option(
-        "--can",
-        default="",
-        metavar="INTERFACE/CHANNEL",
-        help="With local: emulate CAN buses on this interface, such as socketcan/vcan0.",
-    ),
-    click.option(
-        "--with",
-        "with_command",
-        is_flag=True,
-        help="With local: CMD after -- controls instead of our gateway and PLC, in the environment of `fieldtwin with`.",
-    ),
-    click.option("--instance", default="", help="With compose, real: name of the running instance on this host."),
-    click.option(
-        "--field", "field_host", default="", metavar="HOST[:PORT]", help="With compose: address of the field simulator."
-    ),
-    click.option(
-        "--token",
-        type=Secret(),
-        default="",
-        metavar="@FILE",
-        help="Token of that simulator's control channel; or FIELDTWIN_TEST_TOKEN.",
-    ),
-    click.option("--far", default="", metavar="ENDPOINT", help="With real: endpoint of the topside modem, for `send`."),
-    click.option(
-        "--capture",
-        type=click.Path(exists=True, dir_okay=False),
-        help="With --instance: the file with its captured traffic.",
-    ),
-    click.option(
-        "--allow",
-        type=click.Choice([danger.value for danger in Impact]),
-        default=Impact.READ.value,
-        show_default=True,
-        help="With --target real: highest impact level of steps.",
-    ),
-)
+@group("Target", at=TargetOptions)
 @group(
     "Runs",
     click.option("--seed", type=int, default=None, help="Use this seed instead of the scenario's."),
@@ -114,10 +71,9 @@ class _WithCommand(GroupedCommand):
 )
 @group("Campaign of seeds, in virtual time", campaign=CampaignOptions)
 @group("Profiles and templates", sources=SourceOptions)
+@group("Output", junit=JunitOptions)
 @group(
     "Output",
-    click.option("--junit", type=click.Path(dir_okay=False), help="Write JUnit XML to this file."),
-    junit_flavour_option,
     click.option(
         "--html", type=click.Path(dir_okay=False), help="Write an HTML page with verdicts and diagrams to this file."
     ),
@@ -130,24 +86,15 @@ class _WithCommand(GroupedCommand):
 )
 def command(
     files: tuple[str, ...],
-    target: str,
-    allow: str,
-    instance: str,
-    field_host: str,
-    with_command: bool,
-    token: str,
-    far: str,
-    capture: str | None,
-    can: str,
-    waivers: str | None,
-    retries: int,
+    at: TargetOptions,
     seed: int | None,
-    junit: str | None,
-    junit_flavour: str,
-    html: str | None,
-    trace: str | None,
+    retries: int,
+    waivers: str | None,
     campaign: CampaignOptions,
     sources: SourceOptions,
+    junit: JunitOptions,
+    html: str | None,
+    trace: str | None,
     as_json: bool,
 ) -> int:
     """Run the scenarios in FILES (*.scenario.yaml; for a folder, all in it; default: those of the working directory).
@@ -175,12 +122,12 @@ def command(
     from fieldtwin.scenarios.judging.waiving import all_well, ids_of, waive
     from fieldtwin.scenarios.language.form import load_scenario
 
-    target, controller = _controller(target, with_command)
+    target, controller = _controller(at.target, at.with_command)
     paths = _found(files)
     if trace and len(paths) != 1:
         raise UsageError("--trace needs a single scenario", got=f"{len(paths)} of them")
-    _check(target, allow, instance, far, capture, can)
-    if retries and target == "real" and Impact(allow).rank > Impact.READ.rank:
+    _check(target, at)
+    if retries and target == "real" and Impact(at.allow).rank > Impact.READ.rank:
         raise UsageError(
             "--retry-inconclusive would repeat a scenario's writes to a plant",
             expected="--allow read, or no retries",
@@ -196,13 +143,13 @@ def command(
     where = Target(
         target,
         seed,
-        instance,
-        field_host,
-        token,
-        far,
-        Path(capture) if capture else None,
-        Impact(allow),
-        can,
+        at.instance,
+        at.field_host,
+        at.token,
+        at.far,
+        at.capture,
+        Impact(at.allow),
+        at.can,
         controller,
     )
     results: list[ScenarioResult] = []
@@ -236,10 +183,10 @@ def command(
         machines_of=machines,
         served=(),
     )
-    if junit:
+    if junit.junit is not None:
         from fieldtwin.reports.junit import Flavour, write_junit
 
-        write_junit(report, Path(junit), Flavour(junit_flavour))
+        write_junit(report, junit.junit, Flavour(junit.junit_flavour))
     if html:
         from fieldtwin.reports.run.html import write_html
 
@@ -303,14 +250,14 @@ def _controller(target: str, with_command: bool) -> tuple[str, tuple[str, ...]]:
     return target, words
 
 
-def _check(target: str, allow: str, instance: str, far: str, capture: str | None, can: str) -> None:
-    if can and target != "local":
+def _check(target: str, at: TargetOptions) -> None:
+    if at.can and target != "local":
         raise UsageError("--can needs --target local", got=f"--target {target}")
-    if target != "real" and (far or allow != Impact.READ.value):
+    if target != "real" and (at.far or at.allow != Impact.READ.value):
         raise UsageError("--far and --allow need --target real", got=f"--target {target}")
-    if target in ("virtual", "local") and instance:
+    if target in ("virtual", "local") and at.instance:
         raise UsageError("--instance names a running instance", expected="--target compose or real")
-    if capture and target != "compose" and not instance:
+    if at.capture and target != "compose" and not at.instance:
         raise UsageError(
             "--capture needs a running instance", expected="--target compose, or --target real --instance NAME"
         )

@@ -33,11 +33,11 @@ MakeRoom = Callable[[], Awaitable[int]]
 
 
 class KnowledgeWriter:
-    """Writes one origin's events in batches. `observe` never waits and never fails; `run` writes until cancelled.
+    """The writer of one origin's events, in batches. `observe` never waits and never fails; `run` writes until cancelled.
 
-    The writer calls `on_trouble` once when less than `reserve_bytes` of room is left, once when nothing can be written,
-    and with ``""`` when the trouble is over. After each batch it calls `on_written` with the last number written. When
-    the store is full, `make_room` may forget events that are no longer needed.
+    The writer calls `on_trouble` once when less than `reserve_bytes` of room is left, once when nothing can be written, and with
+    ``""`` when the trouble is over. After each batch it calls `on_written` with the last number written. When the store is full,
+    `make_room` may forget events that are no longer needed.
     """
 
     def __init__(
@@ -70,7 +70,7 @@ class KnowledgeWriter:
 
     @property
     def queued(self) -> int:
-        """Number of events that were observed and are not in the store yet."""
+        """Return the number of events that were observed and are not in the store yet."""
         return len(self._queue)
 
     def observe(self, event: Event) -> None:
@@ -84,14 +84,14 @@ class KnowledgeWriter:
     async def run(self) -> None:
         """Write queued events until cancelled.
 
-        A store that refuses is tried again; an event that the store has taken is never written twice.
+        After an error of the store the write is repeated. An event that the store has taken is never written twice.
         """
         while True:
             wait_ms = EVERY_MS if await self.try_to_flush() else RETRY_MS
             await self._clock.sleep_until_ns(self._clock.monotonic_ns() + wait_ms * NS_PER_MS)
 
     async def try_to_flush(self) -> bool:
-        """Call `flush`; if the store refuses, report the trouble and return False."""
+        """Call `flush`. If the store raises an error, report the trouble and return False."""
         try:
             await self.flush()
         except Unreachable as e:

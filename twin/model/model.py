@@ -14,7 +14,7 @@ from fieldtwin.twin.model.variables import Variable, Variables
 
 
 class DigitalModel:
-    """SPEC row DigitalModel. Init: STANDBY, period 0, all variables unknown. ProcessEvent is the state machine's.
+    """SPEC row DigitalModel. Init: STANDBY, period 0, all variables unknown. ProcessEvent is that of the state machine.
 
     `declared` holds the system's variables (`fieldtwin.twin.plant.declared`), and `variables` their last reported
     values. Commands and statuses do not change `variables`, and reported values do not change the state.
@@ -32,7 +32,7 @@ class DigitalModel:
 
     @property
     def period_s(self) -> int:
-        """The last commanded period in seconds, even if it is 0 or negative."""
+        """Return the last commanded period in seconds, even if it is 0 or negative."""
         return self.state_machine.period_s
 
     def process_event(self, command: COMMAND) -> STATE:

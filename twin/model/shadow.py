@@ -1,4 +1,4 @@
-"""The digital shadow: Monitor and Analyze over what arrives from the plant. It holds no object that could send.
+"""The digital shadow: Monitor and Analyze process the events that arrive from the plant. It holds no object that could send.
 
 It receives from a queue (SPEC ruling 16). Filling that queue, acknowledging events and requesting missing ones is done
 outside this module; import contracts keep it free of connections, drivers, transmitters and threads.
@@ -26,7 +26,7 @@ VERDICTS = 1000
 class DigitalShadow:
     """SPEC row DigitalShadow: its own digital model, thread processes, and a receive-only connection.
 
-    `step` runs the stages one after the other on what has arrived. `declared` are the variables of the model, which
+    `step` runs the stages one after the other on the arrived events. `declared` are the variables of the model, which
     only events change. `verdicts` is a consumer for callers that want to read the verdicts.
     """
 
@@ -47,11 +47,11 @@ class DigitalShadow:
 
     @property
     def processes(self) -> tuple[DTDigitalThreadProcess, ...]:
-        """The thread processes, whose shared events are the knowledge of this side."""
+        """Return the thread processes, whose shared events are the knowledge of this side."""
         return (self.monitor, self.analyze)
 
     def recall(self, events: Iterable[Event]) -> None:
-        """Restore the knowledge from before a restart, the last event of each name: the model's state and the findings."""
+        """Restore the model's state and the findings from before a restart, from the last event of each name."""
         for event in events:
             self.monitor.arrived(event, event.t_ms)
             self.monitor.handle_state()

@@ -38,10 +38,9 @@ class DigitalThreadProcess(ABC):  # noqa: B024  the schema has state and no oper
         self._clock = clock
 
     def share(self, kind: Kind, name: str, value: DATA | TagValue | str | int | float | None, t_ms: int = 0) -> Event:
-        """Add an event to the knowledge to share: an unchanged payload, a tag with its quality, or a word of the
-        process itself.
+        """Add an event to the knowledge to share: an unchanged payload, a tag with its quality, or a text of the process itself.
 
-        `t_ms` is the time (UTC) at which it was true; by default now.
+        `t_ms` is the time (UTC) at which the event occurred; by default now.
         """
         t_ms = t_ms or self._clock.utc_ns() // NS_PER_MS
         if isinstance(value, TagValue):

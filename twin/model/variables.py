@@ -1,7 +1,7 @@
 """The declared variables of a digital model: their declarations, and the last reported value of each with quality and
 time.
 
-The set of variables is fixed when the model is made, from the system file. Their values change by events alone. Pure:
+The system file determines the set of variables when the model is created. Their values change by events alone. Pure:
 no connection, no clock, no store; the time of a value comes from its event.
 """
 
@@ -37,12 +37,12 @@ class Variable:
 
     @property
     def heard(self) -> bool:
-        """Whether the plant ever reported this variable."""
+        """Return whether the plant ever reported this variable."""
         return self.t_ms > 0
 
     @property
     def good(self) -> bool:
-        """Whether the quality is good."""
+        """Return whether the quality is good."""
         return self.quality is Quality.GOOD
 
     def declared(self) -> dict[str, Any]:
@@ -84,7 +84,10 @@ class Variables(Mapping[str, Variable]):
         return len(self._held)
 
     def changed(self, name: str, value: Scalar | None, quality: Quality, reason: Reason, t_ms: int) -> bool:
-        """Event: the plant reports `value` for `name` since `t_ms`. Return False if the model does not declare `name`."""
+        """Process the event that the plant reports `value` for `name` since `t_ms`.
+
+        Return False if the model does not declare `name`.
+        """
         held = self._held.get(name)
         if held is None:
             self.undeclared += 1
@@ -93,7 +96,7 @@ class Variables(Mapping[str, Variable]):
         return True
 
     def silent(self, name: str) -> None:
-        """Event: `name` was not reported for too long. Its last value stays readable, with bad quality."""
+        """Process the event that `name` was not reported for too long. Its last value stays readable, with bad quality."""
         held = self._held.get(name)
         if held is not None:
             self._held[name] = replace(held, quality=Quality.BAD, reason=Reason.STALE)

@@ -19,8 +19,7 @@ MOST_FILES = 65_536
 
 
 def end_with_parent(parent: int, linger_s: float = 0.0) -> None:
-    """Make the kernel signal when the process `parent` ends, and raise SIGTERM in this process `linger_s` seconds
-    later.
+    """Raise SIGTERM in this process `linger_s` seconds after the process `parent` has ended. The kernel signals the end.
 
     Linux only; on other systems this does nothing.
     """
@@ -50,7 +49,7 @@ def end_with_parent(parent: int, linger_s: float = 0.0) -> None:
 def allow_open_files() -> None:
     """Raise this process's limit of open files to its maximum, at most `MOST_FILES`: 1,000 devices need 2,000 sockets.
 
-    The usual limit of 1,024 exists for programs that use select(2), which this project does not.
+    The usual limit of 1,024 is for programs that use select(2). This project does not use it.
     """
     try:
         import resource

@@ -22,15 +22,15 @@ local clock, because its age would never count.
 
 
 class CommandGate(PTDigitalThreadProcess):
-    """Decides on commands: `admit` takes an event of the twin's log and returns the command, or None if it was refused.
+    """The gate for commands: `admit` takes an event of the twin's log and returns the command, or None if it was refused.
 
-    The outcome of each command is shared.
+    The outcome of each command is shared with the twin.
     """
 
     def __init__(self, *, remote: bool, bounds: Bounds, clock: Clock, old_ms: int = OLD_MS, since_ms: int = 0) -> None:
-        """`since_ms` is when the plant's own log began (UTC).
+        """Create the gate. `since_ms` is the time when the plant's own log began (UTC).
 
-        An earlier command may already have been obeyed, so it is refused.
+        An earlier command is refused, because the plant may already have obeyed it.
         """
         super().__init__("command gate", clock)
         self.taken = self.refused = 0

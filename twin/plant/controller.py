@@ -1,5 +1,4 @@
-"""The gateway's process: ``python -m fieldtwin.twin.plant.controller CONFIG.json``. A plant and its prototype run the
-same.
+"""The gateway's process: ``python -m fieldtwin.twin.plant.controller CONFIG.json``, the same for a plant and its prototype.
 
 The configuration names the system file, the run directory and, for a prototype, where each plant endpoint is opened
 instead. Only the Connector receives that mapping. Commands of the control channel: ready, get, published, watch, gate,
@@ -172,7 +171,7 @@ class GatewayProcess:
             socket.unlink(missing_ok=True)
 
     async def _flush(self) -> None:
-        """Store the log twice a second, or sooner if there is much. If the disk refuses, report it and try again."""
+        """Store the log twice a second, or earlier if many entries wait. If writing fails, report it and try again."""
         flushed_ns = self._clock.monotonic_ns()
         while True:
             await self._clock.sleep_until_ns(self._clock.monotonic_ns() + LOOK_EVERY_NS)
@@ -204,7 +203,7 @@ class GatewayProcess:
         )
 
     async def _published(self, args: dict[str, Any]) -> dict[str, Any]:
-        """Return at most `PUBLISHED_AT_ONCE` entries, the oldest first; a caller that needs more asks again."""
+        """Return at most `PUBLISHED_AT_ONCE` entries, the oldest first. A caller that needs more repeats the request."""
         since = int(args.get("since", 0))
         tags = self._gateway.tags
         newer = tags.journal_since(since)[:PUBLISHED_AT_ONCE]
@@ -212,9 +211,7 @@ class GatewayProcess:
         return {"entries": entries, "published": tags.published, "dropped": tags.journal_dropped}
 
     async def _watch(self, args: dict[str, Any]) -> dict[str, Any]:
-        """Return changes of tags since the last question, and the current values of some tags
-        (`fieldtwin.twin.plant.watching`).
-        """
+        """Return changes of tags since the last request, and values of some tags (`fieldtwin.twin.plant.watching`)."""
         return self._watching.answer(args)
 
     async def _gate(self, args: dict[str, Any]) -> dict[str, Any]:
@@ -223,9 +220,7 @@ class GatewayProcess:
         return {"remote": self._gateway.config.remote, "period_s": list(may.period_s), "per_minute": may.per_minute}
 
     async def _command(self, args: dict[str, Any]) -> dict[str, Any]:
-        """Pass on a command of the digital twin (``payload`` in hex) as if the transmitter had received it: the control
-        logic decides.
-        """
+        """Pass a command of the digital twin (``payload`` in hex) to the control logic, as if the transmitter had received it."""
         if len(self._gateway.pumps) != 1:
             raise UsageError("a command for the transmitter", expected="one", got=str(len(self._gateway.pumps)))
         try:
@@ -276,7 +271,7 @@ class GatewayProcess:
     async def _request_stop(self, args: dict[str, Any]) -> dict[str, Any]:
         """Set outputs to safe values, then stop.
 
-        The answer says whether the devices confirmed them, and holds the final counters.
+        The answer says whether the devices confirmed the values, and holds the final counters.
         """
         safe = await self._gateway.shut_down()
         await self._places.settle()

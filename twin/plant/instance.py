@@ -31,8 +31,7 @@ SOCKET_PATH_MAX = 100
 
 
 def runtime_root() -> Path:
-    """Return where run directories are made: FIELDTWIN_RUN, else the user's runtime folder, else a folder of the user
-    in /tmp.
+    """Return the folder for run directories: FIELDTWIN_RUN, else the user's runtime folder, else a folder of the user in /tmp.
 
     Raises `Unreachable` if the folder in /tmp was created by another user, or if other users may write to it.
     """
@@ -67,7 +66,10 @@ def _refuse_a_strangers(folder: Path) -> None:
 
 
 class Instance:
-    """``with Instance("observatory") as instance``: locks the directory until the end of the block. Raises `EndpointBusy`."""
+    """An instance with its locked directory: ``with Instance("observatory") as instance``.
+
+    Raises `EndpointBusy` if it is in use.
+    """
 
     def __init__(self, name: str, root: Path | None = None) -> None:
         if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,39}", name):

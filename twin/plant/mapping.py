@@ -1,4 +1,4 @@
-"""The one difference between the prototype and the plant: endpoints are opened elsewhere. Applied below every driver.
+"""The only difference between a prototype and its plant: below the drivers, endpoints of emulators replace those of the plant.
 
 Emulators are unknown here: this is a Connector that wraps a Connector (DESIGN.md, "Who opens a wire").
 """
@@ -13,7 +13,7 @@ from fieldtwin.gateway.core.errors import Unreachable, UsageError
 
 
 class MappedConnector:
-    """Opens `mapping[plant endpoint]` instead of the plant endpoint.
+    """A connector that opens `mapping[plant endpoint]` instead of the plant endpoint.
 
     An endpoint that is not mapped is refused, never opened.
     """
@@ -33,7 +33,7 @@ class MappedConnector:
         return target
 
     async def open_bytes(self, endpoint: Endpoint) -> ByteConnection:
-        """Open the endpoint that stands for `endpoint`. Also raises `Unreachable` where its virtual serial port is gone."""
+        """Open the endpoint that replaces `endpoint`. Also raises `Unreachable` if its virtual serial port no longer exists."""
         target = self._target(endpoint)
         if target.is_serial and target != endpoint:
             _refuse_stale_link(target)
@@ -65,7 +65,7 @@ def _refuse_stale_link(target: Endpoint) -> None:
 
 
 def mapped_endpoint(plant: Endpoint, listening: Endpoint) -> Endpoint:
-    """Return what the controller opens for `plant` when its emulator listens on `listening`.
+    """Return the endpoint that the controller opens instead of `plant` if the emulator listens on `listening`.
 
     A pty is opened as the serial port that it replaces, with the plant's baud rate and character format.
     """

@@ -1,8 +1,8 @@
 """The physical twin: gateway and PLC of a system, and the memory that they share.
 
-Everything on which both processes must agree is made here, once: the process image's layout from the system file, the
-file that holds the image, and the configuration of each process. Emulators are unknown here (`fieldtwin run --plant`
-works without that folder).
+This module creates, once, everything on which both processes must agree: the process image's layout from the system file, the
+file that holds the image, and the configuration of each process. Emulators are unknown here (`fieldtwin run --plant` works
+without that folder).
 """
 
 from __future__ import annotations
@@ -285,7 +285,7 @@ class EmbeddedControlSystem:
         """Return the gateway with its drivers.
 
         The gateway does not know which connections `connector` opens, or where `listen` accepts clients. `taken`
-        records which commands need not be handed on again after a restart; None if there will be no restart.
+        records which commands need not be passed on again after a restart; None if there will be no restart.
         """
         config = gateway_config(
             self.system,
@@ -303,7 +303,7 @@ class EmbeddedControlSystem:
     def prepare(self, run_dir: Path, *, cold: bool = False) -> PlcConfig:
         """Create the process image in `run_dir` and return the PLC process's configuration.
 
-        `cold`: discard retained values.
+        With `cold`, retained values are discarded.
         """
         make_image(self.layout, run_dir / "image")
         return plc_config(self.system, run_dir, cold=cold)
@@ -312,7 +312,7 @@ class EmbeddedControlSystem:
 class PhysicalTwin:
     """SPEC row PhysicalTwin: sensors, transmitters and the embedded control system.
 
-    The devices are external hardware; this class holds what the system file says about them. CANopen nodes count as
+    The devices are external hardware; this class holds their description from the system file. CANopen nodes count as
     sensors (SPEC ruling 13).
     """
 

@@ -23,7 +23,9 @@ MOST_WAITING = 64
 
 
 class RefusalPlaces:
-    """Completes the entries of `journal` over the PLC's control channel at `socket`. It then calls `tell` with each entry."""
+    """The lookup that completes the entries of `journal` over the PLC's control channel at `socket`, and then calls `tell` with
+    each.
+    """
 
     def __init__(self, journal: Refusals, socket: Path, tell: Callable[[dict[str, Any]], None] | None = None) -> None:
         self._journal = journal

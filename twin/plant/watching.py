@@ -1,7 +1,6 @@
-"""Lets clients follow a gateway's tags: every change since the last question, and the current values of some tags.
+"""Let clients follow a gateway's tags: every change since the last request, and the current values of some tags.
 
-Nothing is recorded before the first question; from then on the latest `MOST` changes are kept, and the older ones
-counted.
+Nothing is recorded before the first request. From then on the latest `MOST` changes are kept, and older ones are only counted.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ Change = tuple[int, int, str, Any, str, str]
 
 
 class TagWatch:
-    """Changes of a `TagTable`, numbered. ``answer({"since": 0, "names": [...]})`` is the control channel's `watch`."""
+    """The numbered changes of a `TagTable`. ``answer({"since": 0, "names": [...]})`` implements the control channel's `watch`."""
 
     def __init__(self, tags: TagTable, clock: Clock, journal: Refusals | None = None) -> None:
         self._journal = journal

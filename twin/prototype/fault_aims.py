@@ -19,7 +19,10 @@ from fieldtwin.twin.site.system import System
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """What a fault strikes. Empty `units` mean all of the bus; `addresses` None and empty `functions` mean all."""
+    """The target of a fault.
+
+    Empty `units` stand for all units of the bus; `addresses` None and empty `functions` also stand for all.
+    """
 
     bus: str
     units: tuple[int, ...]

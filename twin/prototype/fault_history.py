@@ -1,4 +1,4 @@
-"""How often each fault struck, including faults that were cleared: a fault that never took effect has tested nothing."""
+"""The number of strikes of each fault, also of cleared ones, because a fault that never took effect has tested nothing."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class FaultHistory:
         """Number of faults that were injected."""
 
     def add(self, active: Active, on: str) -> None:
-        """Remember a fault that is injected on a device or bus."""
+        """Add a fault that is injected into a device or bus."""
         self.count += 1
         self._put_in.append((self.count, active, on))
 

@@ -68,7 +68,7 @@ class FieldDevice:
 
     @property
     def command_list(self) -> frozenset[str]:
-        """The commands that this device accepts, according to its own profile."""
+        """Return the commands that this device accepts, according to its own profile."""
         return self.emulated.profile.command_list
 
     def executed(self) -> dict[str, int]:

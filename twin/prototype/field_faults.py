@@ -82,8 +82,11 @@ class FieldFaults:
         return self._buses[bus].refuses(self._clock.monotonic_ns())
 
     def watch(self, told: Callable[[str, object, bool, bytes], None]) -> None:
-        """Call `told` from now on for the traffic on each line and socket, with the bus, the connection object, whether
-        an emulator sent the bytes, and the bytes. CAN buses have their own listeners (`FieldSide.join`)."""
+        """Call `told` for the traffic on each line and socket from now on.
+
+        Its arguments are the bus, the connection object, whether an emulator sent the bytes, and the bytes. CAN buses have their
+        own listeners (`FieldSide.join`).
+        """
         for name, wire in self._buses.items():
             wire.watch = _watcher(name, told)
 
@@ -159,7 +162,7 @@ class FieldFaults:
             self._buses[bus].take_away(id)
 
     def set_value(self, device: str, tag: str, value: float | str | bool | None) -> None:
-        """Make the device hold `value` for `tag` from now on; None ends that."""
+        """Make the device hold `value` for `tag` from now on; None restores the device's own value."""
         found = tag_of(self._system, device, tag)
         distortions = self._distortions.get(device)
         if distortions is None or found.is_text:
@@ -181,7 +184,7 @@ class FieldFaults:
         self._set[device, tag] = float(value)
 
     def value_set(self, device: str, tag: str) -> float | None:
-        """Return the value at which `set_value` holds the tag; None if none is set."""
+        """Return the value that `set_value` has set for the tag, or None."""
         return self._set.get((device, tag))
 
     def values_set(self) -> dict[str, float]:

@@ -1,10 +1,9 @@
 """Leases on the simulated field devices: the faults and values of a test runner stay only while it renews its lease.
 
-A test runner (a scenario on a running system; *judge* in messages) opens a lease on the control channel, injects faults
-and sets values under its id, and renews it. Whatever happens to the test runner, including kill -9 and a lost network,
-everything that it injected is removed when the lease ends: faults are cleared, and each device value becomes what it
-was before the test runner's first `set`. Only one test runner at a time can hold the lease, because two would change
-each other's verdicts.
+A test runner (a scenario on a running system; *judge* in messages) opens a lease on the control channel, injects faults and sets
+values under the lease's id, and renews it. Even after kill -9 or a lost network, everything that the test runner injected is
+removed when the lease ends: faults are cleared, and each device value is restored to that before the test runner's first `set`.
+Only one test runner at a time can hold the lease, because two would change each other's verdicts.
 
 Pure: the time is passed in, in ns on the clock of the field process.
 """
@@ -55,11 +54,11 @@ class FieldLeases:
 
     @property
     def until_ns(self) -> int | None:
-        """Time at which the lease ends unless it is renewed; None without a lease."""
+        """Return the time (ns) at which the lease ends unless it is renewed; None without a lease."""
         return None if self._lease is None else self._lease.until_ns
 
     def open(self, id: str, for_s: float, now_ns: int) -> None:
-        """Give the lease to test runner `id` for `for_s` seconds. Raises `LeaseTaken` while a different one holds it."""
+        """Give the lease to test runner `id` for `for_s` seconds. Raises `LeaseTaken` while another test runner holds it."""
         self.expire(now_ns)
         if not id or len(id) > MOST_ID:
             raise UsageError("the lease's id", expected=f"1 to {MOST_ID} characters", got=repr(id)[:60])
@@ -95,7 +94,7 @@ class FieldLeases:
         return fault
 
     def set_value(self, id: str, device: str, tag: str, value: float | str | bool | None, now_ns: int) -> None:
-        """Set a device value under the lease; None ends the setting. The lease's end restores what was set before."""
+        """Set a device value under the lease; None ends the setting. The end of the lease restores the earlier value."""
         lease, before = self.of(id, now_ns), self._faults.value_set(device, tag)
         self._faults.set_value(device, tag, value)
         lease.before.setdefault((device, tag), before)

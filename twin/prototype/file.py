@@ -42,7 +42,7 @@ class EmulatedDevice:
 
     @property
     def plays(self) -> str:
-        """Description of the data source for people: synthetic data is never shown as measured."""
+        """Return a description of the data source for users. Synthetic data is never described as measured."""
         if self.form.simulation is not None:
             return f"the simulation {self.form.simulation}"
         if self.recording is None:
@@ -62,9 +62,9 @@ class Prototype:
     form: PrototypeForm
 
     def with_listen(self, system: System, bus: str, listen: Endpoint) -> Prototype:
-        """Return a copy in which the emulators of `bus` of `system` listen elsewhere.
+        """Return a copy in which the emulators of `bus` of `system` listen at a different endpoint.
 
-        Raises `UsageError` if another bus is there.
+        Raises `UsageError` if another bus uses that endpoint.
         """
         buses = {**self.buses, bus: replace(self.buses[bus], listen=listen)}
         if (clash := _clash(system, buses)) is not None:
@@ -160,7 +160,7 @@ def _bus(file: YamlFile, system: System, form: PrototypeForm, name: str) -> Emul
 
 
 def _anywhere(listen: Endpoint) -> bool:
-    """Return whether the endpoint takes a port that is free at that time, and so cannot clash."""
+    """Return whether the endpoint chooses a free port when it is opened, so that it cannot clash."""
     if listen.is_can:
         return listen.path.endswith(":0")
     return listen.scheme != "pty" and listen.port == 0

@@ -29,13 +29,13 @@ class GroupMember:
 
     @property
     def prefix(self) -> str:
-        """The beginning of each of this system's names in the group: ``west.``; empty for a system alone."""
+        """Return the beginning of each of this system's names in the group: ``west.``; empty for a system alone."""
         return f"{self.name}." if self.name else ""
 
 
 @dataclass(frozen=True)
 class SystemGroup(ABC):
-    """The systems of a run, and how names and faults are assigned to them.
+    """The systems of a run. It assigns names and faults to them.
 
     `members` are in the file's order; `seed` is the file's.
     """
@@ -51,11 +51,11 @@ class SystemGroup(ABC):
     @property
     @abstractmethod
     def whole(self) -> System:
-        """All systems combined as one, under the group's names. For readers only; it must never be run."""
+        """Return all systems combined as one, under the group's names. It is only for inspection and must never be run."""
 
     @property
     def shared(self) -> tuple[str, ...]:
-        """The names of what the systems share, at which faults can be aimed as at a bus."""
+        """Return the names of the shared resources, at which faults can be aimed as at a bus."""
         return ()
 
     @abstractmethod
@@ -64,7 +64,7 @@ class SystemGroup(ABC):
 
     @abstractmethod
     def check_fault(self, spec: FaultSpec) -> None:
-        """Check a fault's aim. Raises `WrongAim` if it is neither in a system nor in what they share."""
+        """Check a fault's aim. Raises `WrongAim` if the aim is neither in a system nor a shared resource."""
 
     @abstractmethod
     def place(self, faults: Iterable[Mapping[str, Any]]) -> dict[str, tuple[dict[str, Any], ...]]:
@@ -76,15 +76,15 @@ class SystemGroup(ABC):
     def random_shared_faults(
         self, random: Random, kinds: Collection[str], mean_s: float, last_s: float
     ) -> list[dict[str, Any]]:
-        """Return random faults of what the systems share, in the form of a fault file, all over by `last_s` seconds.
+        """Return random faults of the shared resources, in the form of a fault file. All are over after `last_s` seconds.
 
-        `kinds`: names of faults; empty: all. `mean_s`: mean seconds between two faults of a system.
+        `kinds` are names of faults; empty: all. `mean_s` is the mean time between two faults of a system, in seconds.
         """
         return []
 
 
 class OneSystem(SystemGroup):
-    """A system alone, as `one_system` makes it."""
+    """A system alone, as a group. `one_system` creates it."""
 
     @property
     def whole(self) -> System:

@@ -27,7 +27,7 @@ CANOPEN_KEYS = ("sdo_transfer_ms", "identity", "dcf", "store", "lss", "tpdos", "
 
 
 def canopen_bus(file: YamlFile, name: str, form: BusForm, *, is_can: bool) -> CanopenBusConfig:
-    """Return what else the NMT master of a bus produces. The keys are refused for a bus that is not CAN."""
+    """Return the settings of a bus's NMT master. Their keys are refused for a bus that is not CAN."""
     if not is_can:
         _refuse(file, ("buses", name), form.model_fields_set.intersection(CANOPEN_BUS_KEYS), "a CAN bus")
     counter = form.sync.counter if form.sync else 0
@@ -45,7 +45,7 @@ def canopen_bus(file: YamlFile, name: str, form: BusForm, *, is_can: bool) -> Ca
 def canopen_node(
     file: YamlFile, loc: tuple[Key, ...], form: DeviceForm, path: Path, profiles: Iterable[Path], *, is_can: bool
 ) -> CanopenNodeConfig:
-    """Return how a node is booted. The keys are refused for a device that is not a CANopen node."""
+    """Return the settings for the boot of a node. Their keys are refused for a device that is not a CANopen node."""
     if not is_can:
         _refuse(file, loc, form.model_fields_set.intersection(CANOPEN_KEYS), "a CANopen node")
         return CanopenNodeConfig()
@@ -66,7 +66,7 @@ def canopen_node(
 
 
 def check_rpdo1(file: YamlFile, loc: tuple[Key, ...], form: DeviceForm, profile: DeviceProfile, sync: bool) -> None:
-    """Check that RPDO1's tags may be written and fit into 8 bytes. `sync`: the bus has a SYNC producer."""
+    """Check that RPDO1's tags may be written and fit into 8 bytes. `sync` says that the bus has a SYNC producer."""
     if form.rpdo1 is None:
         return
     loc = (*loc, "rpdo1")

@@ -1,7 +1,7 @@
-"""Files that a run has read once, handed over to the run's own processes.
+"""The data of files that a run has read once, passed to the run's own processes.
 
-Processes that read the same files themselves could see different versions of them. The hand-over is a pickle in the run
-directory, which only its owner can read and write, and it is read by processes of the same version only.
+Processes that read the same files themselves could see different versions of them. The data is passed as a pickle in the run
+directory, which only its owner can read and write, and only processes of the same version read it.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from fieldtwin.gateway.core.errors import Bug
 
 
 def write_resolved(path: Path, *files: object) -> str:
-    """Write what was read from files, such as a `System`, for a child process. Return the path as text.
+    """Write data that was read from files, such as a `System`, for a child process. Return the path as text.
 
     The file is readable and writable for its owner only, and replaces an older one.
     """
@@ -27,7 +27,7 @@ def write_resolved(path: Path, *files: object) -> str:
 
 
 def read_resolved(path: str) -> tuple[object, ...]:
-    """Return what `write_resolved` was given. Raises `Bug` if the file is not whole."""
+    """Return the data that `write_resolved` wrote. Raises `Bug` if the file is not complete."""
     try:
         files = pickle.loads(Path(path).read_bytes())
     except (OSError, EOFError, pickle.UnpicklingError, AttributeError, ImportError) as e:

@@ -146,8 +146,9 @@ class DeviceForm(Strict):
 
 
 class WatchdogForm(Strict):
-    """When a scan counts as late, after how many consecutive overruns the PLC stops, when a scan that does not end is
-    aborted, and how often the programs are restarted after that."""
+    """The limits of the PLC's watchdog: the delay of a late scan, the consecutive overruns before a stop, the time after which a
+    scan that does not end is aborted, and the number of restarts of the programs after that.
+    """
 
     late_ms: Milliseconds = 5
     stop_after: int = Field(default=3, ge=1, le=1000)
@@ -164,9 +165,7 @@ class InputForm(Strict):
 
 
 class StartForm(Strict):
-    """How long a program waits before its first scan until each input has been good once, and what happens after that
-    time.
-    """
+    """The start of a program: how long it waits until each input has been good once, and the action after that time."""
 
     timeout_ms: int = Field(default=10_000, ge=0, le=3_600_000, description="0: do not wait")
     at_timeout: Literal["wait", "stop", "start_anyway"] = Field(
@@ -217,7 +216,7 @@ class PlcForm(Strict):
 
 
 class ServedTagForm(Strict):
-    """Where a tag is served: exactly one of the four tables, at a PDU address.
+    """The place at which a tag is served: exactly one of the four tables, at a PDU address.
 
     `type` is the type of the served value. A quality register holds 0 for good quality.
     """

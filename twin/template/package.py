@@ -75,7 +75,7 @@ class Package(ABC):
 
     @property
     def code(self) -> tuple[str, ...]:
-        """Files of this package that Python could run."""
+        """Return the files of this package that Python could run."""
         return (*self.manifest.code, *self.caches)
 
     def read(self, file: TemplateFile) -> Iterator[bytes]:
@@ -107,7 +107,7 @@ class Package(ABC):
         )
 
     def verify(self) -> None:
-        """Read everything once. Raises `FileInvalid` for the first file that is not what the manifest says."""
+        """Read everything once. Raises `FileInvalid` for the first file that differs from the manifest."""
         for file in self.manifest.files:
             for _ in self.read(file):
                 pass

@@ -62,7 +62,7 @@ class TemplateFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit
 
     @property
     def is_code(self) -> bool:
-        """Whether Python would run the file, whatever its stated kind is."""
+        """Return whether Python would run the file, whatever its stated kind is."""
         return is_code(self.path)
 
 
@@ -94,7 +94,7 @@ class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_def
 
     @property
     def id(self) -> str:
-        """The identity of this template: the SHA-256 of its manifest, 64 hexadecimal digits."""
+        """Return the identity of this template: the SHA-256 of its manifest, 64 hexadecimal digits."""
         return hashlib.sha256(self.to_json()).hexdigest()
 
     def by_path(self) -> dict[str, TemplateFile]:
@@ -103,7 +103,10 @@ class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_def
 
     @property
     def code(self) -> tuple[str, ...]:
-        """Files that Python would run. Unless it is their own template, the user must agree before they are run."""
+        """Return the files that Python would run.
+
+        Unless the template is the user's own, the user must agree before they are run.
+        """
         return tuple(file.path for file in self.files if file.is_code)
 
 

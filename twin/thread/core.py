@@ -145,7 +145,7 @@ class Outgoing:
 
     @property
     def waiting(self) -> int:
-        """Number of events of the log that the other side has not confirmed."""
+        """Return the number of events of the log that the other side has not confirmed."""
         return max(0, self.last - self.through)
 
     # -- what comes -------------------------------------------------------------------------------------------------------
@@ -203,8 +203,8 @@ class Outgoing:
     def _is_less(self, through: int, now_ns: int) -> bool:
         """Handle an ACK for less than was confirmed before: it is late, or the other side is a different one.
 
-        HELLO asks, and its answer is believed, because the earlier confirmations were another side's. Return whether to
-        use this ACK.
+        A HELLO asks the other side, whose answer then counts, because the earlier confirmations may be those of a different side.
+        Return whether to use this ACK.
         """
         asked_ns = self._asked_ns
         if self._known and (asked_ns is None or now_ns - asked_ns < self._rto.smoothed_ns // 2):
@@ -295,7 +295,7 @@ class Outgoing:
         return now_ns < self._gathers_ns + self.linger_ns and not any(event.kind in URGENT for event in events)
 
     def _time_out(self, now_ns: int) -> None:
-        """Send again what waited too long for its ACK. It is enough to check the oldest event."""
+        """Send events again that waited too long for their ACK. It is enough to check the oldest event."""
         oldest = next(iter(self._window.values()), None)
         if oldest is None or oldest.sent_ns < 0 or now_ns < oldest.sent_ns + self._rto.now_ns:
             if oldest is None and not self._lost and self.through < self._loaded and self._tail_due(now_ns):
@@ -357,14 +357,14 @@ class Outgoing:
 
 @dataclass(frozen=True, slots=True)
 class Open:
-    """Effect: look up in the store what it has of this origin, then call `Incoming.opened`."""
+    """The effect "look up in the store which events it has of this origin", after which the caller calls `Incoming.opened`."""
 
     origin: str
 
 
 @dataclass(frozen=True, slots=True)
 class Keep:
-    """Effect: store these events, then call `Incoming.kept`."""
+    """The effect "store these events", after which the caller calls `Incoming.kept`."""
 
     origin: str
     events: tuple[Event, ...]
@@ -373,7 +373,7 @@ class Keep:
 
 @dataclass(frozen=True, slots=True)
 class NoteLost:
-    """Effect: record that these events will never come, then call `Incoming.noted`."""
+    """The effect "record that these events will never arrive", after which the caller calls `Incoming.noted`."""
 
     origin: str
     first: int
@@ -405,9 +405,9 @@ class _Stream:
 
 
 class Incoming:
-    """Receives logs of other sides.
+    """The receiver of the logs of other sides.
 
-    `knows` tells whether a schema can be decoded. ACKs are delayed by `ack_delay_ns`, so that one serves many frames.
+    `knows` returns whether a schema can be decoded. ACKs are delayed by `ack_delay_ns`, so that one ACK confirms many frames.
     """
 
     def __init__(self, knows: Callable[[bytes], bool], ack_delay_ns: int) -> None:
@@ -453,7 +453,7 @@ class Incoming:
         return [Open(hello.origin)]
 
     def opened(self, origin: str, last: int, gaps: Sequence[tuple[int, int]], now_ns: int) -> list[Effect]:
-        """Take what the store has of `origin`: everything up to `last` except the `gaps`."""
+        """Note which events of `origin` the store has: all up to `last` except the `gaps`."""
         effects: list[Effect] = []
         for stream in self._of(origin):
             at = 0

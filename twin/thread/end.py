@@ -81,7 +81,7 @@ class ThreadEnd:
 
     @property
     def waiting(self) -> int:
-        """Number of events of this side's log that the other side has not confirmed."""
+        """Return the number of events of this side's log that the other side has not confirmed."""
         return self.out.waiting if self.out is not None else 0
 
     def appended(self, last: int) -> None:
@@ -244,7 +244,7 @@ class ThreadEnd:
         self.into.noted(effect.origin, effect.first, effect.last, self._clock.monotonic_ns())
 
     async def _tell(self, origin: str) -> None:
-        """Pass on the events after the last ones passed on, without gaps except for lost events."""
+        """Pass on the next events in order, without gaps except for lost events."""
         through = self.into.through(origin)
         while self._on_events is not None and (told := self._told.get(origin, through)) < through:
             block = [e for e in await self._store.read(origin, told + 1, READ_BLOCK) if e.sequence <= through]

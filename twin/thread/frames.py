@@ -52,7 +52,7 @@ class Schema:
 
     @property
     def id(self) -> bytes:
-        """The first bytes of a SHA-256 over the version of this encoding, the system and the names.
+        """Return the first bytes of a SHA-256 over the version of this encoding, the system and the names.
 
         Two plants of the same design therefore have different schemas.
         """

@@ -53,7 +53,7 @@ class Link(ABC):
 
 
 class Carrier(ABC):
-    """Opens links, one at a time."""
+    """The opener of links, one at a time."""
 
     name: str
 
@@ -62,7 +62,7 @@ class Carrier(ABC):
         """Return a link to the other side. A listening side waits for it. Raises `Unreachable`."""
 
     async def aclose(self) -> None:
-        """Open no more links."""
+        """Close the carrier: it opens no more links."""
         return
 
 

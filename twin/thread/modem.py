@@ -34,7 +34,7 @@ NOT_ASKED = DeviceState.error
 class ModemLink(DatagramLink):
     """A link through a transmitter's mailboxes.
 
-    It persists while the modem is offline, and sends what it holds when the modem is back.
+    The link stays open while the modem is offline, and sends its waiting datagrams when the modem is back.
     """
 
     ack_delay_ns = ACK_DELAY_NS
@@ -70,7 +70,7 @@ class ModemLink(DatagramLink):
 
     @property
     def trouble(self) -> str:  # type: ignore[override]
-        """Why the modem does not answer, without the details that differ between tries; empty before the first request."""
+        """Return why the modem does not answer, without the details that differ between tries; empty before the first request."""
         state = self._bus.devices[0]
         why = "" if state.online else self._bus.error or state.error.removeprefix(NOT_ASKED)
         return f"the modem: {why.partition('; expected')[0]}" if why else ""

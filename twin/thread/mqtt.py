@@ -44,7 +44,7 @@ class _Socket(ssl.SSLSocket):
 
 
 class _Heard(logging.Handler):
-    """Keeps the last log message of paho, which is the only source for the reason of a lost connection."""
+    """A log handler that keeps the last message of paho, which is the only source for the reason of a lost connection."""
 
     def __init__(self) -> None:
         super().__init__(logging.WARNING)
@@ -55,7 +55,7 @@ class _Heard(logging.Handler):
 
 
 def _refusal(e: aiomqtt.MqttError, heard: str, where: str) -> Unreachable:
-    """Return why there is no session. A broker that is not reachable may be later; one that refuses will go on refusing."""
+    """Return why there is no session: `Unreachable` if a later attempt may succeed, `Unwelcome` if the broker refuses."""
     cause = e.__context__  # aiomqtt keeps the exception that paho raised
     if isinstance(cause, ssl.SSLCertVerificationError):
         hint = "ca= is the trusted authority; the certificate must name the host in the URL"
@@ -168,7 +168,7 @@ class MqttLink(Link):
 
 
 class MqttCarrier(Carrier):
-    """Connects to the broker.
+    """The carrier that connects to the broker.
 
     `make_side` is called for each session with its number, because births and deaths are counted, and with its start
     time (UTC, ms).

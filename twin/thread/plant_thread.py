@@ -73,8 +73,10 @@ class PlantThreadConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
 
 
 class ImageProcess(PTDigitalThreadProcess):
-    """Shares the process image's changes. Call `look` with both regions often enough to miss no change. While a tag's
-    quality stays the same, its new values are shared at most every `every_ms`; states and messages always.
+    """The thread process that shares the process image's changes. Call `look` with both regions often enough to miss no change.
+
+    While a tag's quality stays the same, its new values are shared at most every `every_ms`. States and messages are always
+    shared.
 
     Whether a program runs is a value with the program's name, which is bad when it does not run (SPEC ruling 18). When
     the PLC is dead, its last state is no longer a state of the plant, and when the gateway is dead, its values are bad.
@@ -96,7 +98,7 @@ class ImageProcess(PTDigitalThreadProcess):
         self._said: dict[str, tuple[object, int]] = {}
 
     def look(self, inputs: Snapshot, outputs: Snapshot) -> None:
-        """Share what is new, and what was not shared for `REFRESH_MS`."""
+        """Share the values that are new, and those that were not shared for `REFRESH_MS`."""
         now_ns = self._clock.monotonic_ns()
         now_ms, offset_ns = self._clock.utc_ns() // NS_PER_MS, self._clock.utc_ns() - now_ns
         gateway_dead = Reason.GATEWAY_DEAD if inputs.age_ns(now_ns) > self._lost_ns[INPUTS] else Reason.NONE
@@ -136,9 +138,7 @@ class ImageProcess(PTDigitalThreadProcess):
             self._status(program, outputs.value(f"{program}.state"), outputs.value(period), now_ms)
 
     def tell_again(self) -> None:
-        """Share the states with the next look even if unchanged: after a refused command, its sender assumes a wrong
-        state.
-        """
+        """Share the states again with the next `look`, because the sender of a refused command assumes a wrong state."""
         for program in self._machines:
             self._said.pop(f"{program}.", None)
 
@@ -246,7 +246,10 @@ class PlantThread:
                 self._gate.share(Kind.REFUSAL, "gateway", f"number {event.sequence} of {origin}: {e}")
 
     async def _hand_over(self, client: ControlClient, origin: str, event: Event) -> None:
-        """Pass a command on. The switch and the limits are read from the gateway, because a reload may have changed them."""
+        """Pass a command to the gateway.
+
+        The switch and the limits are read from the gateway, because a reload may have changed them.
+        """
         now = await client.call("gate")
         least_s, most_s = now["period_s"]
         self._gate.restate(remote=now["remote"], bounds=Bounds(least_s, most_s, now["per_minute"]))

@@ -190,7 +190,7 @@ class EdgeNode(_Side):
         return Message(topic(self._group, "NDEATH", self._node), encode_payload(Payload(self._began_ms, (bd,))), qos=1)
 
     def hello(self) -> list[Message]:
-        """Return what to publish when the link is established: nothing, because the birth is sent with the thread's HELLO."""
+        """Return the messages to publish when the link is established: none, because the birth follows with the HELLO."""
         return []
 
     def messages(self, frame: Frame, now_ms: int) -> list[Message]:
@@ -265,11 +265,11 @@ class HostApplication(_Side):
         return Message(self._state, json.dumps(state, separators=(",", ":")).encode(), qos=1, retain=True)
 
     def will(self) -> Message:
-        """Return what the broker publishes if this side is lost."""
+        """Return the message that the broker publishes if this side is lost."""
         return self._says(online=False)
 
     def hello(self) -> list[Message]:
-        """Return what to publish when the link is established: that this host is online, and a request for a rebirth."""
+        """Return the messages to publish when the link is established: that this host is online, and a request for a rebirth."""
         return [self._says(online=True), self._rebirth(self._began_ms)]
 
     def _rebirth(self, now_ms: int) -> Message:

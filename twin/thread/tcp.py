@@ -127,7 +127,7 @@ class StreamLink(DatagramLink):
 
 
 class TcpDialler(Carrier):
-    """Connects to the other side."""
+    """The carrier that connects to the other side."""
 
     def __init__(self, endpoint: Endpoint, connector: Connector, schemas: Sequence[Schema]) -> None:
         self.name = f"thread to {endpoint}"
@@ -147,8 +147,10 @@ class TcpDialler(Carrier):
 
 
 class TcpListening(Carrier):
-    """Waits for the other side. A peer that lost its link may connect again before this side notices; `refused` counts
-    other peers that were refused.
+    """The carrier that waits for the other side.
+
+    A peer that lost its link may connect again before this side has noticed the loss. `refused` counts other peers that were
+    refused.
 
     ``carrier = await TcpListening.start(endpoint, TcpListener.open, schemas)``; `bound` is the endpoint with its port.
     """

@@ -30,12 +30,11 @@ are events from before this twin was running."""
 
 
 class Analyze(DTDigitalThreadProcess):
-    """SPEC row Analyze. Compares values with the limits of the model's variables. A tag that is not reported for
-    `stale_after_ms` is stale.
+    """SPEC row Analyze. Compares values with the limits of the model's variables.
 
-    Every status gets a verdict. For a tag only changes are emitted: outside and inside again, bad and good, stale and
-    fresh. A change that first arrived as history is emitted again as soon as the plant reports that it still holds,
-    because a planner acts on the present state only.
+    A tag that is not reported for `stale_after_ms` is stale. Every status gets a verdict. For a tag only changes are emitted:
+    outside its limits and inside again, bad and good, stale and fresh. A change that first arrived as history is emitted again as
+    soon as the plant reports that it still holds, because a planner acts on the present state only.
     """
 
     def __init__(self, model: DigitalModel, clock: Clock, *, stale_after_ms: int) -> None:
@@ -67,9 +66,9 @@ class Analyze(DTDigitalThreadProcess):
                 self._history |= {(name, wrong) for wrong in self._wrong[name]}
 
     def check_statuses(self, status: SeenStatus) -> bool | None:
-        """CheckStatuses: return whether the reported state and period equal the model's.
+        """Return whether the reported state and period equal the model's (CheckStatuses).
 
-        None if the status cannot be decoded.
+        Return None if the status cannot be decoded.
         """
         try:
             state, period_s = decode_status(status.data)
@@ -78,7 +77,10 @@ class Analyze(DTDigitalThreadProcess):
         return (state, period_s) == (self.digital_model.state.name, self.digital_model.period_s)
 
     def compare(self) -> None:
-        """compare: consume ; CheckStatuses ; emit. A measurement is compared with its limits."""
+        """Consume statuses and measurements, check them, and emit the verdicts (compare).
+
+        A measurement is compared with its limits.
+        """
         for message in self.consumer.drain():
             if isinstance(message, SeenStatus):
                 self._note_lag(message.t_ms, message.arrived_ms)
@@ -113,8 +115,8 @@ class Analyze(DTDigitalThreadProcess):
             self._turn(event.name, wrong, right, is_wrong, text, event.t_ms, late=late)
 
     def _weighed(self, message: SeenMeasurement) -> Iterator[tuple[str, str, bool, str]]:
-        """Yield each possible finding about a value: the word for wrong, the word for right, whether it is wrong, and a
-        sentence.
+        """Yield each possible finding about a value: its name if the value is wrong, its name if it is right, whether it is
+        wrong, and a sentence.
         """
         event = message.event
         bad = message.quality >= Quality.BAD
@@ -129,7 +131,7 @@ class Analyze(DTDigitalThreadProcess):
         yield "outside", "inside", outside, text
 
     def look(self) -> None:
-        """Report the tags that have not been updated for `stale_after_ms`. To be called as time passes."""
+        """Report the tags that have not been updated for `stale_after_ms`. The caller has to call this periodically."""
         now_ms = self._clock.utc_ns() // 1_000_000
         for name, heard_ms in self._heard.items():
             if now_ms - heard_ms > self._stale_after_ms:

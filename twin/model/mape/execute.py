@@ -1,7 +1,7 @@
 """Execute: the last stage. It checks each command against the digital model, and sends only what the model accepts.
 
-If configured, it also asks a prototype. That takes time and blocks nothing: later commands stay in the queue meanwhile.
-No user is involved. A refusal is an event with its reason (SPEC ruling 9), and is kept.
+If configured, it also asks a prototype. That takes time but blocks nothing: later commands stay in the queue meanwhile. No user
+is involved. A refusal becomes an event with its reason (SPEC ruling 9).
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Bounds:
 
 
 class CommandCheck:
-    """Checks that a command can be decoded, is inside its bounds and does not exceed the rate.
+    """The check that a command can be decoded, is inside its bounds and does not exceed the rate.
 
     Plant and twin each have their own check: the plant does not rely on the twin that commands it.
     """
@@ -44,7 +44,7 @@ class CommandCheck:
         self._taken: deque[int] = deque(maxlen=bounds.per_minute)
 
     def restate(self, bounds: Bounds) -> None:
-        """Use new bounds from now on; commands taken before still count towards the rate."""
+        """Use new bounds from now on. Commands that were taken before still count towards the rate."""
         if bounds != self.bounds:
             self.bounds = bounds
             self._taken = deque(self._taken, maxlen=bounds.per_minute)
@@ -68,10 +68,10 @@ class CommandCheck:
 
 
 class Execute(DTDigitalThreadProcess):
-    """SPEC row Execute: consume ; ChangeState ; emit. `transmitter` emits the commands to send, in order.
+    """SPEC row Execute: consume, ChangeState, emit. `transmitter` emits the commands to send, in order.
 
-    `question` is asked of `what_if` for each command for which the planner gives no question of its own. Such a command
-    is sent only after an answer without an objection.
+    For each command for which the planner gives no own question, `what_if` is asked `question`. The command is sent only after an
+    answer without an objection.
     """
 
     def __init__(
@@ -95,11 +95,11 @@ class Execute(DTDigitalThreadProcess):
 
     @property
     def asking(self) -> bool:
-        """Whether a command waits for its answer; commands planned meanwhile wait in the queue."""
+        """Return whether a command waits for its answer; commands planned meanwhile wait in the queue."""
         return self._pending is not None
 
     def change_state(self, command: COMMAND) -> str:
-        """ChangeState: apply the command to the model. If it is refused, return the reason and leave the model unchanged."""
+        """Apply the command to the model (ChangeState). If it is refused, return the reason and leave the model unchanged."""
         objection = self._check.objection(command)
         if not objection:
             self.digital_model.process_event(command)
@@ -115,14 +115,14 @@ class Execute(DTDigitalThreadProcess):
             self._settle(command, objection or self.change_state(command))
 
     def give_up(self, why: str) -> None:
-        """Refuse the command that waits for an answer and all commands after it, because the twin ends."""
+        """Refuse the command that waits for an answer and all later commands, because the twin ends."""
         waiting = [*self.plans.drain()] if self._pending is None else [self._pending, *self.plans.drain()]
         self._pending = None
         for command in waiting:
             self._settle(command, why)
 
     def _next(self) -> tuple[COMMAND, str | None]:
-        """Return the first command and the objection to it before the model takes it. None: the answer is still pending."""
+        """Return the first command and the objection to it, before the model takes it; None while the answer is pending."""
         if self._pending is None:
             command = self.plans.consume()
             question = command.question if isinstance(command, PlannedCommand) else self._question
@@ -150,7 +150,7 @@ class Execute(DTDigitalThreadProcess):
 
 
 def _told(command: COMMAND, objection: str) -> str:
-    """Return the reason, with the command's period where the reason does not already name it."""
+    """Return the reason with the command's period, unless the reason already contains it."""
     try:
         period_s = decode_period(command)
     except Desync:

@@ -28,22 +28,23 @@ class SeenMeasurement(MEASUREMENT):
 
     @property
     def quality(self) -> Quality:
-        """Quality of the value. A quality worse than every known one, which a newer plant may send, is read as bad."""
+        """Return the quality of the value. An unknown quality, which a newer plant may send, is read as bad."""
         return Quality(min(self.event.quality, Quality.BAD))
 
     @property
     def reason(self) -> Reason:
-        """Reason for a quality that is not good.
+        """Return the reason for a quality that is not good.
 
-        A reason that is unknown to this version, from a newer plant, is read as NONE.
+        An unknown reason, which a newer plant may send, is read as NONE.
         """
         return Reason(self.event.reason) if self.event.reason in _REASONS else Reason.NONE
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict(DATA):
-    """A finding of an analysis about `subject`: `finding` is a key of `FINDINGS`, `text` a sentence. `data` is the text
-    as UTF-8.
+    """A finding of an analysis about `subject`.
+
+    `finding` is a key of `FINDINGS`, `text` a sentence, and `data` the text as UTF-8.
 
     `again` is true if the same finding was emitted before, as history or before a restart, and now holds at present.
     """
@@ -56,7 +57,7 @@ class Verdict(DATA):
 
     @property
     def fine(self) -> bool:
-        """Whether the finding reports a normal condition."""
+        """Return whether the finding reports a normal condition."""
         return self.finding in ("agree", "inside", "good", "fresh")
 
 

@@ -21,7 +21,7 @@ CAPACITY = 10_000
 
 
 class Monitor(DTDigitalThreadProcess):
-    """SPEC row Monitor. `statuses` and `measurements` are its consumers, `emitter` its producer; it updates the twin's model."""
+    """SPEC row Monitor: it updates the twin's model. `statuses` and `measurements` are its consumers, `emitter` its producer."""
 
     def __init__(self, model: DigitalModel, clock: Clock) -> None:
         super().__init__("monitor", clock)
@@ -41,7 +41,7 @@ class Monitor(DTDigitalThreadProcess):
             self.measurements.observe(SeenMeasurement(data, event, arrived_ms))
 
     def handle_state(self) -> None:
-        """handleState: per STATUS consume ; digitalModel.ProcessEvent ; emit.
+        """Consume each STATUS, apply it to the digital model, and emit it (handleState).
 
         A status that cannot be decoded is counted and leaves the model unchanged.
         """
@@ -54,6 +54,6 @@ class Monitor(DTDigitalThreadProcess):
             self.emitter.emit(status)
 
     def handle_measurements(self) -> None:
-        """handleMeasurements: per MEASUREMENT consume ; emit. The state machine of the model stays unchanged."""
+        """Consume and emit each MEASUREMENT (handleMeasurements). The state machine of the model stays unchanged."""
         for measurement in self.measurements.drain():
             self.emitter.emit(measurement)

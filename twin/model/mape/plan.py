@@ -36,9 +36,9 @@ _ABOUT = {
 
 
 class Planner(Protocol):
-    """Planning: from DATA to COMMAND, or None if no command is needed.
+    """The paper's Planning: a function from DATA to a COMMAND, or None if no command is needed.
 
-    A `FieldtwinError` that it raises is kept as a refusal.
+    A `FieldtwinError` that it raises is recorded as a refusal.
     """
 
     def plan(self, data: DATA, model: DigitalModel) -> COMMAND | None: ...
@@ -46,10 +46,10 @@ class Planner(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """When `finding` is reported for `subject` (empty: for any subject), command `period_s`.
+    """A rule: when `finding` is reported for `subject` (empty: for any subject), command `period_s`.
 
-    `ask` is the question for a prototype before the command is sent. True: the twin's default question, if it has one.
-    False: none.
+    `ask` is the question for a prototype before the command is sent. True stands for the twin's default question, if there is
+    one, and False for no question.
     """
 
     finding: str
@@ -66,7 +66,7 @@ class Rule:
 
 
 class RulePlanner:
-    """Applies the first rule that matches. A period that the model already has is not commanded again."""
+    """A planner that applies the first rule that matches. A period that the model already has is not commanded again."""
 
     def __init__(self, rules: Iterable[Rule]) -> None:
         self.rules = tuple(rules)
@@ -81,7 +81,7 @@ class RulePlanner:
 
 
 class Plan(DTDigitalThreadProcess):
-    """SPEC row Plan: consume ; Planning ; emit.
+    """SPEC row Plan: consume, Planning, emit.
 
     `take` consumes findings, and `plan_next` plans for the first of them. Findings may wait while a prototype is asked
     about a command; `overtaken` counts those that `only_newest` dropped because a newer finding superseded them.
@@ -97,7 +97,7 @@ class Plan(DTDigitalThreadProcess):
         self._waiting: deque[Verdict] = deque()
 
     def take(self) -> None:
-        """Consume findings. Those older than `OLD_MS` are counted and dropped."""
+        """Consume findings. Findings older than `OLD_MS` are counted and dropped."""
         now_ms = self._clock.utc_ns() // NS_PER_MS
         for message in self.consumer.drain():
             if now_ms - message.t_ms > OLD_MS:
@@ -106,8 +106,8 @@ class Plan(DTDigitalThreadProcess):
                 self._waiting.append(message)
 
     def only_newest(self) -> None:
-        """Keep only the newest waiting finding of each subject and property, so that no command is planned for an
-        outdated one.
+        """Keep only the newest waiting finding of each subject and property, so that no command is planned for an outdated
+        finding.
         """
         kept: dict[tuple[str, str], Verdict] = {}
         for message in self._waiting:

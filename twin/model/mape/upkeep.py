@@ -16,9 +16,9 @@ CAPACITY = 10_000
 
 
 class Upkeep:
-    """Subscribes to Monitor with `measured` and to Analyze with `analyzed`.
+    """A subscriber of Monitor (with `measured`) and of Analyze (with `analyzed`).
 
-    `keep_up` applies what was received to the model, in order.
+    `keep_up` applies the received events to the model, in order.
     """
 
     def __init__(self, model: DigitalModel, measured: str, analyzed: str) -> None:

@@ -13,8 +13,11 @@ from fieldtwin.gateway.core.values import COMMAND
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """Requirements on a prototype that is given the command and runs `horizon_s` seconds ahead: each of `require` must
-    hold at all times from `settle_s` on, and each of `finally_` at the end. Expressions are written as in scenarios."""
+    """The requirements on a prototype that gets the command and runs `horizon_s` seconds ahead.
+
+    Each expression of `require` must hold at all times from `settle_s` on, and each of `finally_` at the end. Expressions are
+    written as in scenarios.
+    """
 
     horizon_s: float
     require: tuple[str, ...] = ()
@@ -24,7 +27,7 @@ class Question:
 
 @dataclass(frozen=True, slots=True)
 class PlannedCommand(COMMAND):
-    """A command for which the planner gives the question to ask first: its own question, or None to ask nothing.
+    """A command for which the planner determines the question: its own question, or None to ask nothing.
 
     For a plain COMMAND the twin's default question applies.
     """
@@ -33,12 +36,15 @@ class PlannedCommand(COMMAND):
 
 
 class WhatIf(Protocol):
-    """Asks a prototype about the consequences of a command. One question at a time; the caller polls for the answer."""
+    """The interface that asks a prototype about the consequences of a command, one question at a time.
+
+    The caller polls for the answer.
+    """
 
     def ask(self, command: COMMAND, question: Question) -> None:
         """Start to ask a question."""
         ...
 
     def answer(self) -> str | None:
-        """Return None if there is no answer yet, an empty text if nothing speaks against the command, else the objection."""
+        """Return None if there is no answer yet, an empty text if there is no objection to the command, else the objection."""
         ...

@@ -73,7 +73,7 @@ class CanopenBusDecoder:
         return f"{frame}: not a CANopen identifier", []
 
     def finish(self) -> list[DecodedExchange]:
-        """Conclude the trace: requests that still wait have no answer."""
+        """Conclude the trace: the remaining open requests get no answer."""
         dropped = [(node, watch.drop()) for node, watch in self._sdo.items()]
         return [self._transferred(node, t, t.t_ns, "no reply") for node, t in dropped if t] + self._lss.finish()
 

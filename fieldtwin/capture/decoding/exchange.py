@@ -84,17 +84,17 @@ class DecodedExchange:
 
     @property
     def access(self) -> str:
-        """read, write, read and write, or "" where neither is done."""
+        """Return "read", "write", "read and write", or "" if the exchange does neither."""
         return " and ".join(a for a in ("read", "write") if any(s.access == a for s in self.spans))
 
     @property
     def address(self) -> int | None:
-        """The first address (CANopen: index) that it touches."""
+        """Return the first address (CANopen: index) that the exchange accesses."""
         return self.spans[0].address if self.spans else None
 
     @property
     def count(self) -> int:
-        """Registers, bits or objects of the first span."""
+        """Return the number of registers, bits or objects of the first span."""
         return self.spans[0].count if self.spans else 0
 
     @property

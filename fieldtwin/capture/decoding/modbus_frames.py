@@ -57,7 +57,7 @@ class Splitter(ABC):
 
     @property
     def pending(self) -> int:
-        """Bytes of a frame that is not complete."""
+        """Return the number of bytes of a frame that is not complete."""
         return len(self._buffer)
 
     def feed(self, data: bytes, t_ns: int, expected: Expected | None = None) -> list[Frame]:

@@ -171,7 +171,7 @@ class _Lines:
             yield line.decode("latin-1").rstrip("\r\n")
 
     def report(self) -> None:
-        """Tell how far the file has been read."""
+        """Report how much of the file has been read."""
         if self._progress is not None:
             self._progress(min(self._raw.tell(), self._total), self._total)
 
@@ -246,7 +246,7 @@ def _start_utc(text: str) -> str:
 
 
 def _plan(header: CnvHeader, path: Path, chosen: Mapping[str, str]) -> _Plan:
-    """Find the columns; raises `FileInvalid` that names the wanted ones and those that are there."""
+    """Find the columns. Raises `FileInvalid` with the names of the required and of the existing columns."""
     there = {name: index for index, name in header.names.items()}
     used, missing = {}, []
     for signal, known in _candidates(chosen).items():

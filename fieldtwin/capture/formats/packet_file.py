@@ -70,7 +70,7 @@ class PacketFile:
 
     @property
     def read_bytes(self) -> int:
-        """The number of bytes read from the file, for a progress bar: packed bytes if it is packed."""
+        """Return the number of bytes read from the file, for a progress bar: packed bytes if it is packed."""
         return self._raw.tell()
 
     def __iter__(self) -> Iterator[Packet]:

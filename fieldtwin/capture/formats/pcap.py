@@ -1,9 +1,9 @@
 """Write captures as pcap files, so that other tools (tshark, Wireshark) can read them.
 
-A tap sees chunks and frames, not packets; the missing layers around them are made up here so that a dissector finds
-what it expects: Ethernet, IP and TCP with right check sums and sequence numbers around Modbus/TCP, nothing at all
-around Modbus RTU (DLT_USER0, to be decoded as ``mbrtu``), a SocketCAN header around CAN frames. No byte of the
-protocols themselves is made, changed or interpreted here: this module must never depend on Modbus or CANopen.
+A tap receives chunks and frames, not packets. This module creates the missing layers around them, so that a dissector finds what
+it expects: Ethernet, IP and TCP with right check sums and sequence numbers around Modbus/TCP, nothing at all around Modbus RTU
+(DLT_USER0, to be decoded as ``mbrtu``), a SocketCAN header around CAN frames. No byte of the protocols themselves is made,
+changed or interpreted here: this module must never depend on Modbus or CANopen.
 
 Sources: the pcap file format and its link types (https://www.tcpdump.org/linktypes.html), RFC 791, RFC 9293.
 """
@@ -107,9 +107,9 @@ def link_type(endpoint: Endpoint) -> int:
 def packets(captured: Iterable[Captured], endpoint: Endpoint) -> Iterator[Packet]:
     """Yield the packets of one endpoint's conversation, in order.
 
-    ``tcp``: one connection to port 502, handshake included; where the capture spans several connections the packets are
-    those of one. ``rtu``, ``rtu+tcp``: a packet for each request, and one for all bytes until the next request.
-    ``can``: a packet for each frame.
+    ``tcp``: one connection to port 502, handshake included. If the capture spans several connections, their packets are written
+    as one connection. ``rtu``, ``rtu+tcp``: a packet for each request, and one for all bytes until the next request. ``can``: a
+    packet for each frame.
     """
     seen = (c for c in captured if c.endpoint == endpoint)
     if endpoint.is_can:

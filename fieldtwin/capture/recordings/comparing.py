@@ -116,7 +116,7 @@ class Comparison:
 
     @property
     def values(self) -> float:
-        """The share of equal exchanges; 0 if none was compared."""
+        """Return the share of equal exchanges; 0 if none was compared."""
         return self.alike / self.compared if self.compared else 0.0
 
     @property

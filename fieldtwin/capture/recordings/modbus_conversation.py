@@ -58,7 +58,7 @@ class ModbusTalk:
 
     @property
     def endpoint(self) -> str:
-        """The server's URL; without a recognised server that of the second side."""
+        """Return the server's URL, or that of the second side if no server was recognised."""
         scheme = {"mbap": "tcp", "rtu": "rtu+tcp"}.get(self.framing, self.framing or "tcp")
         address, port = self.server or self._conversation.sides[1]
         text = str(ipaddress.ip_address(address))

@@ -132,7 +132,7 @@ class Dump:
 
     @property
     def not_asked(self) -> int:
-        """The number of addresses that no request contained, including those between samples."""
+        """Return the number of addresses that no request contained, including those between samples."""
         return sum(line["counts"].get(STATE_KEYS[NOT_ASKED], 0) for line in self.maps.values() if "counts" in line)
 
     @property

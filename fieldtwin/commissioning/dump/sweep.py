@@ -95,7 +95,7 @@ class TableMap:
 
     @property
     def cells(self) -> int:
-        """The number of readable addresses."""
+        """Return the number of readable addresses."""
         return sum(end - start for start, end in self.readable)
 
     def add_unit(self, start: int, end: int, size: int) -> None:

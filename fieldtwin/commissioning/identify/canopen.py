@@ -43,7 +43,7 @@ class CanIdentity:
 
     @property
     def certain(self) -> str | None:
-        """The one profile that is certain, if there is one."""
+        """Return the one profile that is certain, if there is one."""
         return None if self.conflict else certain(self.candidates)
 
 

@@ -63,7 +63,7 @@ class ModbusIdentity:
 
     @property
     def certain(self) -> str | None:
-        """The one profile that is certain, if there is one."""
+        """Return the one profile that is certain, if there is one."""
         return certain(self.candidates)
 
 

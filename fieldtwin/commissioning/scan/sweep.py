@@ -133,12 +133,12 @@ class UnitSweep:
 
     @property
     def left(self) -> int:
-        """The number of remaining questions, including the current one."""
+        """Return the number of remaining questions, including the current one."""
         return len(self._todo) + len(self._again) + (self._now is not None)
 
     @property
     def asking(self) -> int | None:
-        """The unit that is asked now."""
+        """Return the unit that is asked now."""
         return self._now.unit if self._now is not None else None
 
     def poll(self, now_ns: int) -> Send | Wait | None:

@@ -54,17 +54,17 @@ class Heard:
 
     @property
     def share(self) -> float:
-        """The share of good bytes."""
+        """Return the share of good bytes."""
         return self.good_bytes / self.bytes if self.bytes else 0.0
 
     @property
     def live(self) -> list[int]:
-        """The units that answered."""
+        """Return the units that answered."""
         return sorted(u for u, h in self.units.items() if h.live)
 
     @property
     def silent(self) -> list[int]:
-        """The units that were asked and did not answer."""
+        """Return the units that were asked and did not answer."""
         return sorted(u for u, h in self.units.items() if h.requests and not h.live and u)
 
     @property

@@ -29,7 +29,7 @@ class Recorder:
 
     @property
     def dropped(self) -> int:
-        """The number of dropped events."""
+        """Return the number of dropped events."""
         return self.total - len(self._events)
 
     def since(self, t_ns: int) -> tuple[Event, ...]:

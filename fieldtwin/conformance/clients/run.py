@@ -132,7 +132,7 @@ class MasterRun(Generic[C]):
 
     @property
     def exit_code(self) -> int | None:
-        """The program's exit code, if it ended by itself."""
+        """Return the program's exit code, if it ended by itself."""
         return self._ended.status if self._ended is not None else None
 
     # -- the run --------------------------------------------------------------------------------------------------

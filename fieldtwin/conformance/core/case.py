@@ -116,17 +116,17 @@ class About:
 
     @property
     def row(self) -> str:
-        """The ID of the entry in the test-case list."""
+        """Return the ID of the entry in the test-case list."""
         return self.id.rstrip("abcdefgh")
 
     @property
     def role(self) -> str:
-        """The tested role."""
+        """Return the tested role."""
         return "master"
 
     @property
     def required_by(self) -> str:
-        """The clauses that require the behaviour, such as ``TG 4.4.1.3, AP 6.3``; empty if none does."""
+        """Return the clauses that require the behaviour, such as ``TG 4.4.1.3, AP 6.3``; empty if none does."""
         if self.basis is not Basis.STANDARD:
             return ""
         clauses = self.clause.split(";")[0]

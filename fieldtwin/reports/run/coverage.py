@@ -113,7 +113,7 @@ class Place:
 
     @property
     def missing(self) -> list[str]:
-        """``read``, ``written``: the accesses that are possible and never happened."""
+        """Return the accesses (``read``, ``written``) that are possible and never happened."""
         missing = ["read"] if self.readable and not self.read else []
         return missing + (["written"] if self.writable and not self.written else [])
 
@@ -157,7 +157,7 @@ _Key = tuple[str, str, str, int, int, int]
 
 
 def _things(config: DeviceConfig) -> Iterator[tuple[str, RegisterRange | tuple[int, int], bool, bool]]:
-    """Yield what a device has by name: tags, and mailboxes by their head.
+    """Yield the tags of a device, and its mailboxes by their head.
 
     Each as name, place, whether readable, whether writable.
     """

@@ -21,7 +21,9 @@ Cell = tuple[str, str]
 
 @dataclass(frozen=True)
 class Codes:
-    """Codes by which devices refuse: `seen` with devices, `missing` ones by name, and how many the standard has."""
+    """The codes by which devices refuse: the `seen` codes with their devices, the `missing` codes by name, and their total
+    number.
+    """
 
     title: str
     seen: list[str]
@@ -30,13 +32,13 @@ class Codes:
 
     @property
     def opened(self) -> bool:
-        """Whether the missing ones are few enough to show."""
+        """Return whether the missing codes are few enough to be shown at once."""
         return len(self.missing) <= len(ModbusExceptionReply.NAMES)
 
 
 @dataclass(frozen=True)
 class Grid:
-    """A table of what happened how often: `done` of the `possible` cells happened."""
+    """A table of counts. Of the `possible` cells, `done` have a count above 0."""
 
     name: str
     done: int

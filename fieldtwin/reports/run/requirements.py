@@ -18,7 +18,7 @@ Cells = Mapping[tuple[str, str], Counter[Verdict]]
 
 
 def requirement_verdicts(report: Report) -> dict[str, Verdict | None]:
-    """Return every requirement's verdict: the worst of the scenarios that name it, None if none does."""
+    """Return every requirement's verdict: the worst verdict of the scenarios that name it, None if no scenario names it."""
     found: dict[str, Verdict | None] = dict.fromkeys(report.requirements)
     for scenario in report.scenarios:
         for id in scenario.requirements:

@@ -84,7 +84,7 @@ class Window:
 
     @property
     def lines(self) -> list[FrameLine]:
-        """The frames that were kept, in order."""
+        """Return the frames that were kept, in order."""
         return [*self.before, *self.after]
 
     @property

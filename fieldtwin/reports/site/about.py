@@ -16,8 +16,8 @@ def headed(
 ) -> dict[str, Any]:
     """Return ``{"kind": "fieldtwin compare", "version": 1, "about": {...}}`` to put before a command's results.
 
-    `endpoint` is empty if there was no live device; `device` then names the file that stands for it. `against` is the
-    reference. `when` is ISO 8601, now by default.
+    `endpoint` is empty if there was no live device; `device` then names the file that replaces it. `against` is the reference of
+    the comparison. `when` is ISO 8601, now by default.
     """
     return {
         "kind": f"fieldtwin {kind}",

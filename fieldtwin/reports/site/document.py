@@ -63,7 +63,7 @@ class Piece:
 
     @property
     def good(self) -> bool:
-        """Whether the action ended as it should."""
+        """Return whether the action ended as expected."""
         return self.verdict in ("passed", "whole", "sampled", "met")
 
 

@@ -86,7 +86,7 @@ class RequestContext:
 
     @property
     def neighbour(self) -> int:
-        """The ID of another unit."""
+        """Return the ID of another unit."""
         return self.unit % 247 + 1
 
     def refuse(self, code: int, function: int | None = None) -> bytes:

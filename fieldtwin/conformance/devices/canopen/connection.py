@@ -47,12 +47,12 @@ class Reply:
 
     @property
     def abort(self) -> int:
-        """The abort code, or 0 for a reply that is not an abort."""
+        """Return the abort code, or 0 for a reply that is not an abort."""
         return int.from_bytes(self.data[4:8], "little") if self.data[:1] == b"\x80" else 0
 
     @property
     def specifier(self) -> int:
-        """The server command specifier, -1 for silence."""
+        """Return the server command specifier, -1 for silence."""
         return self.data[0] >> 5 if self.data else -1
 
     def __str__(self) -> str:

@@ -29,7 +29,7 @@ class Answer:
 
     @property
     def refusal(self) -> int:
-        """The exception code, 0 for a normal reply (AP 7)."""
+        """Return the exception code, 0 for a normal reply (AP 7)."""
         return self.pdu[1] if self.pdu[0] & 0x80 and len(self.pdu) == 2 else 0
 
     def __str__(self) -> str:

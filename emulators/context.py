@@ -131,7 +131,7 @@ class VirtualContext:
     def copy(self) -> VirtualContext:
         """Return a context with the same recordings. Afterwards nothing can be added to either of them.
 
-        Nothing may have been taken from this one. The recordings are shared in memory; a copy needs memory for each
+        Call it before anything was taken from this context. The recordings are shared in memory; a copy needs memory for each
         command that is used.
         """
         if self.taken:
@@ -204,7 +204,7 @@ class VirtualContext:
             self._series[data].when_used_up = policy
 
     def peek(self, command: COMMAND) -> Recorded | None:
-        """Return the last recording returned for a command, or else the next one; None if there is none."""
+        """Return the recording that was returned last for a command, else the next recording; None if there is no recording."""
         series = self._find(command)
         if series is None:
             return None
@@ -219,7 +219,7 @@ class VirtualContext:
         return self.take_recorded(command).response
 
     def take_recorded(self, command: COMMAND) -> Recorded:
-        """Do the same as `take`, and return time and latency too."""
+        """Take a recording as `take` does, and return it with its time and latency."""
         series = self._find(command)
         if series is None:
             raise self._unknown(command)

@@ -61,13 +61,13 @@ class UnitEmulator(Emulator):
 
 
 class SensorEmulator(UnitEmulator):
-    """SPEC row SensorEmulator: on RS232, like the sensor that it emulates."""
+    """SPEC row SensorEmulator: an emulator on RS232, like the sensor that it emulates."""
 
     wire_types = frozenset({PROTOCOL.RS232})
 
 
 class TransmitterEmulator(UnitEmulator):
-    """The emulator of a transmitter: on TCP."""
+    """The emulator of a transmitter, on TCP."""
 
     wire_types = frozenset({PROTOCOL.TCP})
 
@@ -113,7 +113,7 @@ class EmulatedUnit(ModbusUnit):
 
 @dataclass(frozen=True)
 class EmulatedCommunication(Communication):
-    """SPEC row EmulatedCommunication: the same agreement, with an emulator in place of the device.
+    """SPEC row EmulatedCommunication: the agreement of Communication, with an emulator in place of the device.
 
     The connection between the two is an EmulatedConnection (`fieldtwin.emulators.link`), which belongs to neither and
     is not used here.

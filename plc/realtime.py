@@ -233,7 +233,7 @@ def run_task(task: Driven, loop: asyncio.AbstractEventLoop, stop_requested: Call
 
 
 def _run_loop(loop: asyncio.AbstractEventLoop, for_ns: int) -> None:
-    """Run callbacks for `for_ns`; with 0, only those that are ready now."""
+    """Run callbacks for `for_ns`, or only those that are ready now if it is 0."""
     timer = loop.call_later(for_ns / NS_PER_S, loop.stop) if for_ns else loop.call_soon(loop.stop)
     try:
         loop.run_forever()

@@ -1,5 +1,6 @@
-"""Retained variables in a file: written after each scan, intact after a kill at any time, refused for a different
-program.
+"""The file of retained variables. It is written after each scan, and stays valid if the process is killed at any time.
+
+A file of different programs or variables is not used.
 
     magic, capacity            16 bytes
     hash of the layout         32 bytes: programs, their retained variables and kinds
@@ -152,7 +153,7 @@ class RetainFile:
             raise FileInvalid("retained variables that cannot be read", path=str(self.path)) from e
 
     def save(self, values: Any) -> bool:
-        """Save `values`; return False if they equal the last saved ones. Raises `RetainFull` if they are too large."""
+        """Save `values`. Return False if they equal those saved last. Raises `RetainFull` if they are too large."""
         try:
             data = msgspec.msgpack.encode(values)
         except (TypeError, OverflowError, msgspec.MsgspecError) as e:

@@ -55,7 +55,7 @@ class HeartbeatProducer(Service):
         self.due_ns = now_ns if self._period_ns() else NEVER
 
     def reset(self, now_ns: int) -> None:
-        """Schedule the heartbeat; the boot-up message counts as the first one."""
+        """Schedule the heartbeat. The boot-up message counts as the first heartbeat."""
         period_ns = self._period_ns()
         self.due_ns = now_ns + period_ns if period_ns else NEVER
 

@@ -369,7 +369,7 @@ class CanopenNode:
         self._reset(now_ns, communication_only=False)
 
     def _reset(self, now_ns: int, *, communication_only: bool) -> None:
-        """Reset the node. A node ID that LSS assigned takes effect here; without one the node stays silent."""
+        """Reset the node. A node ID that LSS assigned takes effect here. A node without a node ID stays silent."""
         self._core.state = NmtState.INITIALISING
         self._core.note(now_ns, "nmt", 0, 0, bytes([NmtState.INITIALISING]))
         if self._lss is not None:

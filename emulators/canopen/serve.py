@@ -150,7 +150,7 @@ class _Shell:
             self._set_timer()
 
     async def _follow_up(self) -> None:
-        """Send left-over frames and withdraw late ones, which an earlier event may have left."""
+        """Send frames that an earlier event left unsent, and withdraw late frames."""
         await self._send_left()
         overdue = self._overdue or self._node.take_overdue()
         self._overdue = ()

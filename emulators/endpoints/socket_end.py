@@ -99,7 +99,7 @@ class SocketEnd(ByteConnection, asyncio.BufferedProtocol):
             await asyncio.shield(self._closed)
 
     def evict(self, *, reset: bool = False) -> None:
-        """Close immediately, dropping buffered bytes; with `reset` by RST, as a crashed device does."""
+        """Close immediately and drop buffered bytes. With `reset`, close by RST, as a crashed device does."""
         if self._transport is not None:
             if reset:
                 sock = self._transport.get_extra_info("socket")

@@ -105,7 +105,7 @@ class ExchangeReplay:
     def copy(self) -> ExchangeReplay:
         """Return a device with the same recording, in its initial state, which shares the learned data.
 
-        This one must not have answered any request.
+        Call it before this device has answered a request.
         """
         other = copy.copy(self)
         other.context = self.context.copy()

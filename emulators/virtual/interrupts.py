@@ -1,4 +1,4 @@
-"""Delivers signals between two callbacks of a virtual loop, and not during one.
+"""Deliver signals between two callbacks of a virtual loop, and never during a callback.
 
 A signal handler raises its exception in the line that happens to run. If that line was to wake a task, the task is never woken
 and can no longer be ended in order. SIGINT and SIGTERM therefore wait until the callback is over, but at most `PATIENCE_S` of

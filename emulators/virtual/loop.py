@@ -44,7 +44,9 @@ class Escape(Bug):
 
 
 class Deadlock(Bug):
-    """The error that no callback is ready and no timer is set, or that callbacks call each other without end at one instant."""
+    """The loop can never continue: no callback is ready and no timer is set, or callbacks schedule each other endlessly at one
+    instant.
+    """
 
 
 class _Call(asyncio.Handle):

@@ -162,7 +162,7 @@ class SerialConnection(ByteConnection):
 
 
 def _ignored_settings(fd: int, endpoint: Endpoint) -> tuple[str, ...]:
-    """Compare the driver's settings with the requested ones. A pty clears parity silently and keeps the rest."""
+    """Return the settings that the driver ignored. A pty clears parity silently and keeps all other settings."""
     asked = endpoint.serial
     try:
         cflag = cast(int, termios.tcgetattr(fd)[2])

@@ -134,7 +134,7 @@ class PlcSeen(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ConfigStatus(msgspec.Struct, frozen=True, kw_only=True):
-    """The files that the gateway has applied: name and hash of the system, number of reloads, changes of the last one."""
+    """The files that the gateway has applied: name and hash of the system, number of reloads, and changes of the last reload."""
 
     system: str
     hash: str

@@ -168,7 +168,7 @@ class TagTable:
         return replace(value, quality=_BAD, reason=Reason.STALE)
 
     def held(self, name: str) -> TagValue:
-        """Return the value as it was stored last, however old."""
+        """Return the value that was stored last, without a check of its age."""
         held = self._held.get(name)
         return NEVER if held is None else held.value
 

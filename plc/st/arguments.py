@@ -37,8 +37,9 @@ class Formals:
         return [*self.names, *(f"{self.repeats}{self.first + n}" for n in range(repeated))]
 
     def place(self, argument: t.Argument) -> int:
-        """Return the number, from 1, of the parameter that a named argument of an extensible function gives; 0 for any
-        other."""
+        """Return the number, from 1, of the parameter that a named argument of an extensible function gives; 0 for any other
+        name.
+        """
         digits = argument.name[len(self.repeats) :]
         known = self.repeats and argument.name.upper().startswith(self.repeats) and re.fullmatch("[0-9]{1,4}", digits)
         return len(self.names) + int(digits) - self.first + 1 if known else 0

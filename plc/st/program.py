@@ -148,7 +148,7 @@ class _Input:
 
 
 def program_class(unit: CompiledUnit, name: str = "") -> type[StProgram]:
-    """Return the class of program `name` of a unit; without a name, of its only program. Raises `FileInvalid`."""
+    """Return the class of program `name` of a unit, or of its only program if `name` is empty. Raises `FileInvalid`."""
     names = [p.name for p in unit.programs]
     found = next((p for p in unit.programs if p.name.lower() == name.lower()), None) if name else None
     if not name and len(unit.programs) == 1:

@@ -70,7 +70,10 @@ class Resource:
 
     @classmethod
     def of(cls, unit: CompiledUnit, together: Together | None) -> Resource:
-        """Return the resource of `unit` in `together`, created there if necessary; without `together`, a new one."""
+        """Return the resource of `unit` in `together`, after creating it there if necessary.
+
+        If `together` is None, return a new one.
+        """
         if together is None:
             return cls(unit)
         key = (unit.path, unit.python)

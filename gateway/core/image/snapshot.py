@@ -63,7 +63,7 @@ class Snapshot(msgspec.Struct, frozen=True, gc=False):
         return TagValue(self.values[i], _QUALITIES[self.qualities[i]], _REASONS[self.reasons[i]], self.time_ns(i))
 
     def time_ns(self, index: int) -> int:
-        """Return the source's time of the tag at `index` (monotonic)."""
+        """Return the time that the source gave for the tag at `index` (monotonic, ns)."""
         return int.from_bytes(self.stamps[8 * index : 8 * index + 8], "little", signed=True)
 
     def all(self) -> dict[str, TagValue]:

@@ -82,7 +82,7 @@ class Bus(Protocol):
         ...
 
     def device_statuses(self, now_ns: int) -> dict[str, DeviceStatus]:
-        """Return the same of its devices, by name."""
+        """Return the statuses of the bus's devices, by name."""
         ...
 
     async def run(self) -> None:

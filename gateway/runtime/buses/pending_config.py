@@ -17,7 +17,7 @@ AnyDriver = RegisterDriver | CanopenDriver
 class PendingConfig:
     """The new configuration of a bus and its devices, by name. Buses, devices and addresses are the same as before.
 
-    `taken` is called with each driver as soon as it has its new configuration; `done` is set when all have.
+    `taken` is called with each driver as soon as it has its new configuration; `done` is set when all drivers have theirs.
     """
 
     bus: BusConfig

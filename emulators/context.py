@@ -101,8 +101,8 @@ def _own(series: _Series) -> list[Recorded]:
 class VirtualContext:
     """The recordings by command. `taken` counts the recordings that were returned, `dropped` those for which there was no room.
 
-    With `commands`, that list is fixed and `take` accepts exactly its items, with or without recordings. Without it,
-    the list is derived from the added recordings (ruling 12). A full context drops its oldest entry.
+    If `commands` is given, `take` accepts exactly these commands, even those without recordings. Otherwise the list of commands
+    is derived from the added recordings (ruling 12). A full context drops its oldest entry.
 
     `copy` returns a context in the initial state of this one; each device of one recording has its own copy.
     """

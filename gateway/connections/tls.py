@@ -35,8 +35,8 @@ class TlsConnection(TcpConnection):
     async def open(cls, endpoint: Endpoint, timeout_s: float = OPEN_TIMEOUT_S, max_pending: int = 1024) -> Self:
         """Connect and perform the handshake.
 
-        Raises `Unreachable` as `TcpConnection.open` does, and if a file cannot be read, a certificate is refused, or
-        the peer does not use TLS; `UsageError` for a ``key`` without ``cert``.
+        Raises `Unreachable` in the cases of `TcpConnection.open`, and also if a file cannot be read, a certificate is refused, or
+        the peer does not use TLS. Raises `UsageError` for a ``key`` without ``cert``.
         """
         connection = cls(endpoint, max_pending)
         make_context = partial(_context, endpoint)

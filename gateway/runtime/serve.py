@@ -96,7 +96,7 @@ class ServeConfig:
 
 
 class Writer(Protocol):
-    """The interface that carries out writes: the output writer."""
+    """The interface to the output writer, which carries out the clients' writes."""
 
     def request(self, tag: str, value: float, by: str, done: Callable[[FieldtwinError | None], None]) -> None:
         """Write a tag once; `done` is called with the result."""

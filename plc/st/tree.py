@@ -40,7 +40,7 @@ class StringType:
 
 @dataclass(frozen=True, slots=True)
 class MessagesType:
-    """``MESSAGES[bytes, depth]``: the longest message and how many may be under way."""
+    """The type ``MESSAGES[bytes, depth]``: the size of the longest message in bytes, and the number of messages that may wait."""
 
     pos: Pos
     max_bytes: Expr | None

@@ -106,8 +106,8 @@ class ControlLogic:
     def send_cmd(self, now_ns: int) -> None:
         """Drain the transmitter's queue (sendCmd): each command is consumed, sets the period, and is emitted.
 
-        A command is always relayed; only logging requires period > 0, with the period after SetPeriod (SPEC ruling 1).
-        An invalid command changes nothing and is not relayed: it is counted, and logged under the same condition.
+        Every valid command is relayed. It is logged if the period that it sets is above 0 (SPEC ruling 1). An invalid command
+        changes nothing and is not relayed: it is counted, and logged if the present period is above 0.
         """
         for command in self.transmitter.drain():
             try:

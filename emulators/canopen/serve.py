@@ -25,7 +25,7 @@ class TakesBack(Protocol):
     """A connection that can withdraw frames that still wait for the bus. A kernel interface cannot."""
 
     def withdraw(self, can_ids: Collection[int], /) -> list[CanFrame]:
-        """Return the frames that were withdrawn, in order."""
+        """Withdraw waiting frames and return them in order."""
         ...
 
 

@@ -70,7 +70,7 @@ def exception_pdu(error: ModbusExceptionReply) -> bytes:
 def examine(pdu: bytes) -> ServerRequest:
     """Read a request PDU. Raises `ModbusExceptionReply` with the code that the server has to answer: 01, 02 or 03.
 
-    A function code of 0, or from 80h on, is refused with 01 (case MB-035: the standard leaves the choice open).
+    A function code of 0, or from 80h on, is always refused with 01, one of the reactions that case MB-035 permits.
     """
     if not pdu or not 1 <= pdu[0] <= 0x7F:
         raise refusal(pdu[0] if pdu else 0, ILLEGAL_FUNCTION)

@@ -88,8 +88,8 @@ MOST_LOCALS = 64
 class ModbusBus:
     """A Modbus bus that runs until cancelled. `on_offline` is called with the driver of a device that was lost.
 
-    `offset`, 0 to less than 1, moves the polls of this bus within the slots that their periods allow, so that the buses
-    of one gateway do not all poll at the same time.
+    `offset`, 0 to less than 1, shifts the phases of this bus's polls, so that the buses of one gateway do not all poll at the
+    same time.
     """
 
     def __init__(

@@ -14,7 +14,7 @@ from asyncio import events
 from collections import deque
 from collections.abc import Awaitable, Callable, Coroutine, Generator
 from contextlib import suppress
-from contextvars import Context, copy_context
+from contextvars import Context
 from heapq import heapify, heappop, heappush
 from pathlib import Path
 from types import FrameType
@@ -49,45 +49,6 @@ class Deadlock(Bug):
     """
 
 
-class _Call(asyncio.Handle):
-    """A handle of `call_soon` that is created in fewer steps, because a virtual loop creates very many. It has no debug mode."""
-
-    __slots__ = ()
-    _callback: Callable[..., object]
-    _args: tuple[Any, ...]
-    _context: Context
-    _cancelled: bool
-    _loop: VirtualLoop
-    _repr = _source_traceback = None  # used in debug mode
-
-
-class _Timer(asyncio.TimerHandle):
-    """A `_Call` with a time."""
-
-    __slots__ = ()
-    _when: float
-    _callback: Callable[..., object]
-    _args: tuple[Any, ...]
-    _context: Context
-    _cancelled: bool
-    _loop: VirtualLoop
-    _repr = _source_traceback = None  # used in debug mode
-
-    def cancel(self) -> None:
-        """Cancel the timer, which stays in the loop's heap until its time comes or the heap is compacted."""
-        self._cancelled = True
-        self._callback = _nothing  # release the callback's objects
-        self._args = ()
-
-
-_new = object.__new__
-"""The constructors of asyncio's handles check its debug mode; `call_soon` and `call_at_ns` do the rest."""
-
-
-def _nothing() -> None:
-    """Do nothing: the callback of a cancelled timer."""
-
-
 def _way_out(name: str) -> Callable[..., NoReturn]:
     def refuse(self: VirtualLoop, *args: Any, **kwargs: Any) -> NoReturn:
         raise escape(f"loop.{name}")
@@ -103,8 +64,8 @@ class VirtualLoop(asyncio.AbstractEventLoop):
         self.now_ns = start_ns
         self.callbacks = 0
         """Number of callbacks that have run."""
-        self._ready: deque[_Call | _Timer] = deque()
-        self._timers: list[tuple[int, int, _Timer | asyncio.Future[None]]] = []
+        self._ready: deque[asyncio.Handle] = deque()
+        self._timers: list[tuple[int, int, asyncio.TimerHandle | asyncio.Future[None]]] = []
         self._sequence = 0
         self._compact_at = _COMPACT_AFTER
         self._tasks = 0
@@ -121,12 +82,7 @@ class VirtualLoop(asyncio.AbstractEventLoop):
     def call_soon(
         self, callback: Callable[[*Ts], object], *args: *Ts, context: Context | None = None
     ) -> asyncio.Handle:
-        handle = _new(_Call)
-        handle._callback = callback
-        handle._args = args
-        handle._context = copy_context() if context is None else context
-        handle._cancelled = False
-        handle._loop = self
+        handle = asyncio.Handle(callback, args, self, context)
         self._ready.append(handle)
         return handle
 
@@ -144,28 +100,17 @@ class VirtualLoop(asyncio.AbstractEventLoop):
         self, when_ns: int, callback: Callable[[*Ts], object], *args: *Ts, context: Context | None = None
     ) -> asyncio.TimerHandle:
         """Schedule a callback as `call_at` does, with a time in ns. A time in the past is due now, after the ready callbacks."""
-        timer = _new(_Timer)
-        timer._callback = callback
-        timer._args = args
-        timer._context = copy_context() if context is None else context
-        timer._cancelled = False
-        timer._loop = self
-        timer._when = when_ns / NS_PER_S
-        self._sequence = sequence = self._sequence + 1
-        now_ns = self.now_ns
-        heappush(self._timers, (when_ns if when_ns > now_ns else now_ns, sequence, timer))
-        if sequence >= self._compact_at:
-            self._compact()
+        timer = asyncio.TimerHandle(when_ns / NS_PER_S, callback, args, self, context)
+        self._set_timer(when_ns, timer)
         return timer
 
     def sleeper(self, when_ns: int) -> asyncio.Future[None]:
-        """Return a future that is done at `when_ns`, for a clock's sleep. This takes fewer steps than `call_at_ns`."""
+        """Return a future that is done at `when_ns`, for a clock's sleep.
+
+        With `call_at_ns` instead of a future among the timers, a virtual run takes 2 to 6 % longer.
+        """
         future: asyncio.Future[None] = asyncio.Future(loop=self)
-        self._sequence = sequence = self._sequence + 1
-        now_ns = self.now_ns
-        heappush(self._timers, (when_ns if when_ns > now_ns else now_ns, sequence, future))
-        if sequence >= self._compact_at:
-            self._compact()
+        self._set_timer(when_ns, future)
         return future
 
     def alarm(self, delay_s: float) -> asyncio.Future[None]:
@@ -174,6 +119,15 @@ class VirtualLoop(asyncio.AbstractEventLoop):
         The caller may set the future earlier.
         """
         return self.sleeper(self.now_ns + round(delay_s * NS_PER_S))
+
+    def _set_timer(self, when_ns: int, due: asyncio.TimerHandle | asyncio.Future[None]) -> None:
+        self._sequence += 1
+        heappush(self._timers, (max(when_ns, self.now_ns), self._sequence, due))
+        if self._sequence >= self._compact_at:
+            self._compact()
+
+    def _timer_handle_cancelled(self, handle: asyncio.TimerHandle) -> None:
+        """Do nothing: a cancelled timer stays in the heap until its time comes or the heap is compacted."""
 
     def _compact(self) -> None:
         """Remove the timers that are no longer needed.
@@ -204,7 +158,7 @@ class VirtualLoop(asyncio.AbstractEventLoop):
         return None
 
     get_debug: Any = bool
-    """Returns False without a Python call, because each new future calls it."""
+    """Returns False without a Python call, because each new future and handle calls it."""
 
     def set_debug(self, enabled: bool) -> None:
         """Do nothing: asyncio's debug mode measures with the wall clock."""
@@ -250,12 +204,7 @@ class VirtualLoop(asyncio.AbstractEventLoop):
             handle = pop()
             if handle._cancelled:
                 continue
-            try:
-                handle._context.run(handle._callback, *handle._args)
-            except (SystemExit, KeyboardInterrupt):
-                raise
-            except BaseException as e:  # as in asyncio, because no caller can catch it
-                self.call_exception_handler({"message": f"in {handle}", "exception": e, "handle": handle})
+            handle._run()
             run += 1
             if run == STUCK_AFTER:
                 raise Deadlock("virtual time stands still: callbacks schedule each other without end", got=str(handle))
@@ -268,14 +217,14 @@ class VirtualLoop(asyncio.AbstractEventLoop):
         now_ns = None
         while timers and (now_ns is None or timers[0][0] == now_ns):
             when_ns, _, due = heappop(timers)
-            if type(due) is _Timer:
-                if due._cancelled:
+            if isinstance(due, asyncio.TimerHandle):
+                if due.cancelled():
                     continue
                 ready.append(due)
-            elif due.done():  # type: ignore[union-attr]  # a future
+            elif due.done():
                 continue
             else:
-                due.set_result(None)  # type: ignore[union-attr]
+                due.set_result(None)
             self.now_ns = now_ns = when_ns
         if now_ns is None:
             raise Deadlock("a deadlock: nothing is ready and no timer is set", got=self._who_waits())
@@ -393,9 +342,9 @@ class VirtualLoop(asyncio.AbstractEventLoop):
     remove_signal_handler: Any = _way_out("remove_signal_handler")
 
 
-def _is_over(due: _Timer | asyncio.Future[None]) -> bool:
+def _is_over(due: asyncio.TimerHandle | asyncio.Future[None]) -> bool:
     """Return whether the timer is no longer needed."""
-    return due._cancelled if isinstance(due, _Timer) else due.done()
+    return due.cancelled() if isinstance(due, asyncio.TimerHandle) else due.done()
 
 
 def culprit() -> str:

@@ -280,25 +280,16 @@ class AttachedConnection(TellsOverrun):
         return not self._held_back and self._runner.submit(self._node, frame, counted=False)
 
     async def send(self, frame: CanFrame) -> None:
-        if self._lost is not None:
-            raise self._loss()
-        full = False
-        if not self._held_back:  # usually no sender waits
-            if self._runner.submit(self._node, frame):
-                return
-            full = True
         self._held_back += 1
         try:
             async with self._turn:
                 while True:
-                    if full:
-                        self._room.clear()
-                        await self._room.wait()
                     if self._lost is not None:
                         raise self._loss()
                     if self._runner.submit(self._node, frame):
                         return
-                    full = True
+                    self._room.clear()
+                    await self._room.wait()
         finally:
             self._held_back -= 1
 

@@ -67,16 +67,14 @@ class RegisterFunctions:
 
     def read(self, pdu: bytes, now_ns: int) -> bytes:
         function, limits = pdu[0], self.limits
-        if len(pdu) != 5:
-            require_length(pdu, 5)
+        require_length(pdu, 5)
         address, count = _ADDRESS_AND_COUNT(pdu, 1)
         if function <= 0x02:
             _require_count(count, limits.read_bits)
             _require_range(address, count)
             data = _pack_bits(self.bank.read(TABLES[function], address, count, now_ns))
             return bytes((function, len(data))) + data
-        if limits.even_only or not 1 <= count <= limits.read_registers or address + count > ADDRESSES:
-            self._require_registers(address, count, limits.read_registers)
+        self._require_registers(address, count, limits.read_registers)
         reply: bytes = _READ_REPLIES[count](
             function, 2 * count, *self.bank.read(TABLES[function], address, count, now_ns)
         )

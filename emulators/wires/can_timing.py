@@ -85,8 +85,8 @@ def bits_on_wire(frame: CanFrame) -> int:
 @lru_cache(maxsize=4096)
 def _stuffed_length(can_id: int, data: bytes, extended: bool, remote: bool, dlc: int) -> int:
     # Cached by content: process data repeats, and the length of a frame is needed when it wins and when it ends. It
-    # uses tables by byte, because frames that do not repeat occur too: several times as fast as building the string of
-    # bits.
+    # uses tables by byte, because frames that do not repeat occur too: with strings of bits, `plain_bits` and `stuff`, a
+    # frame takes 1.7 times as long.
     crc_of, stuffing = _tables()
     rtr = int(remote)
     if extended:

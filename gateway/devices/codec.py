@@ -43,8 +43,6 @@ def decode(tag: Tag, data: bytes, t_ns: int) -> TagValue:
     `order` says so. NaN, an invalid digit and a sentinel are bad values, never good ones; a value outside the profile's range is
     uncertain.
     """
-    if tag.type in _UNPACK:  # the most frequent case: a number
-        return _decode_number(tag, data if tag.order == "ABCD" else reorder(data, tag.order), data, t_ns)
     if tag.type == "string":
         swapped = tag.order in ("BADC", "DCBA")  # characters are swapped within a register; registers are never swapped
         text = (

@@ -139,9 +139,8 @@ class TagTable:
         elif value.t_ns != before.t_ns or value.raw != before.raw or before.quality is not _GOOD:
             self.published += 1
             self._journal.append((name, value))
-            if self._subscribers:  # costs less than a loop over an empty tuple
-                for on_put in self._subscribers:
-                    on_put(name, value)
+            for on_put in self._subscribers:
+                on_put(name, value)
 
     def put_bad(self, names: list[str], reason: Reason) -> None:
         """Mark the tags as bad from now on; their last value and its time stay readable."""

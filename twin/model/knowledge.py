@@ -12,7 +12,6 @@ from collections import deque
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
-from operator import itemgetter
 
 from fieldtwin.gateway.core.clock import NS_PER_MS, Clock
 from fieldtwin.gateway.core.errors import Unreachable
@@ -26,7 +25,6 @@ RETRY_MS = 1000
 RESERVE_BYTES = 64 << 20
 LOSS_NAME = "knowledge"
 _SAYS_WHAT_IS = {int(Kind.VALUE), int(Kind.STATE)}
-_NAME_OF = itemgetter(3)
 
 MakeRoom = Callable[[], Awaitable[int]]
 """Forgets events in the store and returns how many. 0 means that no event may be forgotten."""
@@ -170,9 +168,6 @@ class Known:
     def learn(self, events: list[Event]) -> None:
         """Add a block of events, in order."""
         self.events += len(events)
-        if {event[2] for event in events} <= _SAYS_WHAT_IS:  # fast path, taken by most blocks
-            self.latest.update(zip(map(_NAME_OF, events), events, strict=True))
-            return
         for event in events:
             if event.kind in _SAYS_WHAT_IS:
                 self.latest[event.name] = event

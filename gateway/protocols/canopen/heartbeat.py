@@ -17,9 +17,6 @@ TWIN_BOOT_NS = 100 * NS_PER_MS
 """One node does not boot twice within this time; two nodes with the same ID do (CO-042)."""
 
 
-_INITIALISING = NmtState.INITIALISING
-
-
 @dataclass(slots=True)
 class _Node:
     consumer_ns: int = 0
@@ -77,10 +74,6 @@ class HeartbeatConsumer:
             self.ignored += 1
             return ()
         known = self._node(node)
-        same = state is known.state and known.monitored and not known.lost and state is not _INITIALISING
-        if same and (not known.consumer_ns or t_ns <= known.heard_ns + known.consumer_ns):  # the usual case
-            known.heard_ns = max(known.heard_ns, t_ns)
-            return ()
         events = list(self._overdue(node, known, t_ns))  # `check` may not have been called in between
         if state is NmtState.INITIALISING:
             events += self._booted(node, known, data, t_ns)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Coroutine, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any, NamedTuple, Self, TypeVar
 
 from fieldtwin.gateway.core.clock import NS_PER_S, Clock
@@ -47,9 +46,6 @@ from fieldtwin.gateway.protocols.modbus.requests import (
 from fieldtwin.gateway.protocols.modbus.transaction import Transaction
 
 R = TypeVar("R", bound=Reply)
-
-_read_registers = lru_cache(maxsize=1024)(ReadRegisters)
-"""Polls repeat the same requests, so these are cached. A request is an immutable value, checked when it is made."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -262,7 +258,7 @@ class ModbusClient:
         self, unit: int, table: RegisterTable, address: int, count: int, timeout_s: float | None = None
     ) -> Coroutine[Any, Any, RegistersReply]:
         """Read 1 to 125 holding (03h) or input (04h) registers. Errors as `execute`."""
-        return self.execute(unit, _read_registers(table, address, count), timeout_s)
+        return self.execute(unit, ReadRegisters(table, address, count), timeout_s)
 
     def read_bits(
         self, unit: int, table: BitTable, address: int, count: int, timeout_s: float | None = None

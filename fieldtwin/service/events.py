@@ -8,13 +8,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import Any
 
 from fieldtwin.gateway.runtime.gateway_status import BusStatus, DeviceStatus, GatewayStatus
 from fieldtwin.plc.status import PlcStatus
 from fieldtwin.service.metrics import Snapshot
-
-Status = Mapping[str, Any]
+from fieldtwin.twin.thread.status import PlantThreadStatus
 
 
 class Priority(IntEnum):
@@ -117,12 +115,16 @@ def _reloaded(before: GatewayStatus | None, now: GatewayStatus | None) -> list[E
     return [Event(Priority.NOTICE, "reloaded", text, {"hash": now.config.hash})]
 
 
-def _thread(before: Status | None, now: Status | None) -> list[Event]:
+def _thread(before: PlantThreadStatus | None, now: PlantThreadStatus | None) -> list[Event]:
     """Yield the events of the digital thread: trouble of its carrier and of its log's store, and the end of the trouble."""
+    if now is None:
+        return []
     found = []
-    for key, what in (("trouble", "thread"), ("store_trouble", "store of the thread")):
-        text, was = (now or {}).get(key, ""), (before or {}).get(key, "")
-        if now is not None and text != was:
+    for key, what, text, was in (
+        ("trouble", "thread", now.trouble, before.trouble if before else ""),
+        ("store_trouble", "store of the thread", now.store_trouble, before.store_trouble if before else ""),
+    ):
+        if text != was:
             priority = Priority.WARNING if text else Priority.NOTICE
             found.append(Event(priority, f"thread_{key}", f"{what}: {text or 'recovered'}", {"error": text}))
     return found

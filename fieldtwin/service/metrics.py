@@ -22,6 +22,7 @@ from fieldtwin.gateway.protocols.modbus.client import ClientCounters
 from fieldtwin.gateway.runtime.gateway_status import GatewayStatus
 from fieldtwin.plc.status import PlcStatus, ScanStatus, Spread
 from fieldtwin.service.exposition import Family
+from fieldtwin.twin.thread.status import PlantThreadStatus
 
 MOST_DEVICES = 1000
 """Devices that have series; the others are only counted."""
@@ -31,8 +32,6 @@ MOST_NAMED = 256
 
 ALWAYS = {"modbus": ("missed_polls", *asdict(ClientCounters())), "canopen": tuple(asdict(CanopenCounters()))}
 """Counters that a bus exports before they first count, because a rate needs the 0."""
-
-Status = Mapping[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +48,7 @@ class Snapshot:
     plc: PlcStatus | None
     children: Mapping[str, bool]
     asked_ago_s: float
-    thread: Status | None = None
+    thread: PlantThreadStatus | None = None
 
 
 class Page:
@@ -89,7 +88,7 @@ def families(seen: Snapshot) -> list[Family]:
     if seen.plc is not None:
         _plc(page, seen.plc)
     if seen.thread is not None:
-        page.counter("thread_dropped", "Events that the digital thread's log lost.").add(seen.thread.get("dropped"))
+        page.counter("thread_dropped", "Events that the digital thread's log lost.").add(seen.thread.dropped)
     return list(page.families.values())
 
 

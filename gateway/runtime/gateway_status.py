@@ -81,8 +81,8 @@ class OutputStatus(msgspec.Struct, frozen=True, kw_only=True):
     """An output. `wanted` is the value that `by` commands, None without a command; `held` is the value in the device."""
 
     tag: str
-    wanted: int | float | None
-    held: int | float | None
+    wanted: bool | int | float | None
+    held: bool | int | float | None
     by: str
     refused: bool
 
@@ -163,3 +163,10 @@ class GatewayStatus(msgspec.Struct, frozen=True, kw_only=True):
     """By device: gaps and limits that the gateway has found."""
     store_error: str = ""
     config: ConfigStatus | UnsetType = UNSET
+
+
+class StoppedGateway(msgspec.Struct, frozen=True, kw_only=True):
+    """The answer to `stop`: whether the devices confirmed their safe values, and the final status."""
+
+    safe: bool
+    status: GatewayStatus

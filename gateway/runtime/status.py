@@ -90,7 +90,7 @@ def _tag(seen: TagValue, now_ns: int, names: dict[int, str]) -> TagStatus:
         quality=str(seen.quality),
         reason=str(seen.reason),
         age_s=seen.age_s(now_ns) if seen.t_ns else None,
-        text=names.get(value, UNSET) if isinstance(value, int) else UNSET,
+        text=names[int(value)] if isinstance(value, int | float) and value in names else UNSET,
     )
 
 

@@ -20,6 +20,12 @@ from fieldtwin.plc.status import PlcStatus, Spread, TaskStatus
 from fieldtwin.service.exposition import CONTENT_TYPE, Family, render
 from fieldtwin.service.metrics import MOST_DEVICES, Snapshot, families
 from fieldtwin.service.metrics_server import MOST_CLIENTS, MetricsServer, parse_place
+from fieldtwin.twin.thread.status import PlantThreadStatus
+
+THREAD = PlantThreadStatus(
+    carrier="tcp", connected=True, links=1, origin="plant", sent_through=7, waiting=0, resent=0, duplicates=0, silent="",
+    trouble="", place="tcp://127.0.0.1:1", written=7, dropped=3, store_trouble="", commands_taken=0, commands_refused=0,
+)  # fmt: skip
 
 
 def busy_gateway(devices: int = 1) -> GatewayStatus:
@@ -181,7 +187,7 @@ fieldtwin_writes_total counter result
 def test_names_types_and_labels_are_those_that_dashboards_use() -> None:
     found = {
         " ".join((sample.name, family.type, ",".join(sorted(sample.labels)))).rstrip()
-        for family in text_string_to_metric_families(render(families(seen(thread={"dropped": 3}))))
+        for family in text_string_to_metric_families(render(families(seen(thread=THREAD))))
         for sample in family.samples
     }
     assert sorted(found) == sorted(SERIES.split("\n")[1:-1])

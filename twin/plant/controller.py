@@ -27,7 +27,7 @@ from fieldtwin.gateway.core.errors import Unreachable, UsageError
 from fieldtwin.gateway.devices.register_device import RegisterDriver
 from fieldtwin.gateway.runtime.audit_log import AuditLog
 from fieldtwin.gateway.runtime.buses.learnt_gaps import LearntFile, describe_learnt
-from fieldtwin.gateway.runtime.gateway_status import ConfigStatus, GatewayStatus
+from fieldtwin.gateway.runtime.gateway_status import ConfigStatus, GatewayStatus, StoppedGateway
 from fieldtwin.gateway.runtime.mailboxes.acked_commands import AckedCommandStore
 from fieldtwin.gateway.runtime.reconfigure import reconfigure
 from fieldtwin.gateway.runtime.status import describe
@@ -268,7 +268,7 @@ class GatewayProcess:
                 "warnings": new.warnings,
             }
 
-    async def _request_stop(self, args: dict[str, Any]) -> dict[str, Any]:
+    async def _request_stop(self, args: dict[str, Any]) -> StoppedGateway:
         """Set outputs to safe values, then stop.
 
         The answer says whether the devices confirmed the values, and holds the final counters.
@@ -279,7 +279,7 @@ class GatewayProcess:
             self._learnt.save()
         status = self._status()
         asyncio.get_running_loop().call_later(0.05, self._stop.set)
-        return {"safe": safe, "status": msgspec.to_builtins(status)}
+        return StoppedGateway(safe=safe, status=status)
 
 
 def _plain(value: object) -> object:

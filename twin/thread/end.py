@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Awaitable, Callable, Sequence
 from contextlib import suppress
-from typing import Any
 
 from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S, Clock
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
@@ -18,6 +17,7 @@ from fieldtwin.gateway.store.event import Event, KnowledgeStore, without
 from fieldtwin.twin.thread.core import Effect, Incoming, Keep, NoteLost, Open, Outgoing
 from fieldtwin.twin.thread.frames import Ack, Ask, Data, Frame, Hello, Lost, Refused, Schema
 from fieldtwin.twin.thread.link import Carrier, Link, Unwelcome
+from fieldtwin.twin.thread.status import ThreadStatus
 
 FIRST_RETRY_NS, LAST_RETRY_NS = 200 * NS_PER_MS, 10 * NS_PER_S
 PROVEN_NS = 5 * NS_PER_S
@@ -252,17 +252,17 @@ class ThreadEnd:
             if block:
                 await self._on_events(origin, block)
 
-    def describe(self) -> dict[str, Any]:
+    def status(self) -> ThreadStatus:
         """Return the state of the thread, for a status or a summary."""
-        return {
-            "carrier": self._carrier.name,
-            "connected": self.connected,
-            "links": self.links,
-            "origin": self._origin,
-            "sent_through": self.out.through if self.out is not None else None,
-            "waiting": self.waiting,
-            "resent": self.out.resent if self.out is not None else 0,
-            "duplicates": self.into.duplicates,
-            "silent": self.silent,
-            "trouble": self._refused_by_store or self.trouble or (self._link.trouble if self._link is not None else ""),
-        }
+        return ThreadStatus(
+            carrier=self._carrier.name,
+            connected=self.connected,
+            links=self.links,
+            origin=self._origin,
+            sent_through=self.out.through if self.out is not None else None,
+            waiting=self.waiting,
+            resent=self.out.resent if self.out is not None else 0,
+            duplicates=self.into.duplicates,
+            silent=self.silent,
+            trouble=self._refused_by_store or self.trouble or (self._link.trouble if self._link is not None else ""),
+        )

@@ -47,6 +47,7 @@ from fieldtwin.twin.site.resolved import read_resolved
 from fieldtwin.twin.site.system import System
 from fieldtwin.twin.thread.end import ThreadEnd
 from fieldtwin.twin.thread.place import lent_transmitter, plant_carrier
+from fieldtwin.twin.thread.status import PlantThreadStatus
 from fieldtwin.twin.thread.thread import PTtoDTConnection, schema_of
 
 LOOK_MS = 50
@@ -290,18 +291,18 @@ class PlantThread:
     async def _ready(self, args: dict[str, Any]) -> dict[str, Any]:
         return {"ready": True, "pid": os.getpid()}
 
-    async def _get(self, args: dict[str, Any]) -> dict[str, Any]:
-        return {
-            "place": self._place,
-            **self._end.describe(),
-            "written": self._writer.written,
-            "dropped": self._writer.dropped,
-            "store_trouble": self._writer.trouble,
-            "commands_taken": self._gate.taken,
-            "commands_refused": self._gate.refused,
-        }
+    async def _get(self, args: dict[str, Any]) -> PlantThreadStatus:
+        return PlantThreadStatus(
+            place=self._place,
+            **msgspec.structs.asdict(self._end.status()),
+            written=self._writer.written,
+            dropped=self._writer.dropped,
+            store_trouble=self._writer.trouble,
+            commands_taken=self._gate.taken,
+            commands_refused=self._gate.refused,
+        )
 
-    async def _request_stop(self, args: dict[str, Any]) -> dict[str, Any]:
+    async def _request_stop(self, args: dict[str, Any]) -> PlantThreadStatus:
         status = await self._get(args)
         asyncio.get_running_loop().call_later(0.05, self._stop.set)
         return status

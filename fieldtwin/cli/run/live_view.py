@@ -142,9 +142,6 @@ def _fronts(session: RunSession) -> list[tuple[str, str, dict[str, Any]]]:
     ]
 
 
-THREAD_TROUBLES = (("thread", "trouble"), ("store of the thread", "store_trouble"))
-
-
 def troubles(session: RunSession) -> list[str]:
     """Return the present problems with their reasons.
 
@@ -165,8 +162,9 @@ def troubles(session: RunSession) -> list[str]:
         found.append(f"PLC: {session.plc_status.error}")
     if gateway is not None:
         found += refused(gateway)
-    thread = session.thread_status or {}
-    found += [f"{what}: {text}" for what, key in THREAD_TROUBLES if (text := thread.get(key))]
+    if (thread := session.thread_status) is not None:
+        found += [f"thread: {thread.trouble}"] if thread.trouble else []
+        found += [f"store of the thread: {thread.store_trouble}"] if thread.store_trouble else []
     return found
 
 

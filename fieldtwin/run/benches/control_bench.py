@@ -28,6 +28,7 @@ from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import ConnectionLost, FieldtwinError, Unreachable, UsageError
 from fieldtwin.gateway.core.image.image import OUTPUTS
 from fieldtwin.gateway.core.image.region import RegionReader
+from fieldtwin.gateway.runtime.gateway_status import GatewayStatus
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.plc.status import PlcStatus
 from fieldtwin.results.fault_counts import struck_of
@@ -215,7 +216,7 @@ class ControlBench(AsyncResource):
         where, layout = self._where, image_layout(self.system)
         self._gateway = await self._connect("gateway")
         self._plc = await self._connect("plc")
-        known = set((await self._gateway.call("get"))["tags"])
+        known = set((await self._gateway.ask("get", GatewayStatus)).tags)
         self._asked = [name for name in self._names if name in known]
         image = self._stack.enter_context(attached(layout, where.run_dir / "image"))
         self._outputs = image.reader(OUTPUTS)
@@ -252,7 +253,7 @@ class ControlBench(AsyncResource):
         """Return the endpoint at which the gateway serves `name` of the system file; wait until it does."""
         assert self._gateway is not None
         until_s = self.now_s() + SERVED_WITHIN_S
-        while not (listening := (await self._gateway.call("get"))["serve"][name]["listening"]):
+        while not (listening := (await self._gateway.ask("get", GatewayStatus)).serve[name]["listening"]):
             if self.now_s() > until_s:
                 raise Unreachable(f"the gateway does not serve {name!r}")
             await asyncio.sleep(SERVED_LOOK_S)

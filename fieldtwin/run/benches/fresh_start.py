@@ -7,10 +7,10 @@ of the old run reaches a new device. Then the devices are reset, the gateway rea
 from __future__ import annotations
 
 import asyncio
-from typing import Any
 
 from fieldtwin.gateway.core.control import ControlClient
 from fieldtwin.gateway.core.errors import ReplyTimeout
+from fieldtwin.gateway.runtime.gateway_status import GatewayStatus
 from fieldtwin.plc.status import PlcStatus
 from fieldtwin.run.benches.field_lease import FieldLease
 
@@ -68,14 +68,14 @@ async def _all_read(gateway: ControlClient, since_ns: int) -> None:
 
 async def _not_read(gateway: ControlClient, since_ns: int) -> list[str]:
     """Return the devices that are not online, or whose values are all older than `since_ns`."""
-    status: dict[str, Any] = await gateway.call("get")
-    tags = (await gateway.call("watch", names=list(status["tags"])))["tags"]
+    status = await gateway.ask("get", GatewayStatus)
+    tags = (await gateway.call("watch", names=list(status.tags)))["tags"]
     newest: dict[str, int] = {}
     for name, (value, _, _, t_ns) in tags.items():
         device = name.partition(".")[0]
         newest[device] = max(newest.get(device, 0), t_ns if value is not None else 0)
     return [
         name
-        for name, device in status["devices"].items()
-        if not device["online"] or (newest.get(name) and newest[name] < since_ns)
+        for name, device in status.devices.items()
+        if not device.online or (newest.get(name) and newest[name] < since_ns)
     ]

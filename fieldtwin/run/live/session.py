@@ -23,7 +23,7 @@ from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.control import ControlClient, OtherVersion
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import FieldtwinError, ReplyTimeout, Unreachable, UsageError
-from fieldtwin.gateway.runtime.gateway_status import GatewayStatus
+from fieldtwin.gateway.runtime.gateway_status import GatewayStatus, StoppedGateway
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.plc.status import PlcStatus
 from fieldtwin.results.trace import Trace
@@ -47,6 +47,7 @@ from fieldtwin.twin.site.schema import NONE_STATED
 from fieldtwin.twin.site.system import System, load_system
 from fieldtwin.twin.thread.place import MODEM, lent_transmitter
 from fieldtwin.twin.thread.plant_thread import PlantThreadConfig
+from fieldtwin.twin.thread.status import PlantThreadStatus
 
 if TYPE_CHECKING:
     from fieldtwin.run.benches.invariant_watch import InvariantWatch
@@ -122,7 +123,7 @@ class RunSession(AsyncResource):
         self.field_status: FieldStatus | None = None
         self.outputs_confirmed_safe: bool | None = None
         self.thread_place = ""
-        self.thread_status: dict[str, Any] | None = None
+        self.thread_status: PlantThreadStatus | None = None
         self.thread_return: ThreadReturn | None = None
         self.started_ns = 0
         self.answered_ns: dict[str, int] = {}  # when gateway and PLC last did
@@ -251,7 +252,7 @@ class RunSession(AsyncResource):
         client = await self._start_child(
             "thread", "fieldtwin.twin.thread.plant_thread", self._write("thread.json", config)
         )
-        self.thread_place = str((await client.call("get"))["place"])
+        self.thread_place = (await client.ask("get", PlantThreadStatus)).place
         if not self.delegated:  # the address for a restart, even if the port was chosen freely
             config = msgspec.structs.replace(config, place=self.thread_place)
         self._keep_thread(config)
@@ -455,10 +456,13 @@ class RunSession(AsyncResource):
         for name, status in (("gateway", self.gateway_status), ("plc", self.plc_status)):
             if status is not None:
                 self.answered_ns[name] = self.clock.monotonic_ns()
-        if (thread := await self._get(self._clients.get("thread"), "thread")) is not None:
+        thread = await self._answer(
+            self._clients.get("thread"), "thread", lambda c: c.ask("get", PlantThreadStatus, ANSWERS_WITHIN_S)
+        )
+        if thread is not None:
             self.thread_status = thread
-            if thread["dropped"]:
-                self.note_error(f"the thread's log lost events: {thread['store_trouble'] or 'they arrived too fast'}")
+            if thread.dropped:
+                self.note_error(f"the thread's log lost events: {thread.store_trouble or 'they arrived too fast'}")
 
     async def _refresh_field(self) -> None:
         """Refresh the field simulator's status; after `start: fresh` its journals and counters begin again."""
@@ -470,17 +474,14 @@ class RunSession(AsyncResource):
         self.oracle.begin_again()
         self.counted_before, self.clients_before = {}, {}
 
-    async def _get(self, client: ControlClient | None, name: str, **args: Any) -> dict[str, Any] | None:
-        """Return the status of a process, and record an error without an answer; `name` is empty if monitored elsewhere."""
-        return await self._answer(client, name, lambda c: c.call("get", ANSWERS_WITHIN_S, **args))
-
     async def _ask_field(self, name: str) -> FieldStatus | None:
-        """Return the status of the field simulator; `name` as for `_get`."""
+        """Return the status of the field simulator; `name` as for `_answer`."""
         return await self._answer(self._field_client, name, lambda c: c.ask("get", FieldStatus, ANSWERS_WITHIN_S))
 
     async def _answer(
         self, client: ControlClient | None, name: str, ask: Callable[[ControlClient], Awaitable[T]]
     ) -> T | None:
+        """Return the answer of a process; without one, note an error. `name` is empty if it is monitored elsewhere."""
         if client is None:
             return None
         try:
@@ -551,9 +552,8 @@ class RunSession(AsyncResource):
         gateway = self._clients.get("gateway")
         if gateway is not None:
             try:
-                answer = await gateway.call("stop", timeout_s=2.0)
-                self.outputs_confirmed_safe = answer["safe"]
-                self.gateway_status = msgspec.convert(answer["status"], GatewayStatus)
+                answer = await gateway.ask("stop", StoppedGateway, timeout_s=2.0)
+                self.outputs_confirmed_safe, self.gateway_status = answer.safe, answer.status
             except FieldtwinError as e:
                 self.note_error(f"the gateway did not stop in order: {e}")
         self.field_status = await self._ask_field("") or self.field_status

@@ -17,6 +17,7 @@ from fieldtwin.results.trace import refusal_text
 from fieldtwin.run.processes.states import SeenStates, expected_states
 from fieldtwin.twin.prototype.field_status import FieldStatus
 from fieldtwin.twin.site.system import System
+from fieldtwin.twin.thread.status import PlantThreadStatus
 
 MOST_REFUSED = 10
 """Refused outputs that a summary names one by one."""
@@ -61,7 +62,7 @@ class RunFacts:
     """None if there were no outputs to make safe."""
     field_contact: Mapping[str, Any] | None = None
     """The losses of a remote field simulator; None if it runs on this host."""
-    thread: Mapping[str, Any] | None = None
+    thread: PlantThreadStatus | None = None
     """The last status of the digital thread."""
     delegated: str = ""
     """The transmitter whose mailboxes the digital thread uses."""
@@ -107,7 +108,7 @@ def summarise(run: RunFacts) -> dict[str, Any]:
         "mailboxes": seen.get("mailboxes", {}),
         "far_end": run.topside,
         "field": run.field_contact,
-        "thread": run.thread,
+        "thread": msgspec.to_builtins(run.thread),
         "learnt": seen.get("learnt", {}),
         "logged": seen.get("logged", 0),
         "writes": seen.get("writes", {}),

@@ -12,6 +12,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from fieldtwin.gateway.core.clock import NS_PER_MS
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.control import ControlServer
@@ -175,7 +177,7 @@ class Shadowing:
 
     def _look_for_trouble(self, writer: KnowledgeWriter) -> None:
         assert self._end is not None
-        for where, text in (("thread", str(self._end.describe()["trouble"])), ("store", self._store_trouble(writer))):
+        for where, text in (("thread", self._end.status().trouble), ("store", self._store_trouble(writer))):
             if text != self._troubles.get(where, ""):
                 self._troubles[where] = text
                 self.on_trouble(where, text)
@@ -200,7 +202,7 @@ class Shadowing:
 
     def describe(self) -> dict[str, Any]:
         """Return the shadow's knowledge and the status of its thread."""
-        thread = self._end.describe() if self._end is not None else {}
+        thread = msgspec.structs.asdict(self._end.status()) if self._end is not None else {}
         return {
             "system": self._system.name,
             "prototype": bool(self.prototypes),

@@ -11,18 +11,21 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 import msgspec
 
 from fieldtwin.gateway.core.control import ControlClient
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.gateway.core.files.input_file import read_input
+from fieldtwin.gateway.runtime.gateway_status import GatewayStatus
+from fieldtwin.plc.status import WholePlcStatus
 from fieldtwin.twin.site.system import System
 
 VERSION = 1
 MAX_BYTES = 16 << 20
 Number = float | int | str | bool
+S = TypeVar("S", bound=msgspec.Struct)
 
 
 class _File(msgspec.Struct, forbid_unknown_fields=True):
@@ -93,16 +96,13 @@ async def of_instance(run_dir: Path, system: System) -> KnownState:
 
     Raises `Unreachable`, and `UsageError` if the instance runs a different system.
     """
-    gateway, plc = await _asked(run_dir / "gateway.sock"), await _asked(run_dir / "plc.sock")
-    if (runs := gateway["config"]["system"]) != system.name:
+    gateway = await _asked(run_dir / "gateway.sock", GatewayStatus)
+    plc = await _asked(run_dir / "plc.sock", WholePlcStatus)
+    if (runs := gateway.config.system if gateway.config else "") != system.name:
         raise UsageError(f"the instance {run_dir.name!r} runs a different system", expected=system.name, got=runs)
-    values = {
-        name: tag["value"]
-        for name, tag in gateway["tags"].items()
-        if tag["quality"] == "good" and isinstance(tag["value"], int | float | str)
-    }
+    values = {name: tag.value for name, tag in gateway.tags.items() if tag.quality == "good" and tag.value is not None}
     programs: dict[str, dict[str, Number]] = {}
-    for name, value in plc["variables"].items():
+    for name, value in plc.variables.items():
         program, _, variable = name.partition(".")
         if isinstance(value, int | float | str):
             programs.setdefault(program, {})[variable] = value
@@ -110,11 +110,9 @@ async def of_instance(run_dir: Path, system: System) -> KnownState:
     return KnownState(values, programs, 0, f"instance {run_dir.name}", retained if retained.is_file() else None)
 
 
-async def _asked(socket: Path) -> dict[str, Any]:
+async def _asked(socket: Path, kind: type[S]) -> S:
     client = await ControlClient.connect_unix(socket)
     try:
-        found = await client.call("get")
+        return await client.ask("get", kind)
     finally:
         await client.aclose()
-    assert isinstance(found, dict)
-    return found

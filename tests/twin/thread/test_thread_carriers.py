@@ -50,7 +50,7 @@ def virtually(main: Callable[[VirtualLoop, VirtualClock, MemoryNet], Coroutine[A
 async def until_equal(one: Twin, other: Twin, within_s: float, loop: VirtualLoop) -> float:
     began = loop.time()
     while not await equal(one, other):
-        assert loop.time() - began < within_s, (one.end.describe(), other.end.describe())
+        assert loop.time() - began < within_s, (one.end.status(), other.end.status())
         await asyncio.sleep(0.25)
     return loop.time() - began
 
@@ -281,10 +281,10 @@ def test_a_store_that_refuses_is_not_acknowledged_to_and_catches_up(tmp_path: Pa
         shore.store.keep = refuse  # type: ignore[method-assign]
         await plant.log(*(value(n) for n in range(50)))
         await asyncio.sleep(20)
-        assert (plant.end.waiting, shore.end.describe()["trouble"]) == (50, "the disk is full")
+        assert (plant.end.waiting, shore.end.status().trouble) == (50, "the disk is full")
         shore.store.keep = keep  # type: ignore[method-assign]
         await until_equal(plant, shore, 120, loop)
-        assert shore.end.describe()["trouble"] == "", "and that it is over"
+        assert shore.end.status().trouble == "", "and that it is over"
         await plant.kill()
         await shore.kill()
 

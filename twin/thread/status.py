@@ -1,0 +1,42 @@
+"""The status of one end of a digital thread, for a run's summary and on the control channel of the plant's end.
+
+The fields are the keys of the JSON object.
+"""
+
+from __future__ import annotations
+
+import msgspec
+
+
+class ThreadStatus(msgspec.Struct, frozen=True, kw_only=True):
+    """One end of a thread."""
+
+    carrier: str
+    connected: bool
+    links: int
+    """How many links were opened so far."""
+    origin: str
+    sent_through: int | None
+    """The last event that the other end has acknowledged; None before the first link."""
+    waiting: int
+    """Events that the other end has not acknowledged."""
+    resent: int
+    duplicates: int
+    silent: str
+    """Why nothing arrives although the link is open; empty if something does."""
+    trouble: str
+    """Why events cannot be sent or stored; empty if they can."""
+
+
+class PlantThreadStatus(ThreadStatus, frozen=True, kw_only=True):
+    """The process at the plant's end: the answer to `get`."""
+
+    place: str
+    """The URL at which it listens."""
+    written: int
+    dropped: int
+    """Events that its log lost."""
+    store_trouble: str
+    """Why its log cannot be stored; empty if it can."""
+    commands_taken: int
+    commands_refused: int

@@ -1,8 +1,8 @@
 """Formulas of a simulation: ``speed + (demand - speed) * dt / 0.8``, ``sine(11.5, 0.4, 600) + noise(0.01)``.
 
-They use a small part of Python's expressions. Python's parser reads them, and they are converted to functions of named values; no
-code of the file is ever executed. All values are floats; a comparison gives 1.0 or 0.0. Times are in seconds. A result that
-cannot be computed (a division by zero, the root of a negative number) is NaN, which means "no value".
+`fieldtwin.gateway.core.expressions` is their grammar. They are converted to functions of named values. All values are floats;
+a comparison gives 1.0 or 0.0. Times are in seconds. A result that cannot be computed (a division by zero, the root of a
+negative number) is NaN, which means "no value".
 """
 
 from __future__ import annotations
@@ -11,9 +11,11 @@ import ast
 import math
 import operator
 from collections.abc import Callable, Collection, Mapping
+from itertools import pairwise
 from random import Random
 
 from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.expressions import ARITHMETIC, COMPARE, OF_NUMBERS, Parsed, clamp, dotted
 from fieldtwin.gateway.core.files.nearest import did_you_mean
 
 Values = Mapping[str, float]
@@ -22,56 +24,10 @@ Compute = Callable[[Values], float]
 
 TIME, STEP = "t", "dt"
 """Seconds since the simulation began; seconds since the previous step."""
-LONGEST, DEEPEST = 1000, 50
-
-_ARITHMETIC: dict[type[ast.operator], Callable[[float, float], float]] = {
-    ast.Add: operator.add,
-    ast.Sub: operator.sub,
-    ast.Mult: operator.mul,
-    ast.Div: operator.truediv,
-    ast.Mod: math.fmod,
-    ast.Pow: math.pow,
-}
-_COMPARE: dict[type[ast.cmpop], Callable[[float, float], bool]] = {
-    ast.Eq: operator.eq,
-    ast.NotEq: operator.ne,
-    ast.Lt: operator.lt,
-    ast.LtE: operator.le,
-    ast.Gt: operator.gt,
-    ast.GtE: operator.ge,
-}
-
-
-def _clamp(x: float, low: float, high: float) -> float:
-    return min(max(x, low), high)
-
-
-def _deadband(x: float, width: float) -> float:
-    return 0.0 if abs(x) <= width else x
-
-
-PLAIN: dict[str, tuple[int, Callable[..., float]]] = {
-    "abs": (1, abs),
-    "atan2": (2, math.atan2),
-    "clamp": (3, _clamp),
-    "cos": (1, math.cos),
-    "deadband": (2, _deadband),
-    "exp": (1, math.exp),
-    "floor": (1, math.floor),
-    "hypot": (2, math.hypot),
-    "log": (1, math.log),
-    "max": (2, max),
-    "min": (2, min),
-    "round": (1, round),
-    "sin": (1, math.sin),
-    "sqrt": (1, math.sqrt),
-    "tan": (1, math.tan),
-}
-"""Functions of their arguments: number of arguments and function. Angles are in radians."""
 
 
 def _ramp(t: float, start: float, end: float, over_s: float) -> float:
-    return start + (end - start) * _clamp(t / over_s, 0.0, 1.0)
+    return start + (end - start) * clamp(t / over_s, 0.0, 1.0)
 
 
 def _sine(t: float, mean: float, amplitude: float, period_s: float) -> float:
@@ -106,7 +62,7 @@ OF_TIME: dict[str, tuple[int, Callable[..., float]]] = {
 """
 
 CONSTANTS = {"pi": math.pi, "nan": math.nan, "true": 1.0, "false": 0.0}
-FUNCTIONS = (*sorted([*PLAIN, *OF_TIME]), "noise")
+FUNCTIONS = (*sorted([*OF_NUMBERS, *OF_TIME]), "noise")
 
 
 class Formula:
@@ -120,13 +76,8 @@ class Formula:
         self.names: list[str] = []
         self._known = known
         self._random = random
-        if len(text) > LONGEST:
-            raise UsageError("the formula is too long", expected=f"at most {LONGEST} characters", got=f"{len(text)}")
-        try:
-            tree = ast.parse(text.strip(), mode="eval").body
-        except (SyntaxError, ValueError, RecursionError, MemoryError) as e:
-            raise UsageError("no formula", got=text, hint="for example: speed + (demand - speed) * dt / 0.8") from e
-        self._compute = self._made(tree, 0)
+        self._parsed = Parsed(text, "formula", "for example: speed + (demand - speed) * dt / 0.8")
+        self._compute = self._made(self._parsed.tree)
 
     def __call__(self, values: Values) -> float:
         """Return the present value; NaN if it cannot be computed."""
@@ -135,49 +86,48 @@ class Formula:
         except (ArithmeticError, ValueError):
             return math.nan
 
-    def _made(self, node: ast.expr, depth: int) -> Compute:
-        if depth > DEEPEST:
-            raise UsageError("a formula nested too deep", expected=f"at most {DEEPEST} levels")
+    def _made(self, node: ast.expr) -> Compute:
         match node:
             case ast.Constant(value=bool() | int() | float() as number):
                 return _constant(number)
-            case ast.Name(id=name):
-                return self._named(name)
-            case ast.BinOp(left=left, op=op, right=right) if type(op) in _ARITHMETIC:
-                return _both(_ARITHMETIC[type(op)], self._made(left, depth + 1), self._made(right, depth + 1))
+            case ast.Name() | ast.Attribute():
+                return self._named(node)
+            case ast.BinOp(left=left, op=op, right=right):
+                return _both(ARITHMETIC[type(op)], self._made(left), self._made(right))
             case ast.UnaryOp(op=ast.USub(), operand=operand):
-                negated = self._made(operand, depth + 1)
+                negated = self._made(operand)
                 return lambda values: -negated(values)
             case ast.UnaryOp(op=ast.Not(), operand=operand):
-                denied = self._made(operand, depth + 1)
+                denied = self._made(operand)
                 return lambda values: float(not denied(values))
-            case ast.BoolOp(op=op, values=parts):
-                return _all_or_any(isinstance(op, ast.And), [self._made(part, depth + 1) for part in parts])
-            case ast.Compare(left=left, ops=[op], comparators=[right]) if type(op) in _COMPARE:
-                return _both(_COMPARE[type(op)], self._made(left, depth + 1), self._made(right, depth + 1))
+            case ast.BoolOp(op=op, values=values):
+                return _all_or_any(isinstance(op, ast.And), [self._made(part) for part in values])
+            case ast.Compare(left=left, ops=ops, comparators=others):
+                parts = [self._made(part) for part in (left, *others)]
+                each = [_both(COMPARE[type(op)], *pair) for op, pair in zip(ops, pairwise(parts), strict=True)]
+                return each[0] if len(each) == 1 else _all_or_any(True, each)
             case ast.IfExp(test=test, body=body, orelse=other):
-                return _either(*(self._made(part, depth + 1) for part in (test, body, other)))
-            case ast.Call(func=ast.Name(id=name), args=args, keywords=[]):
-                return self._called(name, [self._made(arg, depth + 1) for arg in args])
-        raise UsageError(
-            "not understood in a formula",
-            got=ast.unparse(node),
-            expected="numbers, names, + - * / % **, comparisons, `A if B else C`, functions",
-        )
+                return _either(*(self._made(part) for part in (test, body, other)))
+            case ast.Call(func=name, args=args):
+                return self._called(name, [self._made(arg) for arg in args])
+        raise self._parsed.error("a text in a formula", node, got=ast.unparse(node), expected="numbers")
 
-    def _named(self, name: str) -> Compute:
+    def _named(self, node: ast.expr) -> Compute:
+        name = dotted(node)
         if name in CONSTANTS:
             return _constant(CONSTANTS[name])
         if name not in self._known and name not in (TIME, STEP):
-            raise UsageError(
+            raise self._parsed.error(
                 f"there is no value or function {name!r}",
+                node,
                 expected=", ".join([TIME, STEP, *self._known]),
                 hint=did_you_mean(name, [TIME, STEP, *self._known, *CONSTANTS]),
             )
         self.names.append(name)
         return operator.itemgetter(name)
 
-    def _called(self, name: str, args: list[Compute]) -> Compute:
+    def _called(self, node: ast.expr, args: list[Compute]) -> Compute:
+        name = dotted(node)
         if name == "noise":
             _count(name, 1, args)
             random, (sigma,) = self._random, args
@@ -186,11 +136,12 @@ class Formula:
             count, of_time = OF_TIME[name]
             _count(name, count, args)
             return lambda values: of_time(values[TIME], *(arg(values) for arg in args))
-        if name in PLAIN:
-            count, plain = PLAIN[name]
+        if name in OF_NUMBERS:
+            count, plain = OF_NUMBERS[name]
             _count(name, count, args)
             return lambda values: plain(*(arg(values) for arg in args))
-        raise UsageError(f"no function {name!r}", expected=", ".join(FUNCTIONS), hint=did_you_mean(name, FUNCTIONS))
+        hint = did_you_mean(name, FUNCTIONS)
+        raise self._parsed.error(f"no function {name!r}", node, expected=", ".join(FUNCTIONS), hint=hint)
 
 
 def _constant(number: float) -> Compute:

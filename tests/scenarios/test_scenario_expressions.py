@@ -58,6 +58,10 @@ def look(function: str, name: str) -> Any:
         ("2 < 1 < ctd.status", False),
         ("'5 s' == '5 s'", True),
         ("true and not false", True),
+        ("(1 if ctd.pressure > 5 else 2) == 1", True),
+        ("(1 if ctd.status > 5 else 1) == 1", None),
+        ("ctd.pressure ** 2 == 30.25 and 7 % 4 == 3 and max(abs(-1), 2) == 2", True),
+        ("max(ctd.status, 9) == 9 or sqrt(-1) == 1 or min(relay.state, 1) == 1", None),
     ],
 )
 def test_values(text: str, value: bool | None) -> None:
@@ -72,8 +76,9 @@ def test_values(text: str, value: bool | None) -> None:
         ("ctd.pressure >", "no expression"),
         ("__import__('os').system('true')", "not a name"),
         ("[x for x in ctd.pressure]", "not understood"),
-        ("ctd.pressure if true else 1", "not understood"),
-        ("ctd.pressure ** 9", "not understood"),
+        ("lambda: ctd.pressure", "not understood"),
+        ("max(ctd.pressure)", "no function 'max'.*expected 2"),
+        ("age(5)", "no function 'age'"),
         ("quality(ctd.pressure, 1)", "no function"),
         ("(" * 300 + "1" + ")" * 300, "expression"),
         ("-" * 200 + "1", "nested too deep"),

@@ -130,7 +130,7 @@ def test_a_mistake_is_named_at_its_position(tmp_path: Path, head: str, told: str
         ("age(ctd.pressure) <= 2.5 s and ctd.presure > 1", "ctd.presure"),
         ("ctd.pressure > 100 ms or qualty(ctd.pressure) == 'good'", "qualty"),
         ("'5 s' == '5 s' and 10 min > relay.stat", "relay.stat"),
-        ("command pending and ctd.pressure ** 2 > 1", "ctd.pressure ** 2"),
+        ("command pending and ctd.pressure // 2 > 1", "ctd.pressure // 2"),
         ("relay.state == 'ACTIVE' or 'ACTVE' == value(relay.state)", "'ACTVE'"),
         ("100 ms > age(ctd.pressure) or quality(ctd.pressure) != 'bade'", "'bade'"),
         ("reason(ctd.pressure) == 'time-out'", "'time-out'"),

@@ -8,10 +8,11 @@ from pathlib import Path
 
 from fieldtwin.emulators.faults.schema import FaultSpec, checked, parse_fault, seconds
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
+from fieldtwin.gateway.core.expressions import NotUnderstood
 from fieldtwin.gateway.core.files.nearest import did_you_mean
 from fieldtwin.gateway.core.files.yaml_file import Key, YamlFile, load, validate
 from fieldtwin.scenarios.bench import Can
-from fieldtwin.scenarios.language.expression import QUALITIES, Expression, NotUnderstood
+from fieldtwin.scenarios.language.expression import QUALITIES, Expression
 from fieldtwin.scenarios.language.invariants import Invariants, load_invariants
 from fieldtwin.scenarios.language.probe_form import Probe, read_probe
 from fieldtwin.scenarios.language.words import WORDS, Bounds, Expect, ScenarioForm, Set, Step, Time, WireForm

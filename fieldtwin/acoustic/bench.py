@@ -60,7 +60,7 @@ class Part:
 class NetworkBench:
     """A `fieldtwin.scenarios.bench.Bench`.
 
-    `parts` by the names of the network's members; `shore` sends from the topside modem.
+    `parts` by the names of the network's members; `topside` sends from the topside modem.
     """
 
     def __init__(self, network: Network, trace: Trace, target: str, faults: AcousticFaults) -> None:
@@ -69,7 +69,7 @@ class NetworkBench:
         self.target = target
         self.allowed = Impact.DISRUPT
         self.parts: dict[str, Part] = {}
-        self.shore: TopsideController | None = None
+        self.topside: TopsideController | None = None
         self.faults = faults
         self._where: dict[str, str] = {}
         """For each fault: its system, or the acoustic channel."""
@@ -78,7 +78,7 @@ class NetworkBench:
     def can(self) -> frozenset[Can]:
         """The abilities that all parts have; commands come from the topside modem."""
         can = frozenset.intersection(*(part.bench.can for part in self.parts.values())) - {Can.SEND_COMMAND, Can.PROBE}
-        return can | ({Can.SEND_COMMAND} if self.shore is not None else frozenset())
+        return can | ({Can.SEND_COMMAND} if self.topside is not None else frozenset())
 
     def _part(self, name: str) -> tuple[Part, str]:
         member, local = self.network.split(name)
@@ -131,9 +131,9 @@ class NetworkBench:
         return told[0][0], max(any_s for _, any_s in told)
 
     async def send(self, period_s: int) -> None:
-        if self.shore is None:
+        if self.topside is None:
             raise UsageError("this network cannot be commanded", expected="`ship:` in its file")
-        self.shore.send(period_s)
+        self.topside.send(period_s)
 
     async def set_value(self, device: str, tag: str, value: float | str | bool | None) -> None:
         part, local = self._part(device)

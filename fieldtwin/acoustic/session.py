@@ -62,7 +62,7 @@ class NetworkSession(AsyncResource):
         self.medium = network.medium(self.seed, self.faults.spoils)
         self.instance = Instance(options.instance or network.name)
         self.sessions: dict[str, RunSession] = {}
-        self.shore: TopsideController | None = None
+        self.topside: TopsideController | None = None
         self.ship: Endpoint | None = None
         self.stopped = asyncio.Event()
         self.started_ns = 0
@@ -86,12 +86,12 @@ class NetworkSession(AsyncResource):
             self.faults.inject(fault)
         if self.ship is not None:
             like = next(iter(self.network.members.values()))
-            self.shore = TopsideController(like.system, like.modem, self.ship, self.clock)
-            self._nursery.start(self.shore.run(list(self.options.commands)), "ship")
+            self.topside = TopsideController(like.system, like.modem, self.ship, self.clock)
+            self._nursery.start(self.topside.run(list(self.options.commands)), "ship")
 
     async def _stop(self) -> None:
-        if self.shore is not None:
-            await self.shore.halt()
+        if self.topside is not None:
+            await self.topside.halt()
 
     async def _start_systems(self, socket: Path) -> None:
         """Start all systems at the same time. If one fails to start, the others are stopped with the rest."""
@@ -129,7 +129,7 @@ class NetworkSession(AsyncResource):
 
     def results(self) -> dict[str, Any]:
         """Return the counters of the acoustic channel, its faults, and what the topside modem sent and heard."""
-        ship = self.shore.describe() if self.shore is not None else None
+        ship = self.topside.describe() if self.topside is not None else None
         return {"water": self.counters(), "faults": self.faults.history.describe(), "ship": ship}
 
     def counters(self) -> dict[str, dict[str, int]]:

@@ -1,4 +1,4 @@
-"""The topside modem of a network, on its own socket: it sends what the topside controller (`far end`) commands."""
+"""The topside modem of a network, on its own socket: it sends what the topside controller commands."""
 
 from __future__ import annotations
 

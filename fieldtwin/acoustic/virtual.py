@@ -20,7 +20,7 @@ from fieldtwin.emulators.virtual.clock import VirtualClock
 from fieldtwin.emulators.virtual.loop import VirtualLoop
 from fieldtwin.gateway.core.concurrency.async_resource import AsyncResource
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
-from fieldtwin.results.trace import FAR_END, Kind, Trace
+from fieldtwin.results.trace import TOPSIDE, Kind, Trace
 from fieldtwin.run.benches.virtual_bench import VirtualBench
 from fieldtwin.run.processes.topside import Scripted, TopsideController
 
@@ -69,7 +69,7 @@ class VirtualNetwork(AsyncResource):
                 self._loop,
                 folder,
                 notes,
-                far_end=False,
+                has_topside=False,
                 water={member.modem: AcousticLink(self.medium, name)},
             )
             self.systems[name] = bench
@@ -80,15 +80,15 @@ class VirtualNetwork(AsyncResource):
             await self._board()
 
     @property
-    def shore(self) -> TopsideController | None:
-        return self.bench.shore
+    def topside(self) -> TopsideController | None:
+        return self.bench.topside
 
     def results(self) -> dict[str, Any]:
         """Return the counters of the acoustic channel, its faults, and what the topside modem sent and heard."""
         return {
             "water": {name: counters.as_dict() for name, counters in self.medium.counters.items()},
             "faults": self.faults.history.describe(),
-            "ship": self.bench.shore.describe() if self.bench.shore is not None else None,
+            "ship": self.bench.topside.describe() if self.bench.topside is not None else None,
         }
 
     def _later(self, name: str) -> Callable[[], int]:
@@ -101,11 +101,11 @@ class VirtualNetwork(AsyncResource):
         ship = TopsideModem(self.network, self.medium, clock)
         endpoint = await ship.open(net)
         self._stack.push_async_callback(ship.aclose)
-        self.bench.shore = shore = TopsideController(ship.like.system, ship.like.modem, endpoint, clock, net)
-        shore.on_send = self._commanded
+        self.bench.topside = topside = TopsideController(ship.like.system, ship.like.modem, endpoint, clock, net)
+        topside.on_send = self._commanded
         nursery = await self._stack.enter_async_context(Nursery())
-        nursery.start(shore.run(self._commands), "ship")
+        nursery.start(topside.run(self._commands), "ship")
 
     def _commanded(self, period_s: int) -> None:
         data = {"text": f"commands {period_s} s", "period_s": period_s}
-        self.trace.note(self.bench.now_ns(), Kind.NOTE, FAR_END, data)
+        self.trace.note(self.bench.now_ns(), Kind.NOTE, TOPSIDE, data)

@@ -21,7 +21,7 @@ from fieldtwin.gateway.core.errors import FileInvalid
 CAPACITY = 200_000
 _AT_ONCE = 256
 """Events that are encoded and hashed together: one at a time takes three times as long."""
-FAR_END = "far end"
+TOPSIDE = "topside"
 
 
 class Kind(Enum):
@@ -35,7 +35,7 @@ class Kind(Enum):
     STEP    a step's number ``text``, ``verdict`` once it has one
     REFUSED  DEVICE.TAG     a write that did not reach its device: ``value``, ``cause``, ``reason``, ``by``, ``program``,
                             ``place`` (FILE:LINE of the program), ``fault`` program | device | "" (by design, or tried again)
-    NOTE    its author      ``text``; of the remote client (`FAR_END`) ``period_s``, when it commands one
+    NOTE    its author      ``text``; of the remote client (`TOPSIDE`) ``period_s``, when it commands one
     """
 
     FRAME = "frame"

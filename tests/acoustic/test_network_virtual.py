@@ -47,7 +47,7 @@ def test_the_same_seed_gives_the_same_run_and_everything_is_checked(tmp_path: Pa
     assert first["water"]["middle"]["heard"] >= 2
     events = read_trace(file.read_bytes().splitlines())
     assert len(events) == first["trace"]["events"]
-    assert {event.where.partition(".")[0] for event in events} == {"west", "middle", "east", "far end"}
+    assert {event.where.partition(".")[0] for event in events} == {"west", "middle", "east", "topside"}
     assert [event.t_ns for event in events if event.t_ns < 0] == []
 
 

@@ -78,7 +78,7 @@ async def emulated(run_dir: Path) -> AsyncIterator[EmulatedTarget]:
             mapping[plant] = mapped_endpoint(plant, Endpoint.parse(url))
         shore = TopsideController(system, "modem", Endpoint.parse(status["far"]["modem"]), WallClock())
         async with Nursery() as nursery:
-            nursery.start(shore.run([]), "far end")
+            nursery.start(shore.run([]), "topside")
             yield EmulatedTarget(mapping, shore)
             await shore.halt()
 

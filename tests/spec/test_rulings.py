@@ -151,7 +151,7 @@ def in_virtual_time(tmp_path: Path, main: Callable[[Watched], Coroutine[Any, Any
     async def sampling() -> AsyncIterator[Watched]:
         async with VirtualPrototype(system, prototype, loop, tmp_path) as plant, Nursery() as nursery:
             shore = TopsideController(system, "modem", plant.field.far["modem"], plant.clock, plant.net)
-            nursery.start(shore.run([]), "far end")
+            nursery.start(shore.run([]), "topside")
             watched = Watched(system, plant, shore)
             await watched.pass_s(3)
             shore.send(1)

@@ -270,7 +270,7 @@ def test_field_controller_and_shore_as_three_separate_processes(tmp_path: Path) 
             summary = controller.summary
             assert summary["ok"]
             assert summary["states"]["relay"] == relay
-            assert summary["far_end"] is None  # it belongs to the shore; a second client would take its responses
+            assert summary["topside"] is None  # it belongs to the shore; a second client would take its responses
         with fieldtwin(tmp_path, *run, name="again", env=run_env):
             wait_for(lambda: container_health(*sockets)[0] == 0, 20, "healthy again")
             field.process.kill()

@@ -33,8 +33,8 @@ def test_it_ends_well_and_reports_it(ended: Fieldtwin) -> None:
 
 def test_the_states_follow_the_commands(ended: Fieldtwin) -> None:
     assert ended.summary["states"] == {"relay": ["STANDBY", "ACTIVE", "STANDBY", "OFF"]}
-    assert ended.summary["far_end"]["commands_sent"] == [1, 2, 0, -1]
-    assert ended.summary["far_end"]["responses"] > 0
+    assert ended.summary["topside"]["commands_sent"] == [1, 2, 0, -1]
+    assert ended.summary["topside"]["responses"] > 0
 
 
 def test_both_sides_count_the_same(ended: Fieldtwin) -> None:
@@ -73,7 +73,7 @@ def test_the_exchanges_of_active_times_are_stored(ended: Fieldtwin) -> None:
     samples = [e["data"] for e in entries if e["kind"] == "response"]
     assert samples
     assert {len(bytes.fromhex(s)) for s in samples} == {20}  # ten registers, unaltered
-    assert ended.summary["far_end"]["last_response"] in samples
+    assert ended.summary["topside"]["last_response"] in samples
 
 
 def test_every_write_is_on_record(ended: Fieldtwin) -> None:

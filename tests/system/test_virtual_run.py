@@ -82,6 +82,6 @@ def test_a_command_that_is_due_between_two_instants_is_sent() -> None:
     made = VirtualRun(VirtualOptions("observatory", 3.0, commands=(1, 2, 0, -1)))
     made.run()
     assert made.errors == []
-    shore = made.checks[""].shore
+    shore = made.checks[""].topside
     assert shore is not None
     assert shore.commands_sent == [1, 2, 0, -1]

@@ -377,7 +377,7 @@ def print_summary(summary: dict[str, Any]) -> None:
         stdout.print(
             f"  simulator      lost {_times(field['losses'])}, away for {field['away_s']:.1f} s", soft_wrap=True
         )
-    if far := summary["far_end"]:
+    if far := summary["topside"]:
         stdout.print(f"  topside        commands {far['commands_sent']}, responses {far['responses']}")
     stdout.print(f"  logged         {summary['logged']} exchanges")
     if thread := summary["thread"]:

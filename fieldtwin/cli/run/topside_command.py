@@ -93,10 +93,10 @@ async def _run(
 ) -> int:
     stop = stop_signal()
     endpoint = Endpoint.parse(far) if far else await _ask_field(device, field_host, token)
-    shore = TopsideController(system, device, endpoint, WallClock())
+    topside = TopsideController(system, device, endpoint, WallClock())
     stderr.print(f"topside end of {device} at {endpoint}", soft_wrap=True)
-    serving = asyncio.create_task(shore.run(script(periods, duration_s or 20.0)))
-    showing = asyncio.create_task(_show(shore)) if not as_json else None
+    serving = asyncio.create_task(topside.run(script(periods, duration_s or 20.0)))
+    showing = asyncio.create_task(_show(topside)) if not as_json else None
     stopping = asyncio.create_task(stop.wait())
     try:
         await asyncio.wait([serving, stopping], timeout=duration_s or None, return_when=asyncio.FIRST_COMPLETED)
@@ -105,7 +105,7 @@ async def _run(
             if task is not None:
                 task.cancel()
                 await asyncio.gather(task, return_exceptions=True)
-    seen = shore.describe()
+    seen = topside.describe()
     if as_json:
         json.dump(seen, sys.stdout)
         sys.stdout.write("\n")
@@ -125,11 +125,11 @@ async def _ask_field(device: str, field_host: str, token: str) -> Endpoint:
     return reachable(Endpoint.parse(far[device]), host)
 
 
-async def _show(shore: TopsideController) -> None:
+async def _show(topside: TopsideController) -> None:
     shown = 0
     while True:
         await asyncio.sleep(0.2)
-        new = shore.responses_received - shown
-        for response in list(shore.responses)[-new:] if new else []:
+        new = topside.responses_received - shown
+        for response in list(topside.responses)[-new:] if new else []:
             stderr.print(f"response {response.hex()}", soft_wrap=True)
-        shown = shore.responses_received
+        shown = topside.responses_received

@@ -33,7 +33,7 @@ from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.plc.status import PlcStatus
 from fieldtwin.results.fault_counts import struck_of
 from fieldtwin.results.model import Struck
-from fieldtwin.results.trace import FAR_END, Event, Kind, Trace, refusal_data
+from fieldtwin.results.trace import TOPSIDE, Event, Kind, Trace, refusal_data
 from fieldtwin.run.benches.capture_tail import CaptureTail
 from fieldtwin.run.benches.field_lease import FieldLease
 from fieldtwin.run.benches.fresh_start import make_fresh, programs_scan
@@ -123,7 +123,7 @@ class ControlBench(AsyncResource):
         self._gateway: ControlClient | None = None
         self._plc: ControlClient | None = None
         self._field: ControlClient | None = None
-        self._shore: TopsideController | None = None
+        self._topside: TopsideController | None = None
         self._outputs: RegionReader | None = None
         self._tail: CaptureTail | None = None
         self._probe = probes
@@ -176,9 +176,9 @@ class ControlBench(AsyncResource):
             assert self.lease is not None
             await make_fresh(self.lease, self._gateway, self._plc)
         if far is not None and device is not None and Can.SEND_COMMAND in self.can:
-            self._shore = TopsideController(self.system, device, far, self._clock)
-            self._shore.on_send = self._commanded
-            nursery.start(self._shore.run([]), "far end")
+            self._topside = TopsideController(self.system, device, far, self._clock)
+            self._topside.on_send = self._commanded
+            nursery.start(self._topside.run([]), "topside")
         if where.capture is not None:
             self._tail = CaptureTail(where.capture, self.system)
             self._stack.callback(self._tail.close)
@@ -323,9 +323,9 @@ class ControlBench(AsyncResource):
         return self._lateness.own_s(since_s), self._lateness.any_s(since_s)
 
     async def send(self, period_s: int) -> None:
-        if self._shore is None:
+        if self._topside is None:
             raise UsageError("this system cannot be commanded", expected="a transmitter with a topside end")
-        self._shore.send(period_s)
+        self._topside.send(period_s)
 
     async def set_value(self, device: str, tag: str, value: float | str | bool | None) -> None:
         answer = await self._put("set", device=device, tag=tag, value=value)
@@ -386,7 +386,7 @@ class ControlBench(AsyncResource):
         self.trace.note(round(self.now_s() * NS_PER_S), kind, where, data)
 
     def _commanded(self, period_s: int) -> None:
-        self._note(Kind.NOTE, FAR_END, {"text": f"commands {period_s} s", "period_s": period_s})
+        self._note(Kind.NOTE, TOPSIDE, {"text": f"commands {period_s} s", "period_s": period_s})
 
     async def _refresh(self) -> None:
         try:

@@ -26,7 +26,7 @@ from fieldtwin.plc.publishing import Change
 from fieldtwin.plc.task import StopReason
 from fieldtwin.results.fault_counts import struck_of
 from fieldtwin.results.model import Struck
-from fieldtwin.results.trace import FAR_END, Kind, Trace, refusal_data
+from fieldtwin.results.trace import TOPSIDE, Kind, Trace, refusal_data
 from fieldtwin.run.benches.probes import Probes
 from fieldtwin.run.processes.states import state_words
 from fieldtwin.run.processes.topside import Scripted, TopsideController
@@ -45,7 +45,7 @@ _FRAME, _TAG, _SENT = Kind.FRAME, Kind.TAG, Direction.SENT  # an Enum's members 
 class VirtualBench(AsyncResource):
     """A bench: ``async with VirtualBench(system, prototype, loop, run_dir, trace, seed=7) as bench``, inside `loop`.
 
-    `commands` are those that the remote client sends by itself; a scenario uses `send` instead. `far_end` False omits
+    `commands` are those that the remote client sends by itself; a scenario uses `send` instead. `has_topside` False omits
     the client. `water`: the ends of transmitters that belong to a network's acoustic channel.
     """
 
@@ -59,7 +59,7 @@ class VirtualBench(AsyncResource):
         *,
         seed: int | None = None,
         commands: list[Scripted] | None = None,
-        far_end: bool = True,
+        has_topside: bool = True,
         probes: Sequence[Probe] = (),
         water: Mapping[str, ModemEnd] | None = None,
     ) -> None:
@@ -78,9 +78,9 @@ class VirtualBench(AsyncResource):
             on_refusal=self._refused,
             water=water,
         )
-        self.shore: TopsideController | None = None
+        self.topside: TopsideController | None = None
         self._commands = commands or []
-        self._far_end = far_end
+        self._has_topside = has_topside
         self._probe = probes
         if probes and all(probe.serve for probe in probes):  # memory contains no other endpoints
             self.can = self.can | {Can.PROBE}
@@ -111,13 +111,13 @@ class VirtualBench(AsyncResource):
         await self._stack.enter_async_context(self.run)
         self.run.gateway.tags.subscribe(self._put)
         device = next(iter(self.run.field.far), None)
-        if device is not None and self._far_end:
-            self.shore = TopsideController(
+        if device is not None and self._has_topside:
+            self.topside = TopsideController(
                 self.system, device, self.run.field.far[device], self.run.clock, self.run.net
             )
-            self.shore.on_send = self._commanded
+            self.topside.on_send = self._commanded
             nursery = await self._stack.enter_async_context(Nursery())
-            nursery.start(self.shore.run(self._commands), "far end")
+            nursery.start(self.topside.run(self._commands), "topside")
         if Can.PROBE in self.can:
             await self._all_served()
             self._probes = Probes(self._probe, self.run.clock, self._served, self.run.net)
@@ -151,7 +151,7 @@ class VirtualBench(AsyncResource):
         self.trace.note(self.now_ns, kind, where, data)
 
     def _commanded(self, period_s: int) -> None:
-        self.note(Kind.NOTE, FAR_END, {"text": f"commands {period_s} s", "period_s": period_s})
+        self.note(Kind.NOTE, TOPSIDE, {"text": f"commands {period_s} s", "period_s": period_s})
 
     def _put(self, name: str, value: TagValue) -> None:
         self._updates[name] = self._updates.get(name, 0) + 1
@@ -240,9 +240,9 @@ class VirtualBench(AsyncResource):
         return 0.0, 0.0
 
     async def send(self, period_s: int) -> None:
-        if self.shore is None:
+        if self.topside is None:
             raise UsageError("this system cannot be commanded", expected="a transmitter with a topside end")
-        self.shore.send(period_s)
+        self.topside.send(period_s)
 
     async def set_value(self, device: str, tag: str, value: float | str | bool | None) -> None:
         self.run.field.faults.set_value(device, tag, value)

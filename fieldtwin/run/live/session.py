@@ -117,7 +117,7 @@ class RunSession(AsyncResource):
             self.invariants = InvariantWatch(self.system)
         self._judging: asyncio.Task[None] | None = None
         self.states = StateWatch(self.system)
-        self.shore: TopsideController | None = None
+        self.topside: TopsideController | None = None
         self.gateway_status: GatewayStatus | None = None
         self.plc_status: PlcStatus | None = None
         self.field_status: FieldStatus | None = None
@@ -170,7 +170,7 @@ class RunSession(AsyncResource):
 
     def summary(self) -> dict[str, Any]:
         """Return the verdict on the run, for `--json` and for printing. Call it after the run."""
-        invariants, shore = self.invariants, self.shore
+        invariants, topside = self.invariants, self.topside
         return summarise(
             RunFacts(
                 prototype=self.options.prototype,
@@ -190,8 +190,8 @@ class RunSession(AsyncResource):
                 invariants=invariants.results() if invariants is not None else (),
                 invariant_errors=invariants.errors() if invariants is not None else (),
                 states=self.states.seen(),
-                topside=shore.describe() if shore is not None else None,
-                commands_sent=tuple(shore.commands_sent) if shore is not None else (),
+                topside=topside.describe() if topside is not None else None,
+                commands_sent=tuple(topside.commands_sent) if topside is not None else (),
                 outputs_confirmed_safe=self.outputs_confirmed_safe,
                 field_contact=self.field_return.describe() if self.field_return is not None else None,
                 thread=self.thread_status,
@@ -369,9 +369,9 @@ class RunSession(AsyncResource):
         if device is not None and self.options.prototype and self.options.commands:
             # Without commands another client uses the remote end (`fieldtwin shore`): two clients would divide the
             # responses.
-            self.shore = TopsideController(self.system, device, self.far[device], self.clock)
+            self.topside = TopsideController(self.system, device, self.far[device], self.clock)
             commands = script(self.options.commands, self.options.duration_s or 20.0)
-            self._nursery.start(self.shore.run(commands), "far end")
+            self._nursery.start(self.topside.run(commands), "topside")
 
     # -- while it runs --------------------------------------------------------------------------------------------------
 
@@ -404,8 +404,8 @@ class RunSession(AsyncResource):
     async def _settle(self) -> None:
         """Wait at the end for a command in progress, for `SETTLE_S` seconds at most."""
         deadline_s = self.elapsed_s + SETTLE_S
-        while self.shore is not None and self.elapsed_s < deadline_s and not self.stopped.is_set():
-            expected = expected_states(self.shore.commands_sent)
+        while self.topside is not None and self.elapsed_s < deadline_s and not self.stopped.is_set():
+            expected = expected_states(self.topside.commands_sent)
             if all(self.states.sequence(p) == expected for p in self.states.relays):
                 return
             await asyncio.sleep(WATCH_S)
@@ -546,8 +546,8 @@ class RunSession(AsyncResource):
     async def _stop_in_order(self) -> None:
         self._notice_deaths()
         await self._end_judging()
-        if self.shore is not None:
-            await self.shore.halt()
+        if self.topside is not None:
+            await self.topside.halt()
         await self.refresh()
         gateway = self._clients.get("gateway")
         if gateway is not None:

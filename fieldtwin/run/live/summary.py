@@ -106,7 +106,7 @@ def summarise(run: RunFacts) -> dict[str, Any]:
         "faults": field.struck if field is not None else [],
         "published": {"values": seen.get("published"), **run.published},
         "mailboxes": seen.get("mailboxes", {}),
-        "far_end": run.topside,
+        "topside": run.topside,
         "field": run.field_contact,
         "thread": msgspec.to_builtins(run.thread),
         "learnt": seen.get("learnt", {}),

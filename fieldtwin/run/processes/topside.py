@@ -98,7 +98,7 @@ class TopsideController:
         """Serve the remote end until cancelled, sending each command at its time."""
         async with Nursery() as nursery:
             nursery.start(self._bus.run(), "far transmitter")
-            nursery.start(self._cycle(deque(commands)), "far end")
+            nursery.start(self._cycle(deque(commands)), "topside")
             await nursery.wait()
 
     async def halt(self) -> None:

@@ -36,7 +36,7 @@ class VirtualSystems(Protocol):
     def systems(self) -> Mapping[str, VirtualBench]: ...
 
     @property
-    def shore(self) -> TopsideController | None:
+    def topside(self) -> TopsideController | None:
         """The sender of commands that none of the systems has for itself."""
 
     def results(self) -> dict[str, Any]:

@@ -27,8 +27,8 @@ class OneRunning:
         return {"": self.bench}
 
     @property
-    def shore(self) -> TopsideController | None:
-        return self.bench.shore
+    def topside(self) -> TopsideController | None:
+        return self.bench.topside
 
     def results(self) -> dict[str, Any]:
         return {}
@@ -48,7 +48,7 @@ async def virtual(
     [member] = group.members.values()
     async with VirtualBench(
         member.system, member.prototype, loop, folder, trace,
-        seed=seed, commands=list(commands or ()), far_end=commands is None or bool(commands), probes=probes,
+        seed=seed, commands=list(commands or ()), has_topside=commands is None or bool(commands), probes=probes,
     ) as bench:  # fmt: skip
         yield OneRunning(bench)
 

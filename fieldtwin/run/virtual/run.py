@@ -151,8 +151,8 @@ class VirtualRun:
                 await self._through(running.bench, loop, lambda: self._judge(running))
                 for name, check in self.checks.items():
                     await check.settle(running.systems[name])
-            if running.shore is not None:
-                await running.shore.halt()
+            if running.topside is not None:
+                await running.topside.halt()
             for name, check in self.checks.items():
                 await check.finish(running.systems[name])
             self._shared = running.results()

@@ -80,7 +80,7 @@ class SystemCheck:
         self.outputs_confirmed_safe: bool | None = None
         self.mapping: dict[Endpoint, Endpoint] = {}
         self.far: dict[str, Endpoint] = {}
-        self.shore: TopsideController | None = None
+        self.topside: TopsideController | None = None
         self._stated = InvariantWatch(system)
         self._numbers: dict[str, int] = {}
         self._emulated: frozenset[str] = frozenset()
@@ -99,10 +99,10 @@ class SystemCheck:
 
     def attach(self, bench: VirtualBench) -> None:
         """Begin to check the events on `bench`."""
-        self.mapping, self.far, self.shore = bench.run.mapping, bench.run.field.far, bench.shore
+        self.mapping, self.far, self.topside = bench.run.mapping, bench.run.field.far, bench.topside
         self._emulated = frozenset(bench.run.field.devices)
         bench.run.gateway.tags.subscribe(self._watched(bench))
-        if self.shore is not None:
+        if self.topside is not None:
             for pump in bench.run.gateway.pumps:
                 if pump.driver.config.name in self.far:
                     self.messages.watch(pump.driver.emitter)
@@ -122,15 +122,15 @@ class SystemCheck:
         outputs = describe(bench.run.gateway, bench.loop.now_ns).outputs  # a stopped node has no certain values
         await bench.sleep_until_s(bench.now_s() + LAST_REPLIES_S)
         self._judge(bench.run.field)
-        if self.shore is not None:
-            self.messages.judge([encode_period(period).data for period in self.shore.commands_sent])
+        if self.topside is not None:
+            self.messages.judge([encode_period(period).data for period in self.topside.commands_sent])
         self._take_status(bench, outputs)
 
     async def settle(self, bench: VirtualBench) -> None:
         """Wait for a command in progress, at most `SETTLE_S`."""
         deadline_s = bench.now_s() + SETTLE_S
-        while self.shore is not None and bench.now_s() < deadline_s:
-            expected = expected_states(self.shore.commands_sent)
+        while self.topside is not None and bench.now_s() < deadline_s:
+            expected = expected_states(self.topside.commands_sent)
             if all(self.states.sequence(p) == expected for p in self.states.relays):
                 return
             await bench.sleep_until_s(bench.now_s() + 0.1)
@@ -220,7 +220,7 @@ class SystemCheck:
 
     def summary(self, errors: Sequence[str] = ()) -> dict[str, Any]:
         """Return the summary of the system, as of a run on this computer; `errors` are those of the run."""
-        invariants, shore = self.invariants, self.shore
+        invariants, topside = self.invariants, self.topside
         facts = RunFacts(
             prototype=True,
             system=self.system,
@@ -240,8 +240,8 @@ class SystemCheck:
             invariants=invariants.results() if invariants is not None else (),
             invariant_errors=invariants.errors() if invariants is not None else (),
             states=self.states.seen(),
-            topside=shore.describe() if shore is not None else None,
-            commands_sent=tuple(shore.commands_sent) if shore is not None else (),
+            topside=topside.describe() if topside is not None else None,
+            commands_sent=tuple(topside.commands_sent) if topside is not None else (),
             outputs_confirmed_safe=self.outputs_confirmed_safe,
             may_refuse=self.may_refuse,
         )

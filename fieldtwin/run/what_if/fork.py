@@ -145,7 +145,7 @@ class _ForkRun:
             unsubscribe = run.gateway.tags.subscribe(self.outcome.saw_tag)
             if self.plan.commands or run.field.far:  # without a topside controller, the modems would stay full
                 nursery = await stack.enter_async_context(Nursery())
-                nursery.start(self._shore().run(list(self.plan.commands)), "far end")
+                nursery.start(self._topside().run(list(self.plan.commands)), "topside")
             for fault in self.plan.faults:
                 run.field.faults.inject(fault)
             await self._watch(run, loop)
@@ -158,7 +158,7 @@ class _ForkRun:
             for requirement, expression in self._at_the_end:
                 self._judge(requirement, expression)
 
-    def _shore(self) -> TopsideController:
+    def _topside(self) -> TopsideController:
         assert self._run is not None
         device = next(iter(self._run.field.far), None)
         if device is None:

@@ -14,7 +14,7 @@ from typing import Any
 from fieldtwin.capture.decoding.decoder import Decoder
 from fieldtwin.capture.decoding.exchange import DecodedExchange
 from fieldtwin.gateway.core.statemachine import encode_period
-from fieldtwin.results.trace import FAR_END, Event, Kind
+from fieldtwin.results.trace import TOPSIDE, Event, Kind
 from fieldtwin.twin.site.system import System
 
 MOST = 200_000
@@ -118,7 +118,7 @@ def story_of(system: System, events: Iterable[Event]) -> Story:
             story.note(story.states, event.where, Change(event.t_ns, event.data.get("value")))
         elif event.kind is Kind.FAULT:
             story.faults.append(event)
-        elif event.kind is Kind.NOTE and event.where == FAR_END and isinstance(event.data.get("period_s"), int):
+        elif event.kind is Kind.NOTE and event.where == TOPSIDE and isinstance(event.data.get("period_s"), int):
             sent.append(Came(event.t_ns, event.where, encode_period(event.data["period_s"]).data))
     take(decoder.finish())
     story.commands = sent or story.commands

@@ -45,7 +45,7 @@ class RunningPlc:
         self._stack = AsyncExitStack()
         self._children: list[Child] = []
         self._plc: ControlClient | None = None
-        self._shore: TopsideController | None = None
+        self._topside: TopsideController | None = None
 
     async def open(self, profiles: tuple[str, ...] = ()) -> None:
         """Start both processes. Raises `ChildFailed` with the output of a process that does not start."""
@@ -77,9 +77,9 @@ class RunningPlc:
         await self._start("gateway", "fieldtwin.twin.plant.controller", config)
         device = next(iter(self._field.far), None)
         if device is not None:
-            self._shore = TopsideController(system, device, self._field.far[device], self._clock)
+            self._topside = TopsideController(system, device, self._field.far[device], self._clock)
             nursery = await self._stack.enter_async_context(Nursery())
-            nursery.start(self._shore.run([]), "far end")
+            nursery.start(self._topside.run([]), "topside")
 
     async def _start(self, name: str, module: str, config: Path) -> ControlClient:
         child = Child(name, module, config, self._folder)
@@ -121,9 +121,9 @@ class RunningPlc:
 
     def send(self, period_s: int) -> None:
         """Command a period at the remote end."""
-        if self._shore is None:
+        if self._topside is None:
             raise UsageError("this system cannot be commanded", expected="a transmitter with a topside end")
-        self._shore.send(period_s)
+        self._topside.send(period_s)
 
     async def _call(self, verb: str, **args: Any) -> dict[str, Any]:
         self.alive()

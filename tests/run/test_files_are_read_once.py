@@ -13,7 +13,7 @@ from fieldtwin.run.live.options import RunOptions
 from fieldtwin.run.live.session import RunSession
 from fieldtwin.twin.prototype.file import load_prototype
 from fieldtwin.twin.site.resolved import read_resolved, write_resolved
-from fieldtwin.twin.site.system import load_system
+from fieldtwin.twin.site.system import System, load_system
 
 SITE = """fieldtwin: 1
 system: shed
@@ -76,3 +76,21 @@ def test_a_damaged_hand_over_is_an_error_of_fieldtwin(tmp_path: Path) -> None:
     path.write_bytes(b"\x80\x04")
     with pytest.raises(Bug, match="handed over"):
         read_resolved(str(path))
+
+
+def test_after_a_reload_a_process_that_starts_again_gets_the_new_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("FIELDTWIN_RUN", str(tmp_path / "r"))
+    for name, text in FILES.items():
+        (tmp_path / name).write_text(text, encoding="utf-8")
+
+    async def polled_every_ms() -> int:
+        async with RunSession(RunOptions(system=str(tmp_path / "shed.yaml"), prototype=True)) as session:
+            (tmp_path / "shed.yaml").write_text(SITE.replace("every_ms: 100", "every_ms: 250"), encoding="utf-8")
+            assert (await session.reload("test")).applied
+            [system] = read_resolved(str(session.instance.path("system.pickle")))
+            assert isinstance(system, System)
+            return system.devices["tank"].poll["values"]
+
+    assert asyncio.run(polled_every_ms()) == 250

@@ -39,7 +39,7 @@ from fieldtwin.twin.plant.physical import EmbeddedControlSystem, attached, gatew
 from fieldtwin.twin.plant.refusal_places import RefusalPlaces
 from fieldtwin.twin.plant.reloading import compare, limits_changed
 from fieldtwin.twin.plant.watching import TagWatch
-from fieldtwin.twin.site.resolved import read_resolved
+from fieldtwin.twin.site.resolved import read_resolved, write_resolved
 from fieldtwin.twin.site.system import System, load_system
 
 FLUSH_EVERY_NS = NS_PER_S // 2
@@ -260,6 +260,8 @@ class GatewayProcess:
                 )
                 self._reloads, self._changed = self._reloads + 1, texts[:MOST_CHANGES_TOLD]
             self._system = new
+            if self._config.resolved:  # for a process of the run that starts again later
+                await asyncio.to_thread(write_resolved, Path(self._config.resolved), new)
             return {
                 "applied": bool(changes),
                 "changes": told,

@@ -22,10 +22,12 @@ from fieldtwin.gateway.wallclock import WallClock
 
 
 class FrameLog(Tap):
-    """A log that appends to `path`, a session at a time; a line is handed to the operating system when the call returns.
+    """A log that appends the frames of one session to `path`, line by line.
 
-    At most `max_bytes` a session: then `full` is True and nothing more is written. A command that may only send logged
-    frames checks `full` before it sends. Raises `FileInvalid` when the file cannot be written.
+    Each line has been given to the operating system when the call returns.
+
+    A session writes at most `max_bytes`. After that `full` is True, and nothing more is written. A command that may only
+    send logged frames checks `full` before it sends. Raises `FileInvalid` when the file cannot be written.
     """
 
     def __init__(self, path: Path, words: str, clock: Clock | None = None, max_bytes: int = 1 << 30) -> None:

@@ -15,7 +15,7 @@ FORMATS = (".png", ".svg", ".pdf")
 
 
 def check_plot(path: Path) -> None:
-    """Raise `UsageError` if no picture can be made at the end, before an hour of watching."""
+    """Raise `UsageError` if matplotlib is missing, so that the user learns it before an hour of watching and not after it."""
     if path.suffix.lower() not in FORMATS:
         raise UsageError("unsupported image format", expected=", ".join(FORMATS), got=path.name)
     if not _there():
@@ -32,7 +32,9 @@ def _there() -> bool:
 
 
 def plot(path: Path, title: str, tags: Sequence[Tag], histories: Mapping[str, History]) -> int:
-    """Write a picture: a panel for each tag that has numbers, time in seconds below. How many panels; 0: no picture.
+    """Write a picture with one panel for each tag that has numbers, over the time in seconds.
+
+    Return the number of panels; 0 if there was nothing to draw and no file was written.
 
     Raises `FileInvalid` when it cannot be written.
     """

@@ -298,7 +298,7 @@ class CanopenPoint:
 
 
 def _singly(read: Read) -> tuple[Read, ...]:
-    """Return a separate read for each tag of `read`; none where it has one tag only, or has to be read whole."""
+    """Return a separate read for each tag of `read`; an empty list if it has only one tag or must be read whole."""
     if read.messages or len(read.tags) < 2:
         return ()
     return tuple(Read(t.registers, (t,), ()) for t in read.tags)
@@ -323,7 +323,7 @@ def planned(tags: Sequence[Tag], profile: DeviceProfile | None) -> tuple[Read, .
 
 
 def part(read: RegisterRange, at: RegisterRange, raw: bytes) -> bytes:
-    """Return the bytes of `at` out of those of `read` (bits one per byte)."""
+    """Return the bytes of the range `at` from the bytes of the whole `read`; a bit takes one byte."""
     width = 1 if read.table in ("coil", "discrete") else 2
     start = (at.address - read.address) * width
     return raw[start : start + at.count * width]

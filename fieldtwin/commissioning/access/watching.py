@@ -24,7 +24,7 @@ GAP = " "
 class History:
     """The history of a tag, in seconds since the start; None where there was no good value.
 
-    `least` and `most` are of all samples ever.
+    `least` and `most` are the extremes of all samples, including those that were dropped.
     """
 
     times_s: deque[float] = field(default_factory=lambda: deque(maxlen=MOST_SAMPLES))

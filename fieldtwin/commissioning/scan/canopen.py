@@ -260,7 +260,7 @@ class CanScanner:
         await clock.sleep_until_ns(began_ns + round(each_s * NS_PER_S))
 
     async def _sdo_is_free(self, node: int) -> bool:
-        """Wait until no other master speaks SDO; False for a node that one has spoken to, and where it never stops."""
+        """Wait until no other master uses SDO. Return False if another master uses this node, or does not stop in time."""
         clock, masters = self._clock, self._ear.heard.sdo_masters
         deadline_ns = clock.monotonic_ns() + round(PATIENCE_S * NS_PER_S)
         while masters:

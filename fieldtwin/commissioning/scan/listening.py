@@ -34,7 +34,10 @@ class Audition:
 
 @dataclass(frozen=True, slots=True)
 class LineVerdict:
-    """The settings of the line. `sure`: they can be relied upon; `why` is a sentence; `others` fit as well."""
+    """The settings of the line.
+
+    `sure`: whether they are proved; `why` gives the reason as a sentence; `others` are settings that fit as well.
+    """
 
     settings: SerialSettings
     framing: str
@@ -60,7 +63,7 @@ def dwell_over(heard: Heard, elapsed_s: float) -> bool:
 
 
 def judge(auditions: Iterable[Audition]) -> LineVerdict | None:
-    """Return the best setting; None if the bytes make sense at none."""
+    """Return the setting at which most bytes form frames; None if they form frames at no setting."""
     good = [a for a in auditions if a.heard.frames and a.heard.share > 0.2]
     if not good:
         return None

@@ -149,7 +149,7 @@ class ModbusScanner:
 
     @property
     def _ended(self) -> bool:
-        """Return whether the scan must not ask more."""
+        """Return whether the scan must send no more questions."""
         return self._met_master or self._stop()
 
     def planned(self) -> list[tuple[str, list[Step]]]:
@@ -205,7 +205,7 @@ class ModbusScanner:
         await self._steps(steps, "every setting", until_found=not self._options.every_setting)
 
     async def _listen(self, said: SerialSettings | None) -> bool:
-        """Listen; True where questions may follow."""
+        """Listen to the line, and return whether questions may follow."""
         options, result = self._options, self.result
         likely = [*plan.likely_settings(self._endpoint), *plan.likely_settings(replace(self._endpoint, params=()))]
         first = said or likely[0]  # the stated settings may be wrong: traffic shows it

@@ -33,7 +33,7 @@ OPENING_S = 0.02
 
 
 def settings_said(endpoint: Endpoint) -> SerialSettings | None:
-    """Return the settings in the endpoint, None if it leaves baud rate or frame open."""
+    """Return the settings that the endpoint states; None if it does not state baud rate and frame."""
     said = {name for name, _ in endpoint.params}
     return endpoint.serial if endpoint.is_serial and {"baudrate", "frame"} <= said else None
 

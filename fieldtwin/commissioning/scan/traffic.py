@@ -69,7 +69,7 @@ class Heard:
 
     @property
     def sure(self) -> bool:
-        """Return whether this is Modbus at these settings, beyond chance."""
+        """Return whether the frames prove Modbus at these settings, because chance cannot explain them."""
         return self.frames >= SURE_FRAMES and self.share > 0.5
 
 

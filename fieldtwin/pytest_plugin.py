@@ -1,4 +1,4 @@
-"""The pytest plugin: emulated devices, field sides, programs and scenarios as fixtures; `*.scenario.yaml` files as tests.
+"""The pytest plugin: emulated devices, field simulators, programs and scenarios as fixtures; `*.scenario.yaml` files as tests.
 
 Loaded in every test run of whoever has fieldtwin installed, so it imports pytest and nothing else until a test asks for
 something: neither pymodbus nor canopen, and none of fieldtwin but `fieldtwin.testing`. What is emulated runs in another process
@@ -196,7 +196,7 @@ def device(request: pytest.FixtureRequest, emulate: Callable[..., Device]) -> De
 
 @pytest.fixture
 def prototype(request: pytest.FixtureRequest) -> Iterator[Prototype]:
-    """The emulated field side of the system that ``@pytest.mark.fieldtwin(system=...)`` names; no gateway, no PLC."""
+    """The simulated field devices of the system that ``@pytest.mark.fieldtwin(system=...)`` names; no gateway, no PLC."""
     from fieldtwin.testing.handles import Prototype
 
     said, runner = _said(request), _runner(request.config)
@@ -233,7 +233,7 @@ def plc(request: pytest.FixtureRequest) -> Iterator[Plc | RunningPlc]:
         whole: Prototype = request.getfixturevalue("prototype")
         places = _places(request)
         yield _or_fail(lambda: RunningPlc(runner, whole.id, places["profiles"]))
-        return  # it ends with the field side
+        return  # it ends with the field simulator
     if "plc" not in said:
         pytest.fail(
             'the program is missing: @pytest.mark.fieldtwin(plc="pump.st"), or system="observatory"', pytrace=False

@@ -61,7 +61,7 @@ def run_trace(seconds: int = 20, lost: tuple[float, float] = (12.0, 15.0)) -> li
         note(0, Kind.STATE, "relay.state", value=0), note(0, Kind.STATE, "relay.period_s", value=0),
         note(2010, Kind.STATE, "relay.period_s", value=1), note(2010, Kind.STATE, "relay.state", value=1),
         note(16_000, Kind.STATE, "relay.state", value=2), note(18_000, Kind.STATE, "relay.state", value=0),
-        note(0, Kind.STEP, "1", text="the far end commands 1 s"), note(2020, Kind.STEP, "1", text="", verdict="passed"),
+        note(0, Kind.STEP, "1", text="topside commands 1 s"), note(2020, Kind.STEP, "1", text="", verdict="passed"),
         note(lost[0] * 1000, Kind.FAULT, "f1", name="drop", on=True, target="ctd"),
         note(lost[1] * 1000, Kind.FAULT, "f1", name="drop", on=False, target="ctd"),
     ]  # fmt: skip

@@ -18,7 +18,7 @@ from fieldtwin.gateway.runtime.tags import TagTable
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.twin.plant.mapping import MappedConnector, mapped_endpoint
 from fieldtwin.twin.plant.physical import make_drivers
-from fieldtwin.twin.prototype.field import FieldSide
+from fieldtwin.twin.prototype.field import FieldSimulator
 from fieldtwin.twin.prototype.file import Prototype, load_prototype
 from fieldtwin.twin.prototype.prototype import DigitalTwinPrototype
 from fieldtwin.twin.site.system import System, load_system
@@ -39,7 +39,7 @@ class Rig:
     """Listening emulators, and the drivers of the same system, attached to them."""
 
     twin: DigitalTwinPrototype
-    field: FieldSide
+    field: FieldSimulator
     tags: TagTable
     drivers: dict[str, RegisterDriver | CanopenDriver]
 

@@ -255,7 +255,7 @@ def test_field_controller_and_shore_as_three_separate_processes(tmp_path: Path) 
 
     assert container_health(field_socket)[0] == 1
     with fieldtwin(tmp_path, *emulate, name="field", env={"FIELDTWIN_EMULATE_TOKEN": "s3cret"}) as field:
-        wait_for(lambda: container_health(field_socket) == (0, "ok"), 20, "the field side is healthy")
+        wait_for(lambda: container_health(field_socket) == (0, "ok"), 20, "the field simulator is healthy")
         (tmp_path / "wrong").write_text("wrong\n", encoding="utf-8")
         stranger = run_to_end(tmp_path, *run, f"--token=@{tmp_path}/wrong", name="stranger")
         assert stranger.process.returncode != 0

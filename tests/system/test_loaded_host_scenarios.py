@@ -38,7 +38,7 @@ def test_the_lateness_of_the_judge_is_subtracted_and_that_of_the_system_is_not(t
     emulate = ("emulate", str(tmp_path / "shed.yaml"), "--control", f"127.0.0.1:{port}")
     words = ("test", str(tmp_path / "a.scenario.yaml"), "--target", "compose", "--field", f"127.0.0.1:{port}", "--json")
     with fieldtwin(tmp_path, *emulate, name="field") as side:
-        wait_for(lambda: "now: fieldtwin run" in side.err, 30, "the field side is up")
+        wait_for(lambda: "now: fieldtwin run" in side.err, 30, "the field simulator is up")
         field = Asking(("127.0.0.1", port))
         with fieldtwin(tmp_path, *words, name="judge") as judge:
             wait_for(lambda: field("get")["devices"]["tank"]["counters"]["requests"] > 5, 30, "the judge looks")

@@ -48,7 +48,7 @@ def judged(tmp_path: Path, source: str) -> dict[str, Any]:
         f"127.0.0.1:{control}",
     )
     with fieldtwin(tmp_path, *words, name="field") as field:
-        wait_for(lambda: str(field_port) in field.out + field.err, 20, "the field side is up")
+        wait_for(lambda: str(field_port) in field.out + field.err, 20, "the field simulator is up")
         controller = subprocess.Popen([loop, "127.0.0.1", str(field_port), str(own_port)])
         try:
             test = ("test", str(scenario), "--target", "compose", "--field", f"127.0.0.1:{control}", "--json")

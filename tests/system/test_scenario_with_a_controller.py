@@ -156,7 +156,7 @@ def test_from_another_terminal_the_test_finds_the_only_field_simulator_of_the_sy
         (home,) = site.glob("with-*")
         assert Asking(str(home / "field.sock"))("get")["set"] == {}, "nothing is left in the devices"
         with fieldtwin(site, "with", "--instance", "second", str(site / "shed.yaml"), "--", "sleep", "600", name="two"):
-            wait_for(lambda: (site / "second" / "field.sock").exists(), 30, "the second field side")
+            wait_for(lambda: (site / "second" / "field.sock").exists(), 30, "the second field simulator")
             several = run_to_end(site, "test", *words, name="several")
             assert several.process.returncode == 1
             assert (

@@ -147,7 +147,7 @@ def running(site: Path) -> Iterator[Running]:
     emulate = ("emulate", str(site / "shed.yaml"), "--control", f"127.0.0.1:{port}")
     run = ("run", str(site / "shed.yaml"), "--prototype", "--field", f"127.0.0.1:{port}")
     with fieldtwin(site, *emulate, name="field") as field:
-        wait_for(lambda: "now: fieldtwin run" in field.err, 30, "the field side is up")
+        wait_for(lambda: "now: fieldtwin run" in field.err, 30, "the field simulator is up")
         with fieldtwin(site, *run) as controller:
             every_device_online(controller.control("shed", "gateway"))
             yield Running(site, field, controller, port)
@@ -247,7 +247,7 @@ def test_a_line_a_can_bus_and_a_modem_are_rebuilt(tmp_path: Path) -> None:
     emulate = ("emulate", "observatory", "--control", f"127.0.0.1:{port}")
     run = ("run", "observatory", "--prototype", "--field", f"127.0.0.1:{port}", "--commands", "none")
     with fieldtwin(tmp_path, *emulate, name="field") as field:
-        wait_for(lambda: "now: fieldtwin run" in field.err, 30, "the field side is up")
+        wait_for(lambda: "now: fieldtwin run" in field.err, 30, "the field simulator is up")
         with fieldtwin(tmp_path, *run) as controller:
             every_device_online(controller.control("observatory", "gateway"))
             for name in ("first", "second"):

@@ -83,7 +83,7 @@ class Chaos:
                     if which == "plant":
                         plant.process.kill()
                         plant.wait()
-                        wait_for(self.field_is_gone, 10, "the field side, which lingers, ends")
+                        wait_for(self.field_is_gone, 10, "the field simulator, which lingers, ends")
                         plant = stack.enter_context(self.plant())
                         self.until_more(self._chance.randrange(5, 40), twin)
                     twin.process.kill()

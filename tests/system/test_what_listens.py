@@ -96,7 +96,9 @@ def test_an_emulated_field_listens_on_loopback(tmp_path: Path) -> None:
     port = free_port()
     with fieldtwin(tmp_path, "emulate", "observatory", "--control", f"{LOOPBACK}:{port}") as side:
         wait_for(lambda: port in only_loopback(side.process.pid), 20, "its control channel")
-        wait_for(lambda: len(only_loopback(side.process.pid)) == 4, 20, "CAN bus, modem, far end and control channel")
+        wait_for(
+            lambda: len(only_loopback(side.process.pid)) == 4, 20, "CAN bus, modem, topside modem and control channel"
+        )
 
 
 @pytest.mark.long

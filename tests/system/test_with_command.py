@@ -76,7 +76,7 @@ def test_a_signal_ends_the_program_first_and_then_the_field(tmp_path: Path, numb
         started.signal(number)
         assert started.wait(30) == 5
     assert "told" in started.out
-    wait_for(lambda: not Path(f"/proc/{field}").exists(), 5, "the field side ended")
+    wait_for(lambda: not Path(f"/proc/{field}").exists(), 5, "the field simulator ended")
 
 
 def test_a_field_that_dies_is_not_a_success(tmp_path: Path) -> None:

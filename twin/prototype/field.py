@@ -103,7 +103,7 @@ def _advised(remark: Remark) -> str:
     return f"{remark.text} (`cia: 402` chooses a model, `cia: none` means it)" if remark.model else remark.text
 
 
-class FieldSide:
+class FieldSimulator:
     """Builds every emulator of a prototype and runs them on their connections.
 
     Virtual serial ports get their links in `run_dir`. After `open`, `listening` holds the endpoint at which each

@@ -85,7 +85,7 @@ class FieldFaults:
         """Call `told` for the traffic on each line and socket from now on.
 
         Its arguments are the bus, the connection object, whether an emulator sent the bytes, and the bytes. CAN buses have their
-        own listeners (`FieldSide.join`).
+        own listeners (`FieldSimulator.join`).
         """
         for name, wire in self._buses.items():
             wire.watch = _watcher(name, told)

@@ -35,7 +35,7 @@ from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.twin.plant.child_main import child_main
-from fieldtwin.twin.prototype.field import FieldSide
+from fieldtwin.twin.prototype.field import FieldSimulator
 from fieldtwin.twin.prototype.field_leases import LEASE_S, FieldLeases
 from fieldtwin.twin.prototype.field_status import FieldStatus
 from fieldtwin.twin.prototype.file import Prototype, load_prototype
@@ -120,13 +120,13 @@ class FieldProcess:
         self._fresh_asked = asyncio.Event()
         self._fresh_done: asyncio.Future[None] | None = None
         self._lease_changed = asyncio.Event()
-        self._field: FieldSide
+        self._field: FieldSimulator
         self._leases: FieldLeases
         self.control_port = 0
         # Identity of these devices: devices that are made anew get a different one, and their counters restart.
         self._life = secrets.token_hex(8)
 
-    async def run(self, on_ready: Callable[[FieldSide], None] | None = None) -> int:
+    async def run(self, on_ready: Callable[[FieldSimulator], None] | None = None) -> int:
         """Open, call `on_ready`, and serve until stopped."""
         run_dir = Path(self._config.run_dir)
         async with AsyncExitStack() as stack:
@@ -138,7 +138,7 @@ class FieldProcess:
             self._leases = FieldLeases(self._field.faults)
             return await self._run(run_dir, on_ready)
 
-    async def _run(self, run_dir: Path, on_ready: Callable[[FieldSide], None] | None) -> int:
+    async def _run(self, run_dir: Path, on_ready: Callable[[FieldSimulator], None] | None) -> int:
         await self._field.open()
         server = ControlServer(
             {
@@ -224,7 +224,7 @@ class FieldProcess:
         """Make the devices again from the same prototype, on the same endpoints. A failure ends the process."""
         old, done = self._field, self._fresh_done
         prototype = _listening_as(self._twin.prototype, old)
-        self._field = FieldSide(old.system, prototype, Path(self._config.run_dir), self._clock)
+        self._field = FieldSimulator(old.system, prototype, Path(self._config.run_dir), self._clock)
         try:
             await self._field.open()
         except BaseException as e:
@@ -315,7 +315,7 @@ class FieldProcess:
         return self._field.status()
 
 
-def _listening_as(prototype: Prototype, field: FieldSide) -> Prototype:
+def _listening_as(prototype: Prototype, field: FieldSimulator) -> Prototype:
     """Return `prototype` with every bus and every far modem at the endpoint that it has in `field`, so that ports stay
     the same.
     """

@@ -17,7 +17,7 @@ from fieldtwin.gateway.core.clock import Clock
 from fieldtwin.twin.model.model import DigitalModel
 from fieldtwin.twin.plant.declared import declared_variables
 from fieldtwin.twin.plant.physical import EmbeddedControlSystem
-from fieldtwin.twin.prototype.field import FieldSide
+from fieldtwin.twin.prototype.field import FieldSimulator
 from fieldtwin.twin.prototype.file import Prototype
 from fieldtwin.twin.site.system import System
 
@@ -46,10 +46,10 @@ class DigitalTwinPrototype:
 
     def field(
         self, run_dir: Path, ports: Ports | None = None, water: Mapping[str, ModemEnd] | None = None
-    ) -> FieldSide:
+    ) -> FieldSimulator:
         """Return the emulators on their connections, not opened yet.
 
         The connections are the operating system's unless other `ports` are given. Virtual serial ports get their links
         in `run_dir`. `water`: the acoustic ends of transmitters that are in a network.
         """
-        return FieldSide(self.ecs.system, self.prototype, run_dir, self._clock, ports, water)
+        return FieldSimulator(self.ecs.system, self.prototype, run_dir, self._clock, ports, water)

@@ -32,7 +32,7 @@ from fieldtwin.plc.runner import Runner
 from fieldtwin.plc.task import run_on_clock
 from fieldtwin.twin.plant.mapping import MappedConnector, mapped_endpoint
 from fieldtwin.twin.plant.physical import plc_config
-from fieldtwin.twin.prototype.field import FieldSide
+from fieldtwin.twin.prototype.field import FieldSimulator
 from fieldtwin.twin.prototype.file import Prototype
 from fieldtwin.twin.prototype.prototype import DigitalTwinPrototype
 from fieldtwin.twin.site.system import System
@@ -73,7 +73,7 @@ class VirtualPrototype(AsyncResource):
         self.clock = VirtualClock(loop)
         self.net = MemoryNet(loop)
         self.twin = DigitalTwinPrototype(system, self.prototype, self.clock)
-        self.field: FieldSide = self.twin.field(Path("virtual"), self.net, water)
+        self.field: FieldSimulator = self.twin.field(Path("virtual"), self.net, water)
         self.gateway: Gateway
         self.plc: Runner
         self.image: Image
@@ -129,7 +129,7 @@ class VirtualPrototype(AsyncResource):
             self._prepare(self)
         self._nursery = await self._stack.enter_async_context(Nursery())
         self._stack.push_async_callback(self._stop)
-        self._nursery.start(self.field.run(), "field side")
+        self._nursery.start(self.field.run(), "field simulator")
         await clock.sleep_until_ns(self.loop.now_ns + STARTING_NS)
         self._nursery.start(run_on_clock(self.plc, clock), "PLC")
         self.started_ns = self.field.faults.start_ns = self.loop.now_ns

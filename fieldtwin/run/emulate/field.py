@@ -8,7 +8,7 @@ from pathlib import Path
 from fieldtwin.console import stderr
 from fieldtwin.twin.plant.child import allow_open_files
 from fieldtwin.twin.plant.instance import Instance
-from fieldtwin.twin.prototype.field import FieldSide
+from fieldtwin.twin.prototype.field import FieldSimulator
 from fieldtwin.twin.prototype.field_process import FieldConfig, FieldProcess, resolve
 from fieldtwin.twin.site.system import load_system
 
@@ -48,7 +48,7 @@ async def run_field(options: FieldOptions) -> int:
         return await process.run(lambda side: _say(side, process, options))
 
 
-def _say(side: FieldSide, process: FieldProcess, options: FieldOptions) -> None:
+def _say(side: FieldSimulator, process: FieldProcess, options: FieldOptions) -> None:
     stderr.print(f"[bold]field simulator[/bold] of {side.system.name}")
     for bus, endpoint in side.listening.items():
         devices = ", ".join(d.name for d in side.system.devices_on(bus))

@@ -360,7 +360,7 @@ class RunSession(AsyncResource):
 
     def _start_watching(self) -> None:
         if self.field_return is not None:
-            self._nursery.start(self.field_return.run(), "field side's return")
+            self._nursery.start(self.field_return.run(), "field simulator's return")
         self._nursery.start(self._watch(), "states")
         if self.invariants is not None:
             self._judging = self._nursery.start(self._judge_invariants(self.invariants), "invariants")

@@ -32,7 +32,7 @@ from fieldtwin.run.processes.topside import TopsideController
 from fieldtwin.run.virtual.age_oracle import AgeOracle
 from fieldtwin.run.virtual.message_oracle import MessageOracle
 from fieldtwin.scenarios.judging.runner import TICK_S
-from fieldtwin.twin.prototype.field import FieldSide
+from fieldtwin.twin.prototype.field import FieldSimulator
 from fieldtwin.twin.prototype.field_status import FieldStatus
 from fieldtwin.twin.site.system import System
 
@@ -203,7 +203,7 @@ class SystemCheck:
         if event.where.endswith(".state") and isinstance(event.data["value"], str):
             self.states.note(event.where.removesuffix(".state"), event.data["value"], event.t_ns)
 
-    def _judge(self, side: FieldSide) -> None:
+    def _judge(self, side: FieldSimulator) -> None:
         for name, device in side.devices.items():
             for held in device.journal.since(self._numbers.get(name, 0)):
                 self.oracle.held(f"{name}.{held.tag}", held.raw, held.t_ns)

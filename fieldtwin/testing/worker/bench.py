@@ -23,7 +23,7 @@ from fieldtwin.testing.worker.one_device import endpoint_words
 from fieldtwin.testing.worker.running_plc import RunningPlc
 from fieldtwin.testing.worker.wire_log import WireLog
 from fieldtwin.twin.plant.mapping import mapped_endpoint
-from fieldtwin.twin.prototype.field import FieldSide
+from fieldtwin.twin.prototype.field import FieldSimulator
 from fieldtwin.twin.prototype.file import Prototype
 from fieldtwin.twin.site.system import System
 
@@ -33,7 +33,7 @@ class Bench:
 
     def __init__(self, system: System, prototype: Prototype, clock: Clock, folder: Path) -> None:
         self.system = system
-        self.field = FieldSide(system, prototype, folder, clock)
+        self.field = FieldSimulator(system, prototype, folder, clock)
         self.log = WireLog(system, clock)
         self.plc: RunningPlc | None = None
         self._clock = clock
@@ -44,7 +44,7 @@ class Bench:
     async def open(self) -> None:
         await self.field.open()
         self.field.faults.watch(self.log.on_bytes)
-        self._nursery.start(self.field.run(), "field side")
+        self._nursery.start(self.field.run(), "field simulator")
         for bus, listening in self.field.listening.items():
             if listening.is_can:
                 ear = await self.field.join(bus, "test")

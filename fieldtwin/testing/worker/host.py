@@ -92,7 +92,7 @@ class Host:
             "report": self._report,
         }
 
-    # -- field sides ----------------------------------------------------------------------------------------------------
+    # -- field simulators ----------------------------------------------------------------------------------------------------
 
     async def _hello(self, args: dict[str, Any]) -> dict[str, Any]:
         return {"fieldtwin": __version__, "pid": os.getpid()}

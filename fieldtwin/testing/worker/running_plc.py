@@ -22,7 +22,7 @@ from fieldtwin.run.processes.topside import TopsideController
 from fieldtwin.twin.plant.controller import ControllerConfig
 from fieldtwin.twin.plant.mapping import mapped_endpoint, mapping_to_json
 from fieldtwin.twin.plant.physical import PhysicalTwin
-from fieldtwin.twin.prototype.field import FieldSide
+from fieldtwin.twin.prototype.field import FieldSimulator
 from fieldtwin.twin.site.resolved import write_resolved
 from fieldtwin.twin.site.system import System
 
@@ -37,7 +37,7 @@ class RunningPlc:
     `aclose` ends both processes, the gateway first, which makes the outputs safe.
     """
 
-    def __init__(self, system: System, field: FieldSide, clock: Clock, folder: Path) -> None:
+    def __init__(self, system: System, field: FieldSimulator, clock: Clock, folder: Path) -> None:
         self._system = system
         self._field = field
         self._clock = clock

@@ -25,7 +25,7 @@ _DECLARATION = "option"
 _HEADINGS = "option_headings"
 _OTHER = "Other options"
 _WIDEST = 30
-"""Width of the options' column, at most: the default of `click.HelpFormatter.write_dl`."""
+"""Maximum width of the options' column: the default of `click.HelpFormatter.write_dl`."""
 
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
@@ -87,10 +87,11 @@ class GroupedCommand(click.Command):
             if record is not None and isinstance(parameter, click.Option):
                 rows.setdefault(headings.get(parameter.name, _OTHER), []).append(record)
         rows[_OTHER] = rows.pop(_OTHER, [])  # shown last
-        width = min(_WIDEST, max(len(names) for records in rows.values() for names, _ in records))
+        lengths = [len(names) for records in rows.values() for names, _ in records]
+        width = max(length for length in lengths if length <= _WIDEST)  # longer ones have a line of their own
         for heading, records in rows.items():
             with formatter.section(heading):
-                formatter.write_dl([(names.ljust(width), text) for names, text in records])
+                formatter.write_dl([(names.ljust(width), text) for names, text in records], col_max=width)
 
 
 def moved_options(sentence: str, *names: str, is_flag: bool = False) -> Decorator:

@@ -88,7 +88,7 @@ class GroupedCommand(click.Command):
                 rows.setdefault(headings.get(parameter.name, _OTHER), []).append(record)
         rows[_OTHER] = rows.pop(_OTHER, [])  # shown last
         lengths = [len(names) for records in rows.values() for names, _ in records]
-        width = max(length for length in lengths if length <= _WIDEST)  # longer ones have a line of their own
+        width = max(length for length in lengths if length <= _WIDEST)  # longer ones are on a separate line
         for heading, records in rows.items():
             with formatter.section(heading):
                 formatter.write_dl([(names.ljust(width), text) for names, text in records], col_max=width)

@@ -12,13 +12,13 @@ from fieldtwin.gateway.core.files.profile import load_profile
 
 KINDS = {
     "system": "The plant: buses, devices, programs. `NAME.yaml`",
-    "prototype": "What is emulated of it, with what. `NAME.prototype.yaml`",
-    "network": "Systems whose modems are in one water, as prototypes.",
+    "prototype": "The devices of a plant that are simulated, and with what. `NAME.prototype.yaml`",
+    "network": "Several systems whose modems share an acoustic channel, as prototypes.",
     "profile": "A device: its registers or objects.",
-    "scenario": "What is done and what must be seen. `NAME.scenario.yaml`",
-    "faults": "What goes wrong, for `run --faults` and `link --faults`.",
-    "waivers": "Failures that somebody answers for, for `check` and `test`.",
-    "rules": "What a digital twin commands by what it finds, for `twin --plan`.",
+    "scenario": "Actions, and the results that are expected. `NAME.scenario.yaml`",
+    "faults": "Injected faults, for `run --faults` and `link --faults`.",
+    "waivers": "Accepted failures, for `check` and `test`.",
+    "rules": "The commands of a digital twin for its findings, for `twin --plan`.",
 }
 PROFILES = Path(__file__).resolve().parents[2] / "profiles" / "devices"
 

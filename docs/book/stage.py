@@ -19,6 +19,7 @@ if str(Path(__file__).parent) not in sys.path:
     sys.path.insert(0, str(Path(__file__).parent))
 
 from cli_page import cli_page  # noqa: E402
+from explain_page import explain_page  # noqa: E402
 from form_pages import form_pages  # noqa: E402
 from paper_page import paper_page  # noqa: E402
 
@@ -33,7 +34,7 @@ FOLDERS = {"examples": "tutorials/examples.md", "docs/decisions": "decisions/REA
 LISTS = {"decisions/README.md": "\n```{toctree}\n:hidden:\n:glob:\n\n0*\n```\n"}
 GENERATED = (
     *("reference/cli.md", "reference/forms.md", "reference/faults.md", "reference/profiles.md"),
-    "reference/paper.md",
+    *("reference/explanations.md", "reference/paper.md"),
 )
 
 _LINK = re.compile(r"(\]\()([^)\s#]+)(#[^)\s]*)?(\))")
@@ -108,7 +109,12 @@ def contents(index: str) -> str:
 
 def generated() -> dict[str, str]:
     """Reference pages that are generated from the program itself."""
-    return {"reference/cli.md": cli_page(), **form_pages(), "reference/paper.md": paper_page()}
+    return {
+        "reference/cli.md": cli_page(),
+        **form_pages(),
+        "reference/explanations.md": explain_page(),
+        "reference/paper.md": paper_page(),
+    }
 
 
 def stage(target: Path) -> None:

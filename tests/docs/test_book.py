@@ -20,6 +20,7 @@ import stage as book
 import fieldtwin
 from fieldtwin.cli.main import COMMANDS
 from fieldtwin.cli.system.schema_command import SCHEMAS
+from fieldtwin.explain.lookup import everything
 
 
 def test_links_between_files_work():
@@ -70,6 +71,22 @@ def test_the_books_source_has_every_kind_of_file_every_fault_and_every_command(t
     assert all(f"## fieldtwin {name}\n" in commands for name in COMMANDS)
     faults = (tmp_path / "source/reference/faults.md").read_text("utf-8")
     assert all(f"`{name}`" in faults for name in form_pages.FAULTS)
+
+
+def test_every_explanation_has_an_anchor_of_its_own(tmp_path):
+    book.stage(tmp_path / "source")
+    page = (tmp_path / "source/reference/explanations.md").read_text("utf-8")
+    anchors = re.findall(r"^\((.+)\)=$", page, re.MULTILINE)
+    assert len(anchors) == len(set(anchors)) == len(everything())
+    assert {
+        "exception-02",
+        "abort-06020000",
+        "mb-015a",
+        "stale",
+        "error-crcerror",
+        "exit-4",
+        "fault-late-reply",
+    } <= set(anchors)
 
 
 def test_the_public_api_equals_the_reference():

@@ -1,0 +1,48 @@
+"""Generate the reference page of everything that `fieldtwin explain` knows: codes, words and test cases, each with an anchor."""
+
+from __future__ import annotations
+
+from itertools import groupby
+
+from fieldtwin.explain.explanation import Explanation
+from fieldtwin.explain.lookup import everything
+
+HEADINGS = {
+    "Modbus exception": "Modbus exceptions",
+    "SDO abort code": "SDO abort codes",
+    "quality": "Qualities of values",
+    "quality reason": "Reasons for a quality",
+    "error": "Errors",
+    "exit code": "Exit codes",
+    "fault": "Faults",
+    "test case": "Test cases",
+}
+
+
+def explain_page() -> str:
+    """Return the page as Markdown. Its anchors are the IDs, such as ``#mb-015a`` and ``#exception-02``."""
+    parts = [
+        "# Codes and words\n",
+        "Each entry is what `fieldtwin explain` prints: the meaning, what to do, and the source. Words can be copied from a"
+        " message as they are.\n",
+    ]
+    for kind, entries in groupby(everything(), key=lambda entry: entry.kind):
+        parts.append(f"## {HEADINGS[kind]}\n")
+        parts += [_entry(entry) for entry in entries]
+    return "\n".join(parts)
+
+
+def anchor(entry: Explanation) -> str:
+    """Return the anchor of an entry. Words that are also a fault's or an error's name get the kind in front."""
+    plain = entry.id.lower().replace(" ", "-").replace("_", "-")
+    return f"{entry.kind}-{plain}" if entry.kind in ("fault", "error") else plain
+
+
+def _entry(entry: Explanation) -> str:
+    lines = [
+        f"({anchor(entry)})=",
+        f"### {entry.id}: {entry.title}\n",
+        f"{entry.meaning}\n",
+        f"**What to do:** {entry.todo}\n",
+    ]
+    return "\n".join([*lines, *([f"*Source: {entry.source}*\n"] if entry.source else [])])

@@ -110,6 +110,10 @@ COMMANDS = {
         "fieldtwin.cli.system.explain_command",
         "Explain a test case, a fault, a code or a word of a message.",
     ),
+    "completion": (
+        "fieldtwin.cli.system.completion_command",
+        "Print or install the completion for bash, zsh or fish.",
+    ),
     "doctor": ("fieldtwin.cli.system.doctor_command", "Check what this computer supports, and what to change."),
 }
 SECTIONS = {
@@ -123,8 +127,9 @@ SECTIONS = {
     ),
     "Test": ("test", "faults", "trace"),
     "Twins": ("template", "shadow", "twin", "what-if"),
+    "Help and setup": ("explain", "doctor", "schema", "completion", "test-host"),
 }
-"""The order of commands in `--help`; commands in no group come last."""
+"""The order of commands in `--help`; each command is in one section."""
 INTERRUPTED = 130
 BUG = 70
 HOST_REFUSES = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.EIO, errno.EACCES, errno.EPERM)
@@ -170,12 +175,10 @@ class LazyGroup(click.Group):
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        shown = {name for names in SECTIONS.values() for name in names}
-        sections = {**SECTIONS, "Besides": tuple(name for name in COMMANDS if name not in shown)}
         widest = max(map(len, COMMANDS))
-        for title, names in sections.items():
+        for title, names in SECTIONS.items():
             with formatter.section(title):
-                formatter.write_dl([(name.ljust(widest), COMMANDS[name][1]) for name in names if name in COMMANDS])
+                formatter.write_dl([(name.ljust(widest), COMMANDS[name][1]) for name in names])
 
 
 @click.command(

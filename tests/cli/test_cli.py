@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from fieldtwin.cli.main import COMMANDS, main
+from fieldtwin.cli.main import COMMANDS, SECTIONS, main
 
 SYSTEMS = Path(__file__).resolve().parents[2] / "profiles" / "systems"
 DEVICES = SYSTEMS.parent / "devices"
@@ -303,3 +303,7 @@ def test_a_reader_that_closes_early_is_not_an_error() -> None:
     assert process.stderr.read() == b""
     process.stderr.close()
     assert process.wait(20) == 0
+
+
+def test_every_command_is_in_one_section_of_the_help() -> None:
+    assert sorted(name for names in SECTIONS.values() for name in names) == sorted(COMMANDS)

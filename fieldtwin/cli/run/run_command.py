@@ -12,6 +12,7 @@ from pathlib import Path
 
 import click
 
+from fieldtwin.cli.completions import systems
 from fieldtwin.cli.option_groups import GroupedCommand, group, moved_options, option
 from fieldtwin.cli.options import Duration, Secret, json_option
 from fieldtwin.cli.run.run_options import ReplayOptions, commands_option, listen_option, systems_of
@@ -124,7 +125,7 @@ class ThreadOptions:
 
 
 @click.command("run", cls=GroupedCommand)
-@click.argument("system")
+@click.argument("system", shell_complete=systems)
 @group("Plant or prototype", place=PlaceOptions)
 @group("Simulated devices", replay=ReplayOptions)
 @group("Simulated devices", listen_option, commands_option, field=FieldOptions)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from fieldtwin.cli.campaign_options import FaultChoice, SeedOptions
+from fieldtwin.cli.completions import systems
 from fieldtwin.cli.option_groups import GroupedCommand, group, option
 from fieldtwin.cli.options import Duration, json_option
 from fieldtwin.cli.run.run_options import ReplayOptions, commands_option, systems_of
@@ -36,7 +37,7 @@ class ManyRuns(SeedOptions):
 
 
 @click.command("simulate", cls=GroupedCommand)
-@click.argument("system")
+@click.argument("system", shell_complete=systems)
 @group(
     "Virtual time and seeds",
     click.option(

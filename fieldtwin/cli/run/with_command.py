@@ -8,6 +8,7 @@ from typing import Any
 import click
 from rich.markup import escape
 
+from fieldtwin.cli.completions import systems
 from fieldtwin.cli.option_groups import group
 from fieldtwin.cli.run.run_options import ReplayOptions, listen_option
 from fieldtwin.cli.template_question import SourceOptions
@@ -19,7 +20,7 @@ LONG = ("_URL", "_TTY", "_BAUDRATE", "_FRAME", "_HOST", "_PORT", "_INTERFACE", "
 
 
 @click.command("with", context_settings={"allow_interspersed_args": False})
-@click.argument("system")
+@click.argument("system", shell_complete=systems)
 @click.argument("argv", nargs=-1, type=click.UNPROCESSED, metavar="-- CMD [ARG]...")
 @group("Simulated devices", listen_option, replay=ReplayOptions)
 @click.option("--faults", default="", metavar="FILE", help="Inject these faults (see fieldtwin faults).")

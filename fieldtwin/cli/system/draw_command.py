@@ -11,12 +11,13 @@ from typing import Any
 
 import click
 
+from fieldtwin.cli.completions import systems
 from fieldtwin.cli.options import json_option, profiles_option
 from fieldtwin.gateway.core.errors import UsageError
 
 
 @click.command("draw")
-@click.argument("system")
+@click.argument("system", shell_complete=systems)
 @click.option("--prototype", is_flag=True, help="Also show what is emulated, from which source, and at which endpoint.")
 @click.option(
     "-o",

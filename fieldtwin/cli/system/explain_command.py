@@ -10,12 +10,13 @@ from itertools import groupby
 import click
 from rich.padding import Padding
 
+from fieldtwin.cli.completions import explained
 from fieldtwin.cli.options import json_option
 from fieldtwin.console import stdout
 
 
 @click.command("explain")
-@click.argument("words", nargs=-1)
+@click.argument("words", nargs=-1, shell_complete=explained)
 @json_option
 def command(words: tuple[str, ...], as_json: bool) -> int:
     """Explain what WORDS mean, where they are defined, and what to do: a test case (MB-015), a fault (late-reply), a Modbus

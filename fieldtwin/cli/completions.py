@@ -1,4 +1,4 @@
-"""What the shell offers for arguments: names of systems and of words that can be explained.
+"""Values that the shell offers for arguments: names of systems, and words that can be explained.
 
 The shell calls the program at each press of the tab key, so each function reads no more than it needs.
 """

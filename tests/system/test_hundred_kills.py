@@ -17,7 +17,6 @@ import pytest
 from fan_hall import hall, writes
 from many_kills_rig import KILLS, KILLS_OF_A_RUN, nothing_is_left, processes_of, victim
 from procs import (
-    CHECKOUT,
     Asking,
     alive,
     command_from_far,
@@ -188,7 +187,7 @@ def test_both_ends_of_a_digital_thread_have_the_same_log_in_the_end(tmp_path: Pa
         gateway = run.control("t", "gateway")
         every_device_online(gateway)
         config = {
-            "system": str(CHECKOUT / "profiles" / "systems" / "observatory.yaml"), "run_dir": str(root / "t"),
+            "resolved": str(root / "t" / "system.pickle"), "run_dir": str(root / "t"),
             "place": place, "store": str(root / "t" / "knowledge.sqlite"), "prototype": True,
             "mapping": json.loads((root / "t" / "gateway.json").read_text())["mapping"],
         }  # fmt: skip

@@ -112,7 +112,9 @@ def load_group(name: str, profiles: Iterable[Path] = ()) -> SystemGroup | None:
     """
     profiles = tuple(profiles)
     found = group_file(name, profiles)
-    if found is None:
-        return None
-    kind, path = found
+    return None if found is None else read_group(*found, profiles)
+
+
+def read_group(kind: str, path: Path, profiles: Iterable[Path] = ()) -> SystemGroup:
+    """Read a file that `group_file` has found, with all files that it names. Raises `FileInvalid`."""
     return cast(SystemGroup, group_module(kind).load(path, profiles))

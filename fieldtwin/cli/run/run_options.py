@@ -74,12 +74,12 @@ def systems_of(
     `others` are the values of options that such a file does not have, and `available` names those that it has. Raises
     `UsageError`, `FileInvalid`, `NotAllowed`.
     """
-    if group_file(file, sources.profiles) is None:
+    found = group_file(file, sources.profiles)
+    if found is None:
         return None
-    from fieldtwin.twin.prototype.group import load_group  # here and below: a plant has no emulators installed
+    from fieldtwin.twin.prototype.group import read_group  # here: a plant has no emulators installed
 
-    group = load_group(file, sources.profiles)
-    assert group is not None
+    group = read_group(*found, sources.profiles)
     if plant:
         raise UsageError(
             f"a {group.kind} file runs only as prototypes: each of its systems is a separate plant",

@@ -135,6 +135,8 @@ class RunSession(AsyncResource):
         self._nursery = Nursery()
         self._clients: dict[str, ControlClient] = {}
         self._field: FieldContact | None = None
+        self._resolved = ""
+        """The file that hands the system to gateway and thread; the prototype has its own, which a gateway cannot read."""
         self.made_anew = 0
         """How often a scenario reset the simulated devices."""
         self.field_return: FieldReturn | None = None
@@ -212,6 +214,7 @@ class RunSession(AsyncResource):
         config = run_dir / "plc.json"
         config.write_bytes(plc.to_json())
         await self._start_child("plc", "fieldtwin.plc", config)
+        self._resolved = write_resolved(self.instance.path("system.pickle"), self.system)
         gateway = ControllerConfig(
             system=str(self.system.path.resolve()),
             run_dir=str(run_dir),
@@ -220,7 +223,7 @@ class RunSession(AsyncResource):
             profiles=tuple(str(p.resolve()) for p in self.options.profiles),
             capture=str(self.options.capture.resolve()) if self.options.capture else "",
             delegated=(self.delegated,) if self.delegated else (),
-            resolved=self._hand_over(self.system),
+            resolved=self._resolved,
         )
         await self._start_child("gateway", "fieldtwin.twin.plant.controller", self._write("gateway.json", gateway))
         self._stack.enter_context(self.states.attached(ecs.layout, run_dir / "image"))
@@ -239,7 +242,7 @@ class RunSession(AsyncResource):
         """Start the plant's side of the digital thread, which observes the process image."""
         o = self.options
         config = PlantThreadConfig(
-            resolved=self._hand_over(self.system),
+            resolved=self._resolved,
             run_dir=str(run_dir),
             place=o.thread,
             store=o.thread_store or str(run_dir / "knowledge.sqlite"),
@@ -293,11 +296,6 @@ class RunSession(AsyncResource):
             water=o.water,
         )
 
-    def _hand_over(self, *files: object) -> str:
-        """Write what this run has read from files, for its own processes: all use the same version of the files."""
-        name = "system.pickle" if len(files) == 1 else "prototype.pickle"  # a gateway cannot read a prototype's
-        return write_resolved(self.instance.path(name), *files)
-
     def _write(self, name: str, config: msgspec.Struct) -> Path:
         path = self.instance.path(name)
         path.write_bytes(msgspec.json.format(msgspec.json.encode(config), indent=2))
@@ -319,12 +317,8 @@ class RunSession(AsyncResource):
             self._field = await contact_elsewhere(at, token, self.system, run_dir)
             self.field_return = FieldReturn(self._field, self.system, at, token, self._field_returned)
         else:
-            config = self._write(
-                "field.json",
-                msgspec.structs.replace(
-                    self._field_config(run_dir), resolved=self._hand_over(self.system, self._prototype)
-                ),
-            )
+            resolved = write_resolved(self.instance.path("prototype.pickle"), self.system, self._prototype)
+            config = self._write("field.json", msgspec.structs.replace(self._field_config(run_dir), resolved=resolved))
             client = await self._start_child("field", "fieldtwin.twin.prototype.field_process", config, FIELD_LINGER_S)
             self._field = await contact_here(client, self.system, run_dir)
         self._stack.push_async_callback(self._field.aclose)

@@ -42,11 +42,10 @@ def _systems(path: Path, said: Mapping[str, Any], profiles: tuple[Path, ...]) ->
     name, prototype = str(said.get("system", "")), said.get("prototype")
     beside = path.parent / name
     named = str(beside) if beside.exists() else name.removesuffix(".yaml")
-    if group_file(named, profiles) is not None:
-        from fieldtwin.twin.prototype.group import load_group  # needs emulators, which a plant does not have
+    if (found := group_file(named, profiles)) is not None:
+        from fieldtwin.twin.prototype.group import read_group  # needs emulators, which a plant does not have
 
-        group = load_group(named, profiles)
-        return [(m.system, m.prototype.path) for m in group.members.values()] if group is not None else []
+        return [(m.system, m.prototype.path) for m in read_group(*found, profiles).members.values()]
     return [(load_system(named, profiles), path.parent / prototype if isinstance(prototype, str) else None)]
 
 

@@ -110,6 +110,8 @@ class SdoChannel:
         self._rebooted = False
         self._began_ambiguous = False
         """Whether replies to earlier requests for the same object could still arrive when the present transfer began."""
+        self._final_seen = False
+        """Whether a reply that ends the present transfer has arrived, so that `_late` is up to date."""
 
     def deliver(self, frame: CanFrame) -> bool:
         """Take a frame of the node. Return True if it is a second answer to one request: then two nodes share the node ID
@@ -156,6 +158,12 @@ class SdoChannel:
             await self._settle(transfer)
             return await self._run(transfer)
 
+    async def end(self) -> None:
+        """Wait for the transfers that were asked for before this call. A transfer that is asked for later waits until it is
+        cancelled.
+        """
+        await self._turn.acquire()  # never released
+
     async def _settle(self, transfer: SdoTransfer) -> None:
         """Make sure that no late reply can be taken for the reply to `transfer` (see `late_replies`)."""
         wanted = (transfer.index, transfer.subindex)
@@ -183,7 +191,7 @@ class SdoChannel:
             raise self._again(self._lost)
         request, complete = (transfer.index, transfer.subindex), False
         self._active, self._reply, self._rebooted = transfer, b"", False
-        self._began_ambiguous = self._late.is_ambiguous(request)
+        self._began_ambiguous, self._final_seen = self._late.is_ambiguous(request), False
         self._answers.pop(request, None)
         try:
             await self._tell_owed(transfer)
@@ -202,9 +210,10 @@ class SdoChannel:
             self._counters.ignored += len(self._inbox)
             self._inbox.clear()
             if not self._rebooted:  # after a reboot no reply can arrive, and there is nothing to abort
-                other_expected = transfer.answered and self._late.answered(request)
-                if not complete or other_expected:
-                    self._late.unanswered(request)
+                if not self._final_seen:
+                    other_expected = transfer.answered and self._late.answered(request)
+                    if not complete or other_expected:
+                        self._late.unanswered(request)
                 self._owe(transfer)
 
     def _answered(self, request: Multiplexor) -> None:
@@ -326,6 +335,8 @@ class SdoChannel:
             return False
         request = multiplexor_of(frame.data)
         if active is not None and (active.index, active.subindex) == request:
+            if is_final(frame.data):
+                self._settle_earlier(request)
             if self._began_ambiguous:
                 return False  # after a stall, the replies to earlier requests arrive together
             waiting = next((f for f in self._inbox if f.data[:4] == frame.data[:4]), None)
@@ -341,6 +352,15 @@ class SdoChannel:
         first = self._answers.pop(request, None)  # reported once per answer
         self.first_reply = first or b""
         return first is not None
+
+    def _settle_earlier(self, request: Multiplexor) -> None:
+        """Settle the requests before the one that a reply for the present `request` answers, when the reply arrives.
+
+        When the transfer's task runs, it would be too late: replies that arrived after this one have settled this one too.
+        """
+        if self._late.answered(request) and not self._final_seen:
+            self._late.unanswered(request)  # this may be the reply to an earlier request, so one more is expected
+        self._final_seen = True
 
     def _again(self, lost: ConnectionLost) -> ConnectionLost:
         """Return a new error for each caller: one instance would collect all their tracebacks."""

@@ -223,6 +223,46 @@ def test_replies_that_come_all_at_once_after_a_stall_are_not_those_of_two_nodes(
     run_virtual(main())
 
 
+@settings(max_examples=200, deadline=None)
+@given(
+    asked=st.lists(st.sampled_from([(0x1001, 0), (0x1018, 4), (0x2000, 0), (0x2000, 2)]), min_size=1, max_size=14),
+    wanted=st.sampled_from([(0x1001, 0), (0x2000, 0)]),
+    pauses=st.sets(st.integers(0, 40)),
+)
+@example([(0x2000, 0)] * 12, (0x2000, 0), {10})
+def test_co042_replies_after_a_stall_are_not_a_conflict_however_they_arrive(
+    asked: list[tuple[int, int]], wanted: tuple[int, int], pauses: set[int]
+) -> None:
+    """Defect: after a process had stood still for 10 s, one late reply was taken for the answer of a second node.
+
+    The client handles the replies between two of `pauses` in one turn of the event loop.
+    """
+
+    async def main() -> None:
+        ours, theirs = bus()
+        master = CanopenMaster(ours, LoopClock())
+        async with running(master):
+            for index, sub in asked:
+                await asyncio.gather(master.sdo_upload(5, index, sub), return_exceptions=True)
+            waiting = sum(request.data[0] == 0x40 for request in theirs.inbound.data_stream)
+            last = [asyncio.ensure_future(master.sdo_upload(5, *wanted)) for _ in range(3)]
+            number = 0
+            while not all(task.done() for task in last):
+                await asyncio.sleep(0.001)
+                for request in drained(theirs):
+                    if request.data[0] == 0x40:
+                        ours.feed(CanFrame(0x585, b"\x43" + request.data[1:4] + number.to_bytes(4, "little")))
+                        number += 1
+                        if number in pauses:
+                            await asyncio.sleep(0.001)
+            for task in last:
+                if task.exception() is None:
+                    assert int.from_bytes(task.result(), "little") >= waiting
+            assert master.conflicts == {}
+
+    run_virtual(main())
+
+
 def test_co023_a_cancelled_request_counts_as_unanswered() -> None:
     async def main() -> None:
         ours, theirs = bus()

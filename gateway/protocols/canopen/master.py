@@ -185,6 +185,17 @@ class CanopenMaster:
                     raise
         await self._transfer(lambda: SdoDownload(node, index, subindex, timeout_ns, data), retries)
 
+    async def end_transfers(self, timeout_s: float) -> None:
+        """Send no further SDO request: wait for the transfers under way, for `timeout_s` seconds at most.
+
+        A transfer that is asked for later waits until it is cancelled. NMT commands and PDOs can still be sent.
+        """
+        ending = [asyncio.ensure_future(channel.end()) for channel in self._channels.values()]
+        if ending:
+            _, late = await asyncio.wait(ending, timeout=timeout_s)
+            for task in late:
+                task.cancel()
+
     async def nmt(self, command: NmtCommand, node: int) -> None:
         """Send an NMT command to `node` (0: all nodes). It is not confirmed: the node's heartbeat shows the result."""
         frame = nmt.command_frame(command, node)

@@ -559,10 +559,14 @@ class CanopenBus:
             status.start_again = asyncio.get_running_loop().call_later(START_AGAIN_S, again)
 
     async def halt(self, timeout_s: float) -> None:
-        """Put the nodes that the gateway started back to PRE-OPERATIONAL, so that they send no process data.
+        """Stop sending requests, so that the counters stay as they are, and put the nodes that the gateway started back to
+        PRE-OPERATIONAL, so that they send no process data.
 
-        Each node may take `timeout_s` seconds."""
+        The requests under way, and then each node, may take `timeout_s` seconds."""
         self._stopping = True
+        if self._master is None:
+            return
+        await self._master.end_transfers(timeout_s)
         if self._master is None or not self._allow_writes:
             return
         for status in self.nodes.values():

@@ -201,6 +201,24 @@ def test_on_the_way_out_nodes_that_we_started_are_stopped_even_without_a_record(
     run(main())
 
 
+def test_no_request_is_sent_after_halt(tmp_path: Path) -> None:
+    """Defect: polls went on after the final counters were read, so a run ended with "the gateway counted 235 requests, the
+    emulators 236".
+    """
+
+    async def main() -> None:
+        async with rig(tmp_path, allow_writes=False, serial="", tpdo1=Tpdo(("slope_long", "serial"), 20)) as r:
+            r.plug_node()
+            await eventually(lambda: r.quality("serial") == ("good", "none"))
+            await r.bus.halt(1.0)
+            totals = r.bus.totals()
+            assert totals["sdo_requests"] == totals["sdo_replies"] + totals["sdo_aborts"]
+            with pytest.raises(AssertionError, match="not within"):
+                await eventually(lambda: r.bus.totals()["sdo_requests"] > totals["sdo_requests"], within_s=1.0)
+
+    run(main())
+
+
 def test_a_bus_that_goes_away_is_joined_again(tmp_path: Path) -> None:
     async def main() -> None:
         async with rig(tmp_path) as r:

@@ -1,7 +1,7 @@
 """The faults of one emulated device outside of a system: `fieldtwin emulate DEVICE --faults FILE`.
 
 The aim of such a fault may not name buses or devices; it may name a register if the device has a profile. Value faults need a
-device whose registers are created from its profile.
+profile.
 """
 
 from __future__ import annotations
@@ -71,8 +71,8 @@ class DeviceFaults:
         return active
 
 
-def check_device(spec: FaultSpec, profile: DeviceProfile | None, *, values: bool) -> None:
-    """Raise `WrongAim` for a fault that a single device cannot have. `values` says whether its values can be changed."""
+def check_device(spec: FaultSpec, profile: DeviceProfile | None) -> None:
+    """Raise `WrongAim` for a fault that a single device cannot have."""
     aim, kind = spec.aim, spec.kind.kind
     for key, name in (("device", aim.device), ("bus", aim.bus)):
         if name:
@@ -82,11 +82,11 @@ def check_device(spec: FaultSpec, profile: DeviceProfile | None, *, values: bool
     if kind is Kind.CAN:
         raise WrongAim("name", f"fault {spec.kind.name} is for {kind.value}", expected="one of a line or socket")
     tag = _tag(aim, profile)
-    if kind is Kind.VALUE and not values:
+    if kind is Kind.VALUE and profile is None:
         raise WrongAim(
             "name",
-            f"fault {spec.kind.name} changes values, and those of this device come from a recording",
-            hint="--values makes its registers from its profile",
+            f"fault {spec.kind.name} changes the values of registers, and a recording alone does not describe them",
+            hint="emulate a profile and give it the recording: fieldtwin emulate PROFILE --recording FILE",
         )
     if kind is Kind.VALUE and tag is not None and tag.is_text:
         raise WrongAim("register", f"{tag.name} is not a number", expected="a tag that is one")

@@ -85,11 +85,13 @@ class OsPorts:
     async def can_bus(self, endpoint: Endpoint, bitrate: int, *, paced: bool) -> CanPort:
         """Return a bus: a software bus is served here, a kernel interface is joined."""
         if endpoint.interface == "fieldtwin":
-            return _ServedBus(await SoftBusServer.open(endpoint, bitrate, paced=paced))
-        return _KernelBus(endpoint, bitrate)
+            return ServedBus(await SoftBusServer.open(endpoint, bitrate, paced=paced))
+        return JoinedBus(endpoint, bitrate)
 
 
-class _ServedBus:
+class ServedBus:
+    """A software bus that this process serves."""
+
     def __init__(self, server: SoftBusServer) -> None:
         self._server = server
 
@@ -111,7 +113,9 @@ class _ServedBus:
         await self._server.aclose()
 
 
-class _KernelBus:
+class JoinedBus:
+    """A bus that others serve: a kernel interface, or the software bus of another process. Bit rate 0: any."""
+
     def __init__(self, endpoint: Endpoint, bitrate: int) -> None:
         self.bound = endpoint
         self._bitrate = bitrate
@@ -127,4 +131,4 @@ class _KernelBus:
         return None
 
     async def aclose(self) -> None:
-        """Do nothing, because the kernel's interface stays."""
+        """Do nothing, because the bus stays."""

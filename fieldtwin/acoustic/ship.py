@@ -9,12 +9,12 @@ from fieldtwin.emulators.endpoints.ports import Listening, Ports
 from fieldtwin.emulators.modbus.mbap import MbapSlave
 from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.emulators.models.acoustic_link import AcousticLink
+from fieldtwin.emulators.models.emulated_modbus import unit_limits
 from fieldtwin.emulators.models.mailbox_modem import MailboxModem
 from fieldtwin.emulators.wires.acoustic import AcousticMedium
 from fieldtwin.gateway.core.clock import NS_PER_S, Clock
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.run.processes.topside import Scripted, script
-from fieldtwin.twin.prototype.field import unit_limits
 
 MOST_CLIENTS = 4
 FIRST_S = 1.0

@@ -39,6 +39,8 @@ from fieldtwin.commissioning.record.tapping import LineTap
 from fieldtwin.emulators.canopen.serve import serve_node
 from fieldtwin.emulators.context import EndOfRecording
 from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
+from fieldtwin.emulators.endpoints.ports import OsPorts
+from fieldtwin.emulators.host import EmulatorHost
 from fieldtwin.emulators.models.emulated_node import emulated_node
 from fieldtwin.emulators.replay.can_log import CanLog
 from fieldtwin.emulators.replay.replay import NeverRecorded
@@ -55,7 +57,7 @@ from fieldtwin.gateway.core.files.recording import RecordedExchange, RecordingHe
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient
 from fieldtwin.gateway.protocols.modbus.requests import ReadRegisters
 from fieldtwin.gateway.wallclock import WallClock
-from fieldtwin.run.emulate.device import DeviceHost, as_it_was_recorded
+from fieldtwin.run.emulate.device import as_it_was_recorded, replayed_units, serve_units
 
 ROOT = Path(__file__).parents[2]
 HEADER = RecordingHeader(version=1, device="a/b", kind="exchanges", source="measured")
@@ -87,12 +89,11 @@ def shipped(folder: Path) -> Path:
 @contextlib.asynccontextmanager
 async def played(recording: Path, wire: str) -> AsyncIterator[None]:
     """The recording, emulated on that wire."""
-    host = DeviceHost(1.0)
+    host = EmulatorHost(WallClock(), OsPorts())
     try:
-        async with Nursery() as nursery:
-            units = host.replayed(recording, None, NeverRecorded.EXCEPTION, EndOfRecording.HOLD)
-            await host.serve(nursery, units, Endpoint.parse(wire))
-            yield
+        units = replayed_units(recording, None, NeverRecorded.EXCEPTION, EndOfRecording.HOLD)
+        await serve_units(host, Endpoint.parse(wire), units)
+        yield
     finally:
         await host.aclose()
 

@@ -19,13 +19,13 @@ from fieldtwin.emulators.endpoints.socket_end import SocketListener
 from fieldtwin.emulators.modbus.mbap import MbapSlave
 from fieldtwin.emulators.modbus.rtu import RtuSlave
 from fieldtwin.emulators.modbus.unit import ModbusUnit
+from fieldtwin.emulators.models.emulated_modbus import unit_limits
 from fieldtwin.emulators.models.sampled_sensor import SampledSensor
 from fieldtwin.emulators.signals import SignalPlayer, SignalTrack
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.files.profile import load_profile
 from fieldtwin.gateway.wallclock import WallClock
-from fieldtwin.twin.prototype.field import unit_limits
 
 pytestmark = [
     pytest.mark.interop,

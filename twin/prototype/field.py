@@ -6,44 +6,39 @@ device of that bus. This module connects the emulators to the system file; it do
 
 from __future__ import annotations
 
-import asyncio
-from collections.abc import Awaitable, Callable, Mapping, Sized
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 from fieldtwin.emulators.canopen.node import CanopenNode
 from fieldtwin.emulators.canopen.remarks import Remark
-from fieldtwin.emulators.canopen.serve import serve_node
-from fieldtwin.emulators.client_counts import ClientCounts, CountDifference
 from fieldtwin.emulators.context import EndOfRecording
-from fieldtwin.emulators.distorted_registers import DistortedRegisters
 from fieldtwin.emulators.emulator import EmulatedUnit
-from fieldtwin.emulators.endpoints.modbus_server import Latency, as_recorded, serve_mbap, serve_rtu, serve_udp
-from fieldtwin.emulators.endpoints.ports import CanPort, Listening, OnClient, OsPorts, Ports
+from fieldtwin.emulators.endpoints.ports import OsPorts, Ports
+from fieldtwin.emulators.host import EmulatorHost, ModbusWire
 from fieldtwin.emulators.journal import DeviceValueLog, share_of
-from fieldtwin.emulators.modbus.ascii import AsciiSlave
-from fieldtwin.emulators.modbus.bank import RegisterBank
-from fieldtwin.emulators.modbus.line import LineSlave
-from fieldtwin.emulators.modbus.mbap import MbapSlave
-from fieldtwin.emulators.modbus.rtu import RtuSlave
-from fieldtwin.emulators.modbus.unit import ModbusUnit, UnitLimits
+from fieldtwin.emulators.modbus.unit import ModbusUnit
+from fieldtwin.emulators.models.emulated_modbus import (
+    ConnectionKind,
+    EmulatedModbus,
+    mailbox_device,
+    recorded_device,
+    register_device,
+    sampled_device,
+    unit_limits,
+)
 from fieldtwin.emulators.models.emulated_node import NodeOptions, emulated_node
 from fieldtwin.emulators.models.mailbox_modem import MailboxModem, ModemPair
 from fieldtwin.emulators.models.packet_link import LinkImpairments, ModemEnd
-from fieldtwin.emulators.models.register_device import ProfileRegisters, add_own_functions
-from fieldtwin.emulators.models.sampled_sensor import SampledSensor
-from fieldtwin.emulators.models.simulated_registers import SimulatedRegisters
 from fieldtwin.emulators.recorded_device import RecordedDevice, load_replay
 from fieldtwin.emulators.replay.can_log import CanLog
 from fieldtwin.emulators.replay.replay import ExchangeReplay
 from fieldtwin.emulators.signals import SignalPlayer, Signals, SignalTrack
-from fieldtwin.emulators.stated import parts_of
 from fieldtwin.gateway.core.clock import NS_PER_MS, Clock
-from fieldtwin.gateway.core.concurrency.nursery import Nursery
-from fieldtwin.gateway.core.connection import ByteConnection, CanConnection, RS232Connection, TCPConnection
+from fieldtwin.gateway.core.connection import CanConnection, RS232Connection, TCPConnection
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.gateway.core.files.candump import SUFFIX
-from fieldtwin.gateway.core.files.profile import DeviceProfile
 from fieldtwin.gateway.devices.config import DeviceConfig
 from fieldtwin.twin.prototype.field_faults import FieldFaults
 from fieldtwin.twin.prototype.field_status import FieldStatus, SimulatedDeviceStatus
@@ -90,12 +85,6 @@ class FieldDevice:
         return {"requests": c.requests, "replies": c.replies, "exceptions": c.exceptions, "broadcasts": c.broadcasts}
 
 
-def _taken(units: Mapping[int, EmulatedUnit | RecordedDevice]) -> tuple[int, int]:
-    """Return the numbers of requests and replies of all units of a line so far."""
-    counters = [unit.counters for unit in units.values()]
-    return sum(c.requests for c in counters), sum(c.replies for c in counters)
-
-
 def _advised(remark: Remark) -> str:
     """Return a remark with the keys of the prototype file that can resolve it."""
     if remark.by_parameter_value:
@@ -131,14 +120,8 @@ class FieldSimulator:
         self.faults = FieldFaults(system, prototype.seed, clock)
         self._run_dir = run_dir
         self._clock = clock
-        self._nursery = Nursery()
         self._ports = ports or OsPorts()
-        self._listeners: list[Listening] = []
-        self._buses: list[CanPort] = []
-        self._can_ports: dict[str, CanPort] = {}
-        self._clients: dict[str, ClientCounts] = {}
-        self._lines: list[CountDifference] = []
-        self._connections: list[ByteConnection | CanConnection] = []
+        self._host = EmulatorHost(clock, self._ports)
         self._pairs: dict[str, ModemPair] = {}
         self._water = water or {}
         self._tracks: dict[Path, SignalTrack] = {}
@@ -165,23 +148,15 @@ class FieldSimulator:
 
     async def run(self) -> None:
         """Serve until cancelled. Raises any exception of an emulator."""
-        # Socket servers have no task in this nursery, so this task keeps it running.
-        self._nursery.start(asyncio.Event().wait(), "until cancelled")
-        try:
-            await self._nursery.wait()
-        finally:
-            await self.aclose()
+        await self._host.run()
 
     async def aclose(self) -> None:
         """Stop every emulator and close every connection."""
-        await self._nursery.__aexit__(None, None, None)
-        for listener in self._listeners:
-            await listener.aclose()
-        for connection in self._connections:
-            await connection.aclose()
-        self._listeners.clear()
-        self._buses.clear()
-        self._connections.clear()
+        await self._host.aclose()
+
+    async def join(self, bus: str, name: str) -> CanConnection:
+        """Join an emulated CAN bus as a passive listener. The caller closes the connection."""
+        return await self._host.join(bus, name)
 
     # -- wires ----------------------------------------------------------------------------------------------------------
 
@@ -190,141 +165,61 @@ class FieldSimulator:
         if listen.is_can:
             await self._open_can(bus, listen, on_it)
             return
-        units = {d.address: self._modbus_unit(d) for d in on_it}
-        stated_s = max((self.prototype.devices[d.name].form.latency_ms for d in on_it), default=0.0) / 1000
-        plant, echo = self.system.buses[bus.name].endpoint, self.system.buses[bus.name].echo
-        latency_s: float | Latency = stated_s
-        if not stated_s and any(isinstance(unit, RecordedDevice) for unit in units.values()):
-            latency_s = as_recorded(plant.serial if listen.scheme == "pty" and bus.pace else None)
         if listen.scheme == "pty":
-            pace = plant.serial if bus.pace else None
-            port, self.listening[bus.name] = await self._ports.serial(self._run_dir / listen.path, plant, pace)
-            end = self.faults.on_bytes(bus.name, port)
-            self._connections.append(end)
-            self._nursery.start(
-                serve_rtu(end, line_of(plant, units), self._clock, latency_s, echo=echo), f"emulators on {bus.name}"
-            )
-        elif listen.scheme == "udp":
-            datagrams = self.faults.on_datagrams(bus.name, await self._ports.datagrams(listen))
-            self._listeners.append(datagrams)
-            self.listening[bus.name] = datagrams.bound
-            serving = serve_udp(datagrams, MbapSlave(units), self._clock, latency_s, clients=self._counts(bus.name))
-            self._nursery.start(serving, f"emulators on {bus.name}")
-        elif plant.is_serial or plant.scheme == "rtu+tcp":
-            line, counted = line_of(plant, units), CountDifference(self._counts(bus.name), lambda: _taken(units))
-            self._lines.append(counted)
-
-            async def serve_line(end: ByteConnection, client: str) -> None:
-                counted.change(client)
-                try:
-                    await serve_rtu(end, line, self._clock, latency_s, echo=echo)
-                finally:
-                    counted.change("")
-
-            self.listening[bus.name] = await self._listen(listen, self._behind(bus.name, serve_line), 1)
-        else:
-            clients = self._counts(bus.name)
-
-            async def serve(end: ByteConnection, client: str) -> None:
-                counts = clients.of(client)
-                counts.open = True
-                try:
-                    await serve_mbap(end, MbapSlave(units, counts=counts), self._clock, latency_s)
-                finally:
-                    counts.open = False
-
-            self.listening[bus.name] = await self._listen(listen, self._behind(bus.name, serve))
+            listen = replace(listen, path=str(self._run_dir / listen.path))
+        wire = ModbusWire(
+            bus.name,
+            listen,
+            self.system.buses[bus.name].endpoint,
+            pace=bus.pace,
+            echo=self.system.buses[bus.name].echo,
+            latency_s=max((self.prototype.devices[d.name].form.latency_ms for d in on_it), default=0.0) / 1000,
+        )
+        units = {d.address: self._modbus_unit(d) for d in on_it}
+        self.listening[bus.name] = await self._host.serve_units(wire, units, self.faults.on_bus(bus.name))
         for device in on_it:
-            await self._open_far(device, stated_s)
-
-    def _counts(self, bus: str) -> ClientCounts:
-        return self._clients.setdefault(bus, ClientCounts())
-
-    def _behind(self, bus: str, serve: Callable[[ByteConnection, str], Awaitable[None]]) -> OnClient:
-        """Wrap `serve` so that clients connect through the faults of their bus. `serve` also gets each client's address."""
-
-        async def client(connection: ByteConnection) -> None:
-            if self.faults.refuses(bus):
-                return
-            end = self.faults.on_bytes(bus, connection)
-            try:
-                await serve(end, getattr(connection, "peer", "?"))
-            finally:
-                await end.aclose()
-
-        return client
-
-    async def _listen(self, endpoint: Endpoint, on_client: OnClient, max_clients: int = 32) -> Endpoint:
-        listener = await self._ports.listen(endpoint, on_client, max_clients)
-        self._listeners.append(listener)
-        return listener.bound
+            await self._open_far(device, wire.latency_s)
 
     async def _open_far(self, device: DeviceConfig, latency_s: float) -> None:
         """Open the far modem of a transmitter, on its own socket."""
-        pair, form = self._pairs.get(device.name), self.prototype.devices[device.name].form
-        if pair is None or form.far is None:
+        pair, emulated = self._pairs.get(device.name), self.prototype.devices[device.name]
+        if pair is None or emulated.form.far is None:
             return
-        unit = ModbusUnit(
-            pair.far, unit_limits(self.prototype.devices[device.name].profile), name=f"{device.name} (far)"
-        )
-        self.far_units[device.name] = unit
-        self.far[device.name] = await self._listen(
-            Endpoint.parse(form.far), lambda c: serve_mbap(c, MbapSlave({device.address: unit}), self._clock, latency_s)
-        )
+        name, listen = f"{device.name} (far)", Endpoint.parse(emulated.form.far)
+        unit = self.far_units[device.name] = ModbusUnit(pair.far, unit_limits(emulated.profile), name=name)
+        wire = ModbusWire(name, listen, plant=listen, latency_s=latency_s)
+        self.far[device.name] = await self._host.serve_units(wire, {device.address: unit})
 
     async def _open_can(self, bus: EmulatedBus, listen: Endpoint, on_it: list[DeviceConfig]) -> None:
-        bitrate = self.system.buses[bus.name].bitrate
-        nodes = [self._canopen_node(d) for d in on_it]
-        port = await self._ports.can_bus(listen, bitrate, paced=bus.pace)
-        self._listeners.append(port)
-        self._buses.append(port)
-        self._can_ports[bus.name] = port
+        nodes = {d.name: self._canopen_node(d) for d in on_it}
+        port = await self._ports.can_bus(listen, self.system.buses[bus.name].bitrate, paced=bus.pace)
         self.listening[bus.name] = port.bound
-        runner = port.runner
-        if runner is not None:
-            self.faults.on_wire(bus.name, runner.disturb, runner.undisturb)
-        connections = [self.faults.on_can(bus.name, await port.join(d.name), d.address) for d in on_it]
-        self._connections.extend(connections)
-        for device, node, connection in zip(on_it, nodes, connections, strict=True):
-            self._nursery.start(serve_node(connection, node, self._clock), f"node {device.name}")
-
-    async def join(self, bus: str, name: str) -> CanConnection:
-        """Join an emulated CAN bus as a passive listener. The caller closes the connection."""
-        for port in self._buses:
-            if port.bound == self.listening.get(bus):
-                return await port.join(name)
-        raise UsageError(f"no emulated CAN bus {bus!r}", expected=", ".join(str(p.bound) for p in self._buses) or "one")
+        if port.runner is not None:
+            self.faults.on_wire(bus.name, port.runner.disturb, port.runner.undisturb)
+        await self._host.serve_nodes(bus.name, port, nodes, self.faults.on_bus(bus.name))
 
     # -- devices --------------------------------------------------------------------------------------------------------
 
     def _modbus_unit(self, config: DeviceConfig) -> EmulatedUnit | RecordedDevice:
         emulated = self.prototype.devices[config.name]
-        unit = self._made_unit(config, emulated)
+        made = self._made_device(config, emulated)
         if emulated.form.busy is not None:
-            unit.be_busy_behind(emulated.form.busy.every, emulated.form.busy.for_ms * NS_PER_MS)
-        return unit
+            made.unit.be_busy_behind(emulated.form.busy.every, emulated.form.busy.for_ms * NS_PER_MS)
+        self.faults.on_values(config.name, made.distortions)
+        device = self.devices[config.name] = FieldDevice(emulated, made.unit, None)
+        device.journal = made.journal
+        return made.unit
 
-    def _made_unit(self, config: DeviceConfig, emulated: EmulatedDevice) -> EmulatedUnit | RecordedDevice:
-        if emulated.form.model == "mailbox":
-            modem = self._modem(config, emulated)
-            seen = DistortedRegisters(modem, modem.peek, emulated.profile, modem.journal)
-            unit = self._emulated_unit(config, seen, ())
-            self.faults.on_values(config.name, seen.distortions)
-            device = self.devices[config.name] = FieldDevice(emulated, unit, None)
-            device.journal = modem.journal
-            return unit
-        if emulated.form.model == "profile" or (emulated.form.simulation and emulated.profile.sampled is None):
-            return self._stated_unit(config, emulated)
-        if emulated.profile.sampled is None:
-            return self._recorded_unit(config, emulated)
-        player = self._signals(emulated)
-        bank = SampledSensor(emulated.profile, player, emulated.form.identity)
-        seen = DistortedRegisters(bank, bank.peek, emulated.profile, bank.journal, bank.own_tags, bank.distortions)
-        unit = self._emulated_unit(config, seen, player)
-        device = self.devices[config.name] = FieldDevice(emulated, unit, None)
-        device.journal = bank.journal
-        self.faults.on_values(config.name, bank.distortions)
-        return unit
+    def _made_device(self, config: DeviceConfig, emulated: EmulatedDevice) -> EmulatedModbus:
+        profile, form, kind = emulated.profile, emulated.form, self._kind(config)
+        if form.model == "mailbox":
+            return mailbox_device(profile, kind, self._modem(config, emulated), config.name)
+        if form.model == "profile" or (form.simulation and profile.sampled is None):
+            return self._register_device(config, emulated)
+        if profile.sampled is None:
+            replay, unit_id = self._replay(emulated)
+            return recorded_device(profile, kind, replay, unit_id, form.identity, config.name)
+        return sampled_device(profile, kind, self._signals(emulated), form.identity, config.name)
 
     def _modem(self, config: DeviceConfig, emulated: EmulatedDevice) -> MailboxModem:
         """Return a transmitter: in a network's acoustic channel, or with its own far modem and link."""
@@ -342,52 +237,34 @@ class FieldSimulator:
         )
         return pair.near
 
-    def _stated_unit(self, config: DeviceConfig, emulated: EmulatedDevice) -> EmulatedUnit:
+    def _register_device(self, config: DeviceConfig, emulated: EmulatedDevice) -> EmulatedModbus:
         """Return a device without a recording: its profile, and the values of its tags from the prototype file."""
-        tags = emulated.profile.tags
-        stated = {name: tags[name].number_of(value) for name, value in emulated.form.values.items()}
-        values = {**stated, **emulated.form.identity}
+        profile, form = emulated.profile, emulated.form
+        stated = {name: profile.tags[name].number_of(value) for name, value in form.values.items()}
         now_ns = self._clock.monotonic_ns()
+        signals = None if form.simulation is None else self._signals(emulated)
         try:
-            if emulated.form.simulation is None:
-                bank = ProfileRegisters(emulated.profile, values, now_ns)
-            else:
-                bank = SimulatedRegisters(emulated.profile, values, self._signals(emulated), now_ns)
+            return register_device(
+                profile, self._kind(config), {**stated, **form.identity}, now_ns, signals, config.name
+            )
         except FileInvalid as e:
             raise FileInvalid(
                 f"{config.name!r}: {e.message}", path=str(self.prototype.path), expected=e.expected, got=e.got
             ) from e
-        seen = DistortedRegisters(bank, bank.peek, emulated.profile, bank.journal)
-        unit = self._emulated_unit(config, seen, ())
-        self.faults.on_values(config.name, seen.distortions)
-        add_own_functions(unit, bank, emulated.profile)
-        device = self.devices[config.name] = FieldDevice(emulated, unit, None)
-        device.journal = bank.journal
-        return unit
 
-    def _recorded_unit(self, config: DeviceConfig, emulated: EmulatedDevice) -> RecordedDevice:
-        """Return a device that replays its recorded exchanges."""
+    def _replay(self, emulated: EmulatedDevice) -> tuple[ExchangeReplay, int]:
+        """Return a copy of the device's recording, and its unit ID there. Devices that share a recording read it once."""
         assert emulated.recording is not None
         profile, at_end = emulated.profile, EndOfRecording.parse(emulated.form.at_end)
         key = emulated.recording, profile.path, profile.hash, at_end
-        if key not in self._replays:  # a recording shared by many devices is read and kept in memory once
+        if key not in self._replays:
             self._replays[key] = load_replay(profile, emulated.recording, at_end)
         replay, unit_id = self._replays[key]
-        kind = self._kind(config)
-        unit = RecordedDevice(profile, replay.copy(), unit_id, kind, emulated.form.identity, config.name)
-        device = self.devices[config.name] = FieldDevice(emulated, unit, None)
-        device.journal = unit.journal
-        self.faults.on_values(config.name, unit.distortions)
-        return unit
+        return replay.copy(), unit_id
 
-    def _kind(self, config: DeviceConfig) -> type[RS232Connection] | type[TCPConnection]:
+    def _kind(self, config: DeviceConfig) -> ConnectionKind:
+        """Return the kind of the plant's connection, whatever carries the connection in this run."""
         return RS232Connection if self.system.buses[config.bus].endpoint.is_serial else TCPConnection
-
-    def _emulated_unit(self, config: DeviceConfig, bank: RegisterBank, context: Sized) -> EmulatedUnit:
-        """Return the device on a connection of the plant's kind, whatever carries that connection in this run."""
-        profile = self.prototype.devices[config.name].profile
-        limits, parts = unit_limits(profile), parts_of(profile)
-        return EmulatedUnit(bank, profile, self._kind(config), context, limits, config.name, parts)
 
     def _canopen_node(self, config: DeviceConfig) -> CanopenNode:
         emulated = self.prototype.devices[config.name]
@@ -437,18 +314,6 @@ class FieldSimulator:
             at_end=EndOfRecording.parse(form.at_end),
         )
 
-    def _clients_by_bus(self) -> dict[str, dict[str, dict[str, int]]]:
-        """Return, by bus and client, the requests that reached a device and their replies.
-
-        Kernel CAN buses and ptys are not included.
-        """
-        for line in self._lines:
-            line.settle()
-        found = {bus: counts.describe() for bus, counts in self._clients.items()}
-        for bus, port in self._can_ports.items():
-            found[bus] = port.stats().get("sdo_clients", {})
-        return found
-
     # -- what others see ------------------------------------------------------------------------------------------------
 
     def status(self) -> FieldStatus:
@@ -471,7 +336,7 @@ class FieldSimulator:
                 )
                 for name, d in self.devices.items()
             },
-            clients=self._clients_by_bus(),
+            clients={bus: clients for bus, clients in self._host.clients().items() if bus in self.listening},
             faults=self.faults.describe(),
             struck=self.faults.history.describe(),
             listening={bus: str(endpoint) for bus, endpoint in self.listening.items()},
@@ -484,7 +349,7 @@ class FieldSimulator:
                 }
                 for name, p in self._pairs.items()
             },
-            buses={str(bus.bound): stats for bus in self._buses if (stats := bus.stats())},
+            buses=self._host.can_stats(),
             set=self.faults.values_set(),
         )
 
@@ -494,14 +359,3 @@ class FieldSimulator:
             name: [(h.number, h.tag, h.raw.hex(), h.t_ns) for h in d.journal.since(numbers.get(name, 0))]
             for name, d in self.devices.items()
         }
-
-
-def line_of(plant: Endpoint, units: Mapping[int, ModbusUnit]) -> LineSlave:
-    """Return the units of a serial line, in the framing of the plant's endpoint."""
-    return AsciiSlave(units) if plant.scheme == "ascii" else RtuSlave(units)
-
-
-def unit_limits(profile: DeviceProfile) -> UnitLimits:
-    limits = profile.form.limits
-    functions = frozenset(limits.functions) if limits.functions is not None else UnitLimits().functions
-    return UnitLimits(functions=functions, read_registers=limits.read_registers, even_only=limits.even_only)

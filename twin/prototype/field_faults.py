@@ -12,21 +12,17 @@ from random import Random
 from typing import Any
 
 from fieldtwin.emulators.distortion import Distortions
-from fieldtwin.emulators.endpoints.faulty import FaultyEnd
-from fieldtwin.emulators.endpoints.faulty_can import FaultyCan, bus_rule
-from fieldtwin.emulators.endpoints.faulty_udp import FaultyDatagrams
-from fieldtwin.emulators.endpoints.ports import Datagrams
+from fieldtwin.emulators.endpoints.faulty_can import bus_rule
 from fieldtwin.emulators.faults.can_fault import BusFault
 from fieldtwin.emulators.faults.engine import WireFaults
 from fieldtwin.emulators.faults.fault import Active, Aim, ValueFault
-from fieldtwin.emulators.faults.frames import Framing, Way
+from fieldtwin.emulators.faults.frames import Way
 from fieldtwin.emulators.faults.schema import FaultSpec, parse_fault
 from fieldtwin.emulators.faults.values.set_value import Form, SetValue
 from fieldtwin.emulators.faults.values.value_ranges import check_value
+from fieldtwin.emulators.host import framing_of
 from fieldtwin.emulators.wires.can_faults import Rule
 from fieldtwin.gateway.core.clock import NS_PER_S, Clock
-from fieldtwin.gateway.core.connection import ByteConnection, CanConnection
-from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.twin.prototype.fault_aims import tag_of, target
 from fieldtwin.twin.prototype.fault_history import FaultHistory
@@ -57,17 +53,9 @@ class FieldFaults:
 
     # -- where faults can be --------------------------------------------------------------------------------------------
 
-    def on_bytes(self, bus: str, connection: ByteConnection) -> FaultyEnd:
-        """Return an emulator's end of a line or socket, with the faults of its bus applied."""
-        return FaultyEnd(connection, self._buses[bus])
-
-    def on_datagrams(self, bus: str, socket: Datagrams) -> FaultyDatagrams:
-        """Return an emulator's UDP socket, with the faults of its bus applied."""
-        return FaultyDatagrams(socket, self._buses[bus])
-
-    def on_can(self, bus: str, connection: CanConnection, node: int) -> FaultyCan:
-        """Return a node's end of a bus, with the faults of that bus applied."""
-        return FaultyCan(connection, self._buses[bus], node)
+    def on_bus(self, bus: str) -> WireFaults:
+        """Return the faults on the traffic of a bus."""
+        return self._buses[bus]
 
     def on_values(self, device: str, distortions: Distortions) -> None:
         """Register the distortions through which the values of `device` can be changed."""
@@ -76,10 +64,6 @@ class FieldFaults:
     def on_wire(self, bus: str, disturb: Callable[[Rule], None], undisturb: Callable[[Rule], None]) -> None:
         """Register a modelled CAN bus, on which bus errors can be injected."""
         self._disturb[bus], self._undisturb[bus] = disturb, undisturb
-
-    def refuses(self, bus: str) -> bool:
-        """Return whether new clients of the emulators of `bus` are refused now."""
-        return self._buses[bus].refuses(self._clock.monotonic_ns())
 
     def watch(self, told: Callable[[str, object, bool, bytes], None]) -> None:
         """Call `told` for the traffic on each line and socket from now on.
@@ -201,15 +185,6 @@ class FieldFaults:
             {"id": id, "name": spec.kind.name, "bus": bus, "device": spec.aim.device, "struck": active.struck}
             for id, (spec, active, bus) in self._active.items()
         ]
-
-
-def framing_of(endpoint: Endpoint) -> Framing:
-    """Return the framing of a bus."""
-    if endpoint.is_can:
-        return Framing.RAW
-    if endpoint.scheme == "ascii":
-        return Framing.ASCII
-    return Framing.RTU if endpoint.is_serial or endpoint.scheme == "rtu+tcp" else Framing.MBAP
 
 
 def _watcher(bus: str, told: Callable[[str, object, bool, bytes], None]) -> Callable[[object, Way, bytes], None]:

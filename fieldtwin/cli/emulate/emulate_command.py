@@ -160,8 +160,7 @@ def _extras(kind: str, path: Path, device: OneDeviceOptions, recording: Path | N
         unknown = next((name for name in held if name not in profile.tags), None)
         if unknown is not None:
             raise UsageError(f"{profile.name} has no tag {unknown!r}", expected=", ".join(profile.tags))
-    stated = held is not None
-    said = load_faults(Path(faults), lambda spec: check_device(spec, profile, values=stated)) if faults else ()
+    said = load_faults(Path(faults), lambda spec: check_device(spec, profile)) if faults else ()
     return Extras(held, said, device.seed, device.any_unit)
 
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
-from fieldtwin.emulators.endpoints.can_end import open_can_end
-from fieldtwin.gateway.core.connection import CanConnection
+from fieldtwin.emulators.endpoints.ports import CanPort, JoinedBus, ServedBus
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import EndpointBusy, Unreachable, UsageError
 
@@ -24,28 +23,19 @@ def only_bus(wires: Sequence[Endpoint]) -> Endpoint:
     return wires[0]
 
 
-async def stand_on_bus(
-    wire: Endpoint, bitrate: int | None, name: str, closing: list[SoftBusServer | CanConnection]
-) -> tuple[CanConnection, str]:
+async def open_bus(wire: Endpoint, bitrate: int | None) -> tuple[CanPort, str]:
     """Make the software bus at `wire` in this process, at `bitrate` bit/s.
 
-    If it exists already, or is a kernel bus, join it. Everything that is opened is added to `closing`. Returns the
-    connection and a description of its place. Raises `Unreachable`, `EndpointBusy`, or `UsageError` where a bus runs at
-    a bit rate other than the requested one (None: any).
+    If it exists already, or is a kernel bus, the returned port joins it. Returns the port and a description of its place.
+    Raises `Unreachable`, `EndpointBusy`, or `UsageError` where a bus runs at a bit rate other than the requested one
+    (None: any).
     """
     if wire.interface != "fieldtwin":
-        connection = await open_can_end(wire, bitrate or DEFAULT_BIT_RATE)
-        closing.append(connection)
-        return connection, str(wire)
+        return JoinedBus(wire, bitrate or DEFAULT_BIT_RATE), str(wire)
     try:
         made = await SoftBusServer.open(wire, bitrate or DEFAULT_BIT_RATE)
     except (EndpointBusy, Unreachable):  # another process listens there, or the address is another computer's
-        connection = await open_can_end(wire, bitrate or 0)
-        closing.append(connection)
-        return connection, f"{wire}, with others"
-    closing.append(made)
-    connection = made.attach(name)
-    closing.append(connection)
+        return JoinedBus(wire, bitrate or 0), f"{wire}, with others"
     host, port = made.bound.address
     look = f"python -m can.viewer -i fieldtwin -c {host}:{port}"
-    return connection, f"{made.bound}, a new bus with {made.bitrate} bit/s (watch it: {look})"
+    return ServedBus(made), f"{made.bound}, a new bus with {made.bitrate} bit/s (watch it: {look})"

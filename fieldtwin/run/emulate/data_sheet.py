@@ -12,20 +12,18 @@ from fieldtwin.emulators.canopen.dictionary import Dictionary, load_eds
 from fieldtwin.emulators.canopen.lss import UNCONFIGURED
 from fieldtwin.emulators.canopen.node import CanopenNode, NodeContext
 from fieldtwin.emulators.canopen.remarks import Remark
-from fieldtwin.emulators.canopen.serve import serve_node
-from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
+from fieldtwin.emulators.endpoints.ports import OsPorts
+from fieldtwin.emulators.host import EmulatorHost
 from fieldtwin.emulators.models.by_profile import model_for
 from fieldtwin.emulators.models.emulated_node import NodeOptions, node_remarks
 from fieldtwin.emulators.replay.can_log import CanLog
 from fieldtwin.emulators.replay.objects import recorded_objects
-from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.concurrency.stop_signal import stop_signal
-from fieldtwin.gateway.core.connection import CanConnection
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.wallclock import WallClock
-from fieldtwin.run.emulate.can_bus import only_bus, stand_on_bus
-from fieldtwin.run.processes.until_stopped import until_stopped
+from fieldtwin.run.emulate.can_bus import only_bus, open_bus
+from fieldtwin.run.emulate.serve_until import serve_until
 
 DEFAULT_NODE_ID = 1
 
@@ -54,17 +52,14 @@ async def run_data_sheet(
     node = _node(dictionary, node_id or dictionary.node_id or DEFAULT_NODE_ID, log, options)
     if log is None or options.model is not None:  # a node of a log is known by its recorded behaviour
         print_remarks(path.name, node_remarks(dictionary, node.node_id, node.context.model, options))
-    closing: list[SoftBusServer | CanConnection] = []
-    stop = stop_signal()
+    host, stop = EmulatorHost(WallClock(), OsPorts()), stop_signal()
     try:
-        async with Nursery() as nursery:  # inside: servers stop before their connections close
-            connection, where = await stand_on_bus(wire, bitrate or dictionary.bit_rate, path.stem, closing)
-            nursery.start(serve_node(connection, node, WallClock()), f"node on {wire}")
-            stderr.print(f"{_named(node)} on {where}", soft_wrap=True)
-            await until_stopped(nursery, stop)
+        port, where = await open_bus(wire, bitrate or dictionary.bit_rate)
+        await host.serve_nodes(str(wire), port, {path.stem: node})
+        stderr.print(f"{_named(node)} on {where}", soft_wrap=True)
+        await serve_until(stop, host)
     finally:
-        for thing in reversed(closing):
-            await thing.aclose()
+        await host.aclose()
     return 0
 
 

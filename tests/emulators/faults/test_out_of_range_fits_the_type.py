@@ -129,10 +129,10 @@ def test_an_explicit_value_that_does_not_fit_is_refused(tmp_path: Path, name: st
     file.write_text(f"faults:\n  - {{name: {name}, {said}}}\n")
     profile = load_profile(tmp_path / "tank.yaml")
     with pytest.raises(FileInvalid, match=message.replace("tank.", "")) as refused:  # fieldtwin emulate --faults
-        load_faults(file, lambda spec: check_device(spec, profile, values=True))
+        load_faults(file, lambda spec: check_device(spec, profile))
     assert "faults.yaml:2" in str(refused.value)
     with pytest.raises(UsageError):
-        check_device(parse_fault({"name": "out-of-range", "register": "step"}), profile, values=True)
+        check_device(parse_fault({"name": "out-of-range", "register": "step"}), profile)
 
 
 def test_a_value_too_large_for_bits_of_a_register_is_limited_and_does_not_wrap(tmp_path: Path) -> None:

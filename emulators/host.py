@@ -216,15 +216,17 @@ class EmulatorHost:
             await self.aclose()
 
     async def aclose(self) -> None:
-        """Stop every server, then close every connection."""
-        await self._nursery.__aexit__(None, None, None)
-        for listener in self._listeners:
-            await listener.aclose()
-        for connection in self._connections:
-            await connection.aclose()
-        self._listeners.clear()
-        self._can_ports.clear()
-        self._connections.clear()
+        """Stop every server, then close every connection. Raises the failure of a server."""
+        try:
+            await self._nursery.__aexit__(None, None, None)
+        finally:
+            for listener in self._listeners:
+                await listener.aclose()
+            for connection in self._connections:
+                await connection.aclose()
+            self._listeners.clear()
+            self._can_ports.clear()
+            self._connections.clear()
 
     def _counts(self, name: str) -> ClientCounts:
         return self._clients.setdefault(name, ClientCounts())

@@ -153,7 +153,7 @@ class NetworkBench:
         self._where[str(fault["id"])] = where
 
     async def struck(self) -> list[Struck]:
-        found = [struck_of(one) for one in self.faults.history.describe()]
+        found = [struck_of(one) for one in self.faults.history.struck()]
         for member, part in self.parts.items():
             found += [replace(one, on=f"{member}.{one.on}") for one in await part.bench.struck()]
         return found

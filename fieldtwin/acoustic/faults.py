@@ -20,6 +20,7 @@ from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.twin.prototype.fault_aims import known
 from fieldtwin.twin.prototype.fault_history import FaultHistory
+from fieldtwin.twin.prototype.field_status import ActiveFaultStatus
 
 MOST = 1_000
 MOST_AT_RANDOM = 500
@@ -75,10 +76,10 @@ class AcousticFaults:
         """Clear a fault. Does nothing if it is not active or its time is over."""
         self._wire.take_away(id)
 
-    def describe(self) -> list[dict[str, Any]]:
+    def active(self) -> list[ActiveFaultStatus]:
         """Return the active faults, and how often each struck."""
         return [
-            {"id": id, "name": active.fault.name, "bus": WATER, "device": active.aim.device, "struck": active.struck}
+            ActiveFaultStatus(id=id, name=active.fault.name, bus=WATER, device=active.aim.device, struck=active.struck)
             for id, active in self._wire.active.items()
         ]
 

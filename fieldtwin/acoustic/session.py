@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from fieldtwin.acoustic.faults import AcousticFaults
 from fieldtwin.acoustic.network import Network
 from fieldtwin.acoustic.schema import WATER
@@ -130,7 +132,7 @@ class NetworkSession(AsyncResource):
     def results(self) -> dict[str, Any]:
         """Return the counters of the acoustic channel, its faults, and what the topside modem sent and heard."""
         ship = self.topside.describe() if self.topside is not None else None
-        return {"water": self.counters(), "faults": self.faults.history.describe(), "ship": ship}
+        return {"water": self.counters(), "faults": msgspec.to_builtins(self.faults.history.struck()), "ship": ship}
 
     def counters(self) -> dict[str, dict[str, int]]:
         """Return the counters of each modem in the acoustic channel."""

@@ -10,6 +10,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from fieldtwin.acoustic.bench import MemberTrace, NetworkBench, Part
 from fieldtwin.acoustic.faults import AcousticFaults
 from fieldtwin.acoustic.network import Network
@@ -87,7 +89,7 @@ class VirtualNetwork(AsyncResource):
         """Return the counters of the acoustic channel, its faults, and what the topside modem sent and heard."""
         return {
             "water": {name: counters.as_dict() for name, counters in self.medium.counters.items()},
-            "faults": self.faults.history.describe(),
+            "faults": msgspec.to_builtins(self.faults.history.struck()),
             "ship": self.bench.topside.describe() if self.bench.topside is not None else None,
         }
 

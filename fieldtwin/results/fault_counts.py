@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 from fieldtwin.results.model import Struck
+from fieldtwin.twin.prototype.field_status import StruckStatus
 
 
-def struck_of(told: Mapping[str, Any]) -> Struck:
+def struck_of(told: StruckStatus) -> Struck:
     """Return one entry of a field simulator's history."""
-    return Struck(told["id"], told["name"], told["on"], told["struck"], told["optional"])
+    return Struck(told.id, told.name, told.on, told.struck, told.optional)

@@ -132,13 +132,13 @@ def _thread(before: PlantThreadStatus | None, now: PlantThreadStatus | None) -> 
 
 def _refused(before: GatewayStatus | None, now: GatewayStatus | None) -> list[Event]:
     """Yield writes that did not reach their device. As everywhere here, the fields contain no value."""
-    last = max((e["number"] for e in (before.refusals.entries if before is not None else [])), default=0)
+    last = max((e.number for e in (before.refusals.entries if before is not None else [])), default=0)
     found = []
     for entry in now.refusals.entries if now is not None else []:
-        if entry["number"] > last:
-            priority = Priority.WARNING if entry["fault"] else Priority.NOTICE
-            named = {"tag": entry["tag"], "cause": entry["cause"], "by": entry["by"], "place": entry["place"]}
-            text = f"{entry['tag']}: a write did not reach the device ({entry['cause']})"
+        if entry.number > last:
+            priority = Priority.WARNING if entry.fault else Priority.NOTICE
+            named = {"tag": entry.tag, "cause": entry.cause, "by": entry.by, "place": entry.place}
+            text = f"{entry.tag}: a write did not reach the device ({entry.cause})"
             found.append(Event(priority, "output_refused", text, named))
     return found
 

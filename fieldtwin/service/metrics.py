@@ -19,7 +19,7 @@ from fieldtwin.__about__ import __version__
 from fieldtwin.gateway.core.values import Quality
 from fieldtwin.gateway.protocols.canopen.sdo_channel import Counters as CanopenCounters
 from fieldtwin.gateway.protocols.modbus.client import ClientCounters
-from fieldtwin.gateway.runtime.gateway_status import GatewayStatus
+from fieldtwin.gateway.runtime.gateway_status import FrontStatus, GatewayStatus
 from fieldtwin.plc.status import PlcStatus, ScanStatus, Spread
 from fieldtwin.service.exposition import Family
 from fieldtwin.twin.thread.status import PlantThreadStatus
@@ -111,9 +111,8 @@ def _buses(page: Page, gateway: GatewayStatus) -> None:
         is_can = not isinstance(bus.not_produced, UnsetType)
         for event, count in (dict.fromkeys(ALWAYS["canopen" if is_can else "modbus"], 0) | bus.counters).items():
             events.add(count, bus=name, event=event)
-        if shape := bus.latency:
-            bounds = [ms / 1000 for ms in shape["bounds_ms"]]
-            latency.add_histogram(bounds, shape["counts"], shape["total_s"], bus=name)
+        bounds = [ms / 1000 for ms in bus.latency.bounds_ms]
+        latency.add_histogram(bounds, bus.latency.counts, bus.latency.total_s, bus=name)
         late.add(_set(bus.not_produced), bus=name)
 
 
@@ -137,7 +136,7 @@ def _devices(page: Page, gateway: GatewayStatus) -> None:
         boots.add(_set(device.boots), **labels)
         emcys.add(_set(device.emcys), **labels)
         if not isinstance(device.tpdos, UnsetType):
-            pdos.add(sum(t["frames"] for t in device.tpdos.values()), **labels, direction="in")
+            pdos.add(sum(t.frames for t in device.tpdos.values()), **labels, direction="in")
             pdos.add(_set(device.rpdos_sent), **labels, direction="out")
     page.gauge("devices", "Devices of the system.").add(len(devices))
     page.gauge("devices_online", "Devices that answer.").add(sum(d.online for d in devices.values()))
@@ -188,11 +187,11 @@ def _mailboxes(page: Page, gateway: GatewayStatus) -> None:
 def _masters(page: Page, gateway: GatewayStatus) -> None:
     """Add the clients' requests: servers and bridges."""
     counted = page.counter("server_events", "Counters of a server or bridge, by event.")
-    for kind, servers in (("serve", gateway.serve), ("bridge", gateway.bridge)):
+    fronts: list[tuple[str, Mapping[str, FrontStatus]]] = [("serve", gateway.serve), ("bridge", gateway.bridge)]
+    for kind, servers in fronts:
         for name, server in _some(servers):
-            for event, count in server.items():
-                if isinstance(count, int) and not isinstance(count, bool) and event != "unit":
-                    counted.add(count, kind=kind, name=name, event=event)
+            for event, count in server.counters.items():
+                counted.add(count, kind=kind, name=name, event=event)
 
 
 def _watchers(page: Page, gateway: GatewayStatus) -> None:

@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Sequence
 from typing import Any
 
-from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
+from fieldtwin.gateway.core.clock import NS_PER_MS
 
 RESPONSE_MS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
 """The limits of `response_times` in ms: from TCP on a switch to a slow serial line with a slow device."""
@@ -84,11 +84,6 @@ class Histogram:
             "above_1ms": self.share_above(NS_PER_MS),
             "max": self.max_ns / 1e3,
         }
-
-    def describe(self) -> dict[str, Any]:
-        """Return data for JSON: `bounds_ms` (the limits), `counts` (one more than limits) and `total_s`."""
-        bounds_ms = [ns // NS_PER_MS for ns in self.limits_ns]
-        return {"bounds_ms": bounds_ms, "counts": list(self.counts), "total_s": self.total_ns / NS_PER_S}
 
 
 def response_times() -> Histogram:

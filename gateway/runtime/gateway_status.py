@@ -14,6 +14,35 @@ from msgspec import UNSET, UnsetType
 Counts = dict[str, int]
 
 
+class EmcyStatus(msgspec.Struct, frozen=True, kw_only=True):
+    """An emergency message of a CANopen node (CiA 301, 7.2.7)."""
+
+    age_ms: int
+    code: str
+    """Emergency error code, such as ``8130h``."""
+    meaning: str
+    register: int | None
+    """Error register, object 1001h."""
+    vendor: str
+    """The manufacturer-specific bytes as hex."""
+
+
+class TpdoStatus(msgspec.Struct, frozen=True, kw_only=True):
+    """A transmit PDO of a node, with the frames received so far."""
+
+    cob_id: str
+    tags: list[str]
+    frames: int
+
+
+class LatencyStatus(msgspec.Struct, frozen=True, kw_only=True):
+    """Response times as counts by bucket. `bounds_ms` are the upper limits; `counts` has one more, for longer times."""
+
+    bounds_ms: list[int]
+    counts: list[int]
+    total_s: float
+
+
 class DeviceStatus(msgspec.Struct, frozen=True, kw_only=True):
     """A device as its driver sees it. Counters begin with the gateway."""
 
@@ -40,8 +69,9 @@ class DeviceStatus(msgspec.Struct, frozen=True, kw_only=True):
     emcys: int | UnsetType = UNSET
     emcy: list[str] | UnsetType = UNSET
     """Error codes that the node has sent and not reset, such as ``8130h``."""
-    emcy_log: list[dict[str, Any]] | UnsetType = UNSET
-    tpdos: dict[str, dict[str, Any]] | UnsetType = UNSET
+    emcy_log: list[EmcyStatus] | UnsetType = UNSET
+    tpdos: dict[str, TpdoStatus] | UnsetType = UNSET
+    """By number of the PDO."""
     rpdos: dict[str, list[str]] | UnsetType = UNSET
     rpdos_sent: int | UnsetType = UNSET
 
@@ -58,8 +88,8 @@ class BusStatus(msgspec.Struct, frozen=True, kw_only=True):
     error: str
     """Why the bus is not connected; empty while it is."""
     counters: Counts
-    latency: dict[str, Any]
-    """Response times (`Histogram.describe`)."""
+    latency: LatencyStatus
+    """Response times: from request to reply (Modbus), and of whole SDO transfers (CANopen)."""
     not_produced: int | UnsetType = UNSET
     """Of a CAN bus: SYNC, TIME and repeated RPDOs that could not be sent in their period."""
     sync_producers: str | UnsetType = UNSET
@@ -99,6 +129,26 @@ class WritesStatus(msgspec.Struct, frozen=True, kw_only=True):
     safe: bool
 
 
+class RefusalStatus(msgspec.Struct, frozen=True, kw_only=True):
+    """A write that did not reach its device (`fieldtwin.gateway.runtime.outputs.refusals.Refusal`). Times are monotonic."""
+
+    number: int
+    tag: str
+    first: Any
+    value: Any
+    cause: str
+    reason: str
+    by: str
+    t_ns: int
+    last_ns: int
+    count: int
+    program: str
+    place: str
+    fault: str
+    """What has to be corrected: "program", "device", or "" for nothing."""
+    standing: bool
+
+
 class RefusalsStatus(msgspec.Struct, frozen=True, kw_only=True):
     """The journal of writes that did not reach their device (`fieldtwin.gateway.runtime.outputs.refusals`)."""
 
@@ -108,8 +158,8 @@ class RefusalsStatus(msgspec.Struct, frozen=True, kw_only=True):
     faults: Counts
     """Refusals that are a fault of the program, and of the device."""
     counts: Counts
-    entries: list[dict[str, Any]]
-    """The entries that are kept (`Refusal.describe`)."""
+    entries: list[RefusalStatus]
+    """The entries that are kept."""
 
 
 class MailboxStatus(msgspec.Struct, frozen=True, kw_only=True):
@@ -122,6 +172,44 @@ class MailboxStatus(msgspec.Struct, frozen=True, kw_only=True):
     queued: int
     dropped: int
     commands_refused: int
+
+
+class FrontStatus(msgspec.Struct, frozen=True, kw_only=True):
+    """Where the gateway answers clients: a TCP port or a serial line."""
+
+    listening: str | None
+    """The URL that is open; None while it is not."""
+    error: str
+    """Why it is not open; empty while it is."""
+    counters: Counts
+    clients: list[str] = []
+    """The connected clients of a TCP port, as HOST:PORT."""
+
+
+class ServerStatus(FrontStatus, frozen=True, kw_only=True):
+    """A server of tags."""
+
+    unit: int
+    """The unit ID that it answers."""
+
+
+class BridgeStatus(FrontStatus, frozen=True, kw_only=True):
+    """A bridge to the units of buses."""
+
+    away: list[str]
+    """The units that did not answer and are not asked for a while, as BUS/UNIT."""
+
+
+class LearntStatus(msgspec.Struct, frozen=True, kw_only=True):
+    """Addresses at which a device refuses reads, as the gateway found them out."""
+
+    profile: str
+    gaps: list[str]
+    borders: list[str]
+    missing: list[str]
+    """Tags that the device does not have."""
+    line: str
+    """The line that replaces the `gaps` in the profile; "" if there is nothing to state."""
 
 
 class PlcSeen(msgspec.Struct, frozen=True, kw_only=True):
@@ -153,14 +241,13 @@ class GatewayStatus(msgspec.Struct, frozen=True, kw_only=True):
     refusals: RefusalsStatus
     mailboxes: dict[str, MailboxStatus]
     plc: PlcSeen
-    serve: dict[str, dict[str, Any]]
-    """By server: its address (`listening`), `error`, and counters."""
-    bridge: dict[str, dict[str, Any]]
+    serve: dict[str, ServerStatus]
+    bridge: dict[str, BridgeStatus]
     published: int
     logged: int
     log_dropped: int
-    learnt: dict[str, Any] = {}
-    """By device: gaps and limits that the gateway has found."""
+    learnt: dict[str, LearntStatus] = {}
+    """By device: the gaps that the gateway has found."""
     store_error: str = ""
     config: ConfigStatus | UnsetType = UNSET
 

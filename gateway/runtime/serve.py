@@ -11,7 +11,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
-from typing import Any, Literal, Protocol
+from typing import Literal, Protocol
 
 from fieldtwin.gateway.connections.listeners import TcpListener
 from fieldtwin.gateway.core.clock import Clock
@@ -36,6 +36,7 @@ from fieldtwin.gateway.runtime.audit_log import AuditLog
 from fieldtwin.gateway.runtime.bridge.audit import WriteRecord
 from fieldtwin.gateway.runtime.bridge.policy import EVERYONE, Network, within
 from fieldtwin.gateway.runtime.bridge.tcp import Answer, Caller, TcpFront
+from fieldtwin.gateway.runtime.gateway_status import ServerStatus
 from fieldtwin.gateway.runtime.serve_codec import REGISTERS, not_a_number, pack, unpack
 from fieldtwin.gateway.runtime.tags import TagTable
 
@@ -167,9 +168,16 @@ class TagServer:
         """Serve clients until cancelled."""
         await self.front.run()
 
-    def describe(self) -> dict[str, Any]:
-        """Return the server's part of the status."""
-        return {**self.front.describe(), **asdict(self.counters), "unit": self.config.unit}
+    def status(self) -> ServerStatus:
+        """Return where the server listens, its clients and its counters."""
+        front = self.front.status()
+        return ServerStatus(
+            listening=front.listening,
+            error=front.error,
+            clients=front.clients,
+            counters={**front.counters, **asdict(self.counters)},
+            unit=self.config.unit,
+        )
 
     # -- one request ------------------------------------------------------------------------------------------------
 

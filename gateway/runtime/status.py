@@ -12,7 +12,6 @@ from fieldtwin.gateway.runtime.gateway_status import (
     MailboxStatus,
     OutputStatus,
     PlcSeen,
-    RefusalsStatus,
     TagStatus,
     WritesStatus,
 )
@@ -44,7 +43,7 @@ def describe(gateway: Gateway, now_ns: int) -> GatewayStatus:
             superseded=outputs.superseded,
             safe=outputs.safe_active,
         ),
-        refusals=RefusalsStatus(**outputs.journal.describe()),
+        refusals=outputs.journal.status(),
         mailboxes={
             pump.driver.config.name: MailboxStatus(
                 received=pump.driver.received,
@@ -63,8 +62,8 @@ def describe(gateway: Gateway, now_ns: int) -> GatewayStatus:
             losses=gateway.plc_losses,
             stopped=gateway.exchange.plc_stopped,
         ),
-        serve={server.config.name: server.describe() for server in gateway.servers},
-        bridge={bridge.config.name: bridge.describe() for bridge in gateway.bridges},
+        serve={server.config.name: server.status() for server in gateway.servers},
+        bridge={bridge.config.name: bridge.status() for bridge in gateway.bridges},
         published=gateway.tags.published,
         logged=gateway.log.stored,
         log_dropped=gateway.log.dropped,

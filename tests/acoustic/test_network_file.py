@@ -13,6 +13,7 @@ from fieldtwin.acoustic.network import load_network
 from fieldtwin.cli.main import cli
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.scenarios.language.form import load_scenario
+from fieldtwin.twin.prototype.field_status import ActiveFaultStatus
 from fieldtwin.twin.site.groups import group_file
 from fieldtwin.twin.site.system import load_system
 
@@ -140,7 +141,7 @@ def test_faults_of_the_acoustic_channel_start_and_end() -> None:
     faults = AcousticFaults(load_network(SHIPPED).places, 1)
     assert faults.inject({"id": "deaf", "name": "drop", "bus": "water", "device": "east"}) == "deaf"
     assert [faults.spoils(5, listener, b"x") for listener in (1, 2, 3, 4)] == [False, False, True, False]
-    assert faults.describe() == [{"id": "deaf", "name": "drop", "bus": "water", "device": "east", "struck": 1}]
+    assert faults.active() == [ActiveFaultStatus(id="deaf", name="drop", bus="water", device="east", struck=1)]
     with pytest.raises(UsageError, match="already active"):
         faults.inject({"id": "deaf", "name": "drop", "bus": "water"})
     faults.clear("deaf")

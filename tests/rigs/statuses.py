@@ -9,7 +9,8 @@ import msgspec
 from fieldtwin.gateway.runtime.gateway_status import GatewayStatus
 
 DEVICE = {"bus": "line1", "address": 1, "online": True, "error": "", "identity_error": "", "polls": 0, "errors": 0}
-BUS = {"endpoint": "", "connected": True, "opens": 1, "local": [], "error": "", "counters": {}, "latency": {}}
+LATENCY = {"bounds_ms": [1], "counts": [0, 0], "total_s": 0.0}
+BUS = {"endpoint": "", "connected": True, "opens": 1, "local": [], "error": "", "counters": {}, "latency": LATENCY}
 TAG = {"value": None, "quality": "good", "reason": "none", "age_s": None}
 OUTPUT = {"wanted": None, "held": None, "by": "plc", "refused": False}
 MAILBOX = dict.fromkeys(("received", "sent", "taken", "waits", "queued", "dropped", "commands_refused"), 0)

@@ -6,6 +6,7 @@ import asyncio
 from dataclasses import replace
 from typing import Any
 
+import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -15,6 +16,7 @@ from support import run
 
 from fieldtwin.gateway.core.errors import EndpointBusy, UsageError
 from fieldtwin.gateway.core.histogram import RESPONSE_MS, response_times
+from fieldtwin.gateway.runtime.buses.bus import latency_status
 from fieldtwin.gateway.runtime.gateway_status import GatewayStatus
 from fieldtwin.plc.status import PlcStatus, Spread, TaskStatus
 from fieldtwin.service.exposition import CONTENT_TYPE, Family, render
@@ -33,14 +35,18 @@ def busy_gateway(devices: int = 1) -> GatewayStatus:
     latency.record(3_000_000)
     latency.record(9_000_000_000)
     counted = {"polls": 7, "errors": 2}
-    node = {"boots": 3, "emcys": 1, "tpdos": {"1": {"frames": 5}}, "rpdos_sent": 4}
+    node = {"boots": 3, "emcys": 1, "tpdos": {"1": {"cob_id": "185h", "tags": [], "frames": 5}}, "rpdos_sent": 4}
     return gateway_status(
         devices={
             **{f"ctd{i}": counted for i in range(devices)},
             "tilt": {**counted, **node, "bus": "can0", "online": False},
         },
         buses={
-            "line1": {"opens": 2, "counters": {"requests": 9, "timeouts": 1}, "latency": latency.describe()},
+            "line1": {
+                "opens": 2,
+                "counters": {"requests": 9, "timeouts": 1},
+                "latency": msgspec.to_builtins(latency_status(latency)),
+            },
             "can0": {
                 "connected": False,
                 "error": "down",
@@ -67,7 +73,7 @@ def busy_gateway(devices: int = 1) -> GatewayStatus:
             }
         },
         plc={"losses": 1},
-        serve={"hmi": {"listening": "tcp://x:1", "requests": 11, "clients": [], "unit": 1}},
+        serve={"hmi": {"listening": "tcp://x:1", "error": "", "counters": {"requests": 11}, "unit": 1}},
         published=83,
         logged=2,
         log_dropped=1,
@@ -194,7 +200,8 @@ def test_names_types_and_labels_are_those_that_dashboards_use() -> None:
 
 
 def test_bounds_of_buckets_are_written_as_dashboards_use_them() -> None:
-    buckets = [dict(labels)["le"] for name, labels in scraped(render(families(seen()))) if name.endswith("_bucket")]
+    labels = [dict(labels) for name, labels in scraped(render(families(seen()))) if name.endswith("_bucket")]
+    buckets = [found["le"] for found in labels if found["bus"] == "line1"]
     wanted = "0.001 0.002 0.005 0.01 0.02 0.05 0.1 0.2 0.5 1 2 5 +Inf"
     assert buckets == wanted.split()
 

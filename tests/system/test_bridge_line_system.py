@@ -104,8 +104,8 @@ def test_a_master_on_a_line_reaches_tcp_units_of_a_prototype(tmp_path: Path) -> 
         text = mbpoll(masters, 21, 34, "3")
         assert "Written 1 references" in text, text
         status = gateway("get")
-        assert status["bridge"]["door"]["requests"] == 3
-        assert status["bridge"]["door"]["noise_bytes"] == 0
+        assert status["bridge"]["door"]["counters"]["requests"] == 3
+        assert status["bridge"]["door"]["counters"]["noise_bytes"] == 0
         assert '"done"' in (tmp_path / "run" / "p" / "audit.jsonl").read_text("ascii")
         program.signal(signal.SIGINT)
         # 1: no message came from the remote client, and no program takes messages here
@@ -146,7 +146,7 @@ def use_the_plant(tmp_path: Path, system: Path, masters: Path) -> None:
         check_a_master(masters)
         assert "Illegal function" in mbpoll(masters, 21, 34, "3")  # a plant is read-only unless told otherwise
         status: dict[str, Any] = gateway("get")
-        assert status["bridge"]["door"]["refused"] == 1
+        assert status["bridge"]["door"]["counters"]["refused"] == 1
         program.signal(signal.SIGINT)
         assert program.wait(10) == 0, program.err
     no_tracebacks(tmp_path / "run")

@@ -53,9 +53,9 @@ def test_an_hmi_and_a_bridge_client_with_a_running_gateway(tmp_path: Path) -> No
         wait_for(lambda: gateway("get")["tags"]["ctd.pressure"]["quality"] == "good", 20)
         run(ask(gateway), timeout_s=30)
         status = gateway("get")
-        assert status["serve"]["hmi"]["reads"] > 0
-        assert status["bridge"]["door"]["no_path"] == 1
-        assert status["bridge"]["door"]["refused"] == 1
+        assert status["serve"]["hmi"]["counters"]["reads"] > 0
+        assert status["bridge"]["door"]["counters"]["no_path"] == 1
+        assert status["bridge"]["door"]["counters"]["refused"] == 1
         hmi = status["serve"]["hmi"]["listening"]
         assert not hmi.endswith(":1502")  # a prototype takes free ports
         wait_for(lambda: f"serve hmi  ←  {hmi}" in program.err, 5)

@@ -141,7 +141,7 @@ def test_a_client_without_our_certificate_is_refused(pki: Pki, tmp_path: Path) -
             writer.write(bytes.fromhex("0001 0000 0006 01 03 0000 0001"))  # Modbus without TLS
             assert (await reader.read(64))[:1] in (b"", b"\x15")  # closed, or a TLS alert
             writer.close()
-            await eventually(lambda: b.front.describe()["unshaken"] == 3)
+            await eventually(lambda: b.front.status().counters["unshaken"] == 3)
             async with client(pki, "plain", port) as good:
                 assert (await good.read_registers(1, "holding", 0, 1)).registers == (7,)
             assert b.counters.requests == 1

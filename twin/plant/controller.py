@@ -26,7 +26,7 @@ from fieldtwin.gateway.core.control import ControlServer
 from fieldtwin.gateway.core.errors import Unreachable, UsageError
 from fieldtwin.gateway.devices.register_device import RegisterDriver
 from fieldtwin.gateway.runtime.audit_log import AuditLog
-from fieldtwin.gateway.runtime.buses.learnt_gaps import LearntFile, describe_learnt
+from fieldtwin.gateway.runtime.buses.learnt_gaps import LearntFile, learnt_statuses
 from fieldtwin.gateway.runtime.gateway_status import ConfigStatus, GatewayStatus, StoppedGateway
 from fieldtwin.gateway.runtime.mailboxes.acked_commands import AckedCommandStore
 from fieldtwin.gateway.runtime.reconfigure import reconfigure
@@ -195,7 +195,7 @@ class GatewayProcess:
     def _status(self) -> GatewayStatus:
         return msgspec.structs.replace(
             describe(self._gateway, self._clock.monotonic_ns()),
-            learnt=describe_learnt(self._gateway.drivers.values()),
+            learnt=learnt_statuses(self._gateway.drivers.values()),
             store_error=self._store_error,
             config=ConfigStatus(
                 system=self._system.name, hash=self._system.hash, reloads=self._reloads, changed=self._changed

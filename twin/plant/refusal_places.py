@@ -12,6 +12,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from msgspec.structs import asdict
+
 from fieldtwin.gateway.core.control import ControlClient
 from fieldtwin.gateway.core.errors import FieldtwinError
 from fieldtwin.gateway.runtime.outputs.refusals import Refusal, Refusals
@@ -49,7 +51,7 @@ class RefusalPlaces:
     def _complete(self, entry: Refusal, program: str, place: str) -> None:
         self._journal.placed(entry.number, program, place)
         if self._tell is not None:
-            self._tell(entry.describe())
+            self._tell(asdict(entry.status()))
 
     async def run(self) -> None:
         """Look up lines until cancelled."""

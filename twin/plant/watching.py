@@ -60,7 +60,7 @@ class TagWatch:
             "changes": self._after(since),
             "dropped": max(0, oldest - since - 1),
             "tags": {name: _shown(self._tags.current(name, now_ns)) for name in names},
-            "refusals": [r.describe() for r in self._journal.since(refused)] if self._journal is not None else [],
+            "refusals": [r.status() for r in self._journal.since(refused)] if self._journal is not None else [],
         }
 
     def _after(self, since: int) -> list[Change]:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections import deque
-from typing import Any
 
 from fieldtwin.emulators.faults.fault import Active
+from fieldtwin.twin.prototype.field_status import StruckStatus
 
 MOST = 10_000
 """Number of faults that are remembered; the oldest are forgotten."""
@@ -24,18 +24,16 @@ class FaultHistory:
         self.count += 1
         self._put_in.append((self.count, active, on))
 
-    def describe(self) -> list[dict[str, Any]]:
-        """Return, for each fault, its number (from 1), id, name, device or bus, how often it struck, and whether it is
-        optional.
-        """
+    def struck(self) -> list[StruckStatus]:
+        """Return how often each fault took effect."""
         return [
-            {
-                "number": number,
-                "id": active.id,
-                "name": active.fault.name,
-                "on": on,
-                "struck": active.struck,
-                "optional": active.aim.optional,
-            }
+            StruckStatus(
+                number=number,
+                id=active.id,
+                name=active.fault.name,
+                on=on,
+                struck=active.struck,
+                optional=active.aim.optional,
+            )
             for number, active, on in self._put_in
         ]

@@ -337,8 +337,8 @@ class FieldSimulator:
                 for name, d in self.devices.items()
             },
             clients={bus: clients for bus, clients in self._host.clients().items() if bus in self.listening},
-            faults=self.faults.describe(),
-            struck=self.faults.history.describe(),
+            faults=self.faults.active(),
+            struck=self.faults.history.struck(),
             listening={bus: str(endpoint) for bus, endpoint in self.listening.items()},
             far={device: str(endpoint) for device, endpoint in self.far.items()},
             links={

@@ -26,6 +26,7 @@ from fieldtwin.gateway.core.clock import NS_PER_S, Clock
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.twin.prototype.fault_aims import tag_of, target
 from fieldtwin.twin.prototype.fault_history import FaultHistory
+from fieldtwin.twin.prototype.field_status import ActiveFaultStatus
 from fieldtwin.twin.site.system import System
 
 MOST = 1_000
@@ -179,10 +180,10 @@ class FieldFaults:
         """Return the ids of the active faults."""
         return list(self._active)
 
-    def describe(self) -> list[dict[str, Any]]:
+    def active(self) -> list[ActiveFaultStatus]:
         """Return the active faults, and how often each struck."""
         return [
-            {"id": id, "name": spec.kind.name, "bus": bus, "device": spec.aim.device, "struck": active.struck}
+            ActiveFaultStatus(id=id, name=spec.kind.name, bus=bus, device=spec.aim.device, struck=active.struck)
             for id, (spec, active, bus) in self._active.items()
         ]
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.twin.prototype.field_status import HeldLease, LeaseStatus
 
 if TYPE_CHECKING:  # a test runner on a plant imports LEASE_S without emulators
     from fieldtwin.twin.prototype.field_faults import FieldFaults
@@ -126,15 +127,15 @@ class FieldLeases:
         if self._lease is not None:
             self._lease = _Lease(self._lease.id, self._lease.until_ns)
 
-    def describe(self, now_ns: int) -> dict[str, Any]:
+    def status(self, now_ns: int) -> LeaseStatus:
         """Return the lease's state for the control channel."""
         lease = self._lease
         held = None
         if lease is not None:
             left_s = max(0.0, (lease.until_ns - now_ns) / NS_PER_S)
             sets = [f"{device}.{tag}" for device, tag in lease.before]
-            held = {"id": lease.id, "left_s": round(left_s, 3), "faults": sorted(lease.faults), "set": sets}
-        return {"held": held, "expired": self.expired}
+            held = HeldLease(id=lease.id, left_s=round(left_s, 3), faults=sorted(lease.faults), set=sets)
+        return LeaseStatus(held=held, expired=self.expired)
 
 
 def _duration_ns(for_s: float) -> int:

@@ -240,7 +240,7 @@ class FieldProcess:
         return {"ready": True, "pid": os.getpid()}
 
     async def _get(self, args: dict[str, Any]) -> FieldStatus:
-        lease = self._leases.describe(self._clock.monotonic_ns())
+        lease = self._leases.status(self._clock.monotonic_ns())
         return msgspec.structs.replace(self._field.status(), life=self._life, lease=lease)
 
     async def _held(self, args: dict[str, Any]) -> dict[str, Any]:
@@ -262,11 +262,11 @@ class FieldProcess:
         else:
             id = self._field.faults.inject(said, start_ns)
         faults = self._field.faults
-        return {"id": id, "number": faults.history.count, "faults": faults.describe()}
+        return {"id": id, "number": faults.history.count, "faults": faults.active()}
 
     async def _clear(self, args: dict[str, Any]) -> dict[str, Any]:
         self._field.faults.clear(str(args.get("id", "")))
-        return {"faults": self._field.faults.describe()}
+        return {"faults": self._field.faults.active()}
 
     async def _set(self, args: dict[str, Any]) -> dict[str, Any]:
         device, tag, value = str(args.get("device", "")), str(args.get("tag", "")), args.get("value")
@@ -291,8 +291,8 @@ class FieldProcess:
         faults = self._field.faults
         return {
             "life": self._life,
-            "lease": self._leases.describe(now_ns),
-            "faults": faults.describe(),
+            "lease": self._leases.status(now_ns),
+            "faults": faults.active(),
             "set": faults.values_set(),
         }
 

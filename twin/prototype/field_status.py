@@ -36,6 +36,47 @@ class SimulatedDeviceStatus(msgspec.Struct, frozen=True, kw_only=True):
     """The number of those values that were dropped from the journal."""
 
 
+class ActiveFaultStatus(msgspec.Struct, frozen=True, kw_only=True):
+    """A fault that is injected now. `bus` or `device` is empty if the fault is not aimed at one."""
+
+    id: str
+    name: str
+    bus: str
+    device: str
+    struck: int
+    """How often it took effect."""
+
+
+class StruckStatus(msgspec.Struct, frozen=True, kw_only=True):
+    """A fault that was injected, and how often it took effect."""
+
+    number: int
+    """Its position among all faults of these devices, from 1."""
+    id: str
+    name: str
+    on: str
+    """The device or bus."""
+    struck: int
+    optional: bool
+    """Whether a scenario may pass although the fault never took effect."""
+
+
+class HeldLease(msgspec.Struct, frozen=True, kw_only=True):
+    """The lease of a test runner: its faults and the values that it has set, by DEVICE.TAG, are removed when it ends."""
+
+    id: str
+    left_s: float
+    faults: list[str]
+    set: list[str]
+
+
+class LeaseStatus(msgspec.Struct, frozen=True, kw_only=True):
+    """The present lease, and the number of leases that ended because they were not prolonged."""
+
+    held: HeldLease | None = None
+    expired: int = 0
+
+
 class FieldStatus(msgspec.Struct, frozen=True, kw_only=True):
     """All simulated devices of a system, and the faults on them."""
 
@@ -46,10 +87,9 @@ class FieldStatus(msgspec.Struct, frozen=True, kw_only=True):
     devices: dict[str, SimulatedDeviceStatus]
     clients: dict[str, dict[str, Counts]] = {}
     """By bus and client: the requests that reached a device, and the replies."""
-    faults: list[dict[str, Any]] = []
-    """The active faults (`FieldFaults.describe`)."""
-    struck: list[dict[str, Any]] = []
-    """Every fault so far (`FaultHistory.describe`)."""
+    faults: list[ActiveFaultStatus] = []
+    struck: list[StruckStatus] = []
+    """Every fault so far, the first one first."""
     listening: dict[str, str] = {}
     """By bus: the URL at which its simulated devices listen."""
     far: dict[str, str] = {}
@@ -57,8 +97,7 @@ class FieldStatus(msgspec.Struct, frozen=True, kw_only=True):
     links: dict[str, Counts] = {}
     """By transmitter: messages sent, sent again and delivered over the modems' link."""
     buses: dict[str, dict[str, Any]] = {}
-    """By URL: the statistics of a CAN bus that this process serves."""
-    set: dict[str, Any] = {}
+    """By URL: the statistics of a CAN bus that this process serves (`SoftBusServer.bus_stats`)."""
+    set: dict[str, float] = {}
     """The values that were set by hand or by a test, by DEVICE.TAG."""
-    lease: dict[str, Any] = {}
-    """The lease of a test runner (`FieldLeases.describe`)."""
+    lease: LeaseStatus = LeaseStatus()

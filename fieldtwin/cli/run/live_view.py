@@ -10,6 +10,7 @@ from itertools import islice
 from types import TracebackType
 from typing import Any
 
+import msgspec
 from rich.console import Group, RenderableType
 from rich.live import Live
 from rich.markup import escape
@@ -18,10 +19,11 @@ from rich.text import Text
 
 from fieldtwin.cli.run.plc_views import acts_text, waiting_texts, without_texts
 from fieldtwin.console import stderr, stdout
-from fieldtwin.gateway.runtime.gateway_status import BusStatus, GatewayStatus
+from fieldtwin.gateway.runtime.gateway_status import BusStatus, FrontStatus, GatewayStatus
 from fieldtwin.plc.status import PlcStatus
 from fieldtwin.results.trace import refusal_text
 from fieldtwin.run.live.session import RunSession
+from fieldtwin.twin.prototype.field_status import StruckStatus
 
 COLOUR = {"good": "green", "uncertain": "yellow", "bad": "red", "substituted": "magenta", "simulated": "cyan"}
 REFRESH_S = 0.25
@@ -127,10 +129,10 @@ class LiveView:
 
 def ports(session: RunSession) -> list[str]:
     """Return where the gateway serves tags and lets clients reach units."""
-    return [f"{kind} {name}  ←  {front['listening']}" for kind, name, front in _fronts(session) if front["listening"]]
+    return [f"{kind} {name}  ←  {front.listening}" for kind, name, front in _fronts(session) if front.listening]
 
 
-def _fronts(session: RunSession) -> list[tuple[str, str, dict[str, Any]]]:
+def _fronts(session: RunSession) -> list[tuple[str, str, FrontStatus]]:
     """Return kind, name and status of each server and bridge."""
     gateway = session.gateway_status
     if gateway is None:
@@ -154,7 +156,7 @@ def troubles(session: RunSession) -> list[str]:
         found.append(trouble)
     closed = {name: bus.error for name, bus in (gateway.buses if gateway else {}).items() if bus.error}
     found += [f"{name}: {error}" for name, error in closed.items()]
-    found += [f"{kind} {name}: {front['error']}" for kind, name, front in _fronts(session) if front["error"]]
+    found += [f"{kind} {name}: {front.error}" for kind, name, front in _fronts(session) if front.error]
     for name, device in (gateway.devices if gateway else {}).items():
         if device.error and device.error != closed.get(device.bus):
             found.append(f"{name}: {device.error}")
@@ -173,9 +175,9 @@ def refused(gateway: GatewayStatus) -> list[str]:
 
     In a read-only plant one line stands for all outputs that are not written by design.
     """
-    entries = [e for e in gateway.refusals.entries if e["standing"]]
-    by_design = {e["tag"] for e in entries if e["cause"] == READ_ONLY}
-    found = [refusal_text(e["tag"], e) for e in entries if e["cause"] != READ_ONLY]
+    entries = [e for e in gateway.refusals.entries if e.standing]
+    by_design = {e.tag for e in entries if e.cause == READ_ONLY}
+    found = [refusal_text(e.tag, msgspec.structs.asdict(e)) for e in entries if e.cause != READ_ONLY]
     if by_design:
         found.append(f"read-only plant: {', '.join(sorted(by_design))} not written (--allow-writes)")
     return found
@@ -425,8 +427,8 @@ def print_faults(faults: list[dict[str, Any]]) -> None:
     """Print how often each fault of a run took effect."""
     from fieldtwin.results.fault_counts import struck_of
 
-    for fault in faults[:MOST_FAULTS]:
-        colour = "yellow" if not fault["struck"] and not fault["optional"] else "default"
+    for fault in msgspec.convert(faults[:MOST_FAULTS], list[StruckStatus]):
+        colour = "yellow" if not fault.struck and not fault.optional else "default"
         stdout.print(
             f"  [{colour}]fault[/{colour}]          {escape(struck_of(fault).text)}", soft_wrap=True, highlight=False
         )

@@ -55,6 +55,7 @@ def command(
     from fieldtwin.run.processes.with_program import run_with
     from fieldtwin.run.template import system_file
     from fieldtwin.twin.prototype.field_process import FieldConfig
+    from fieldtwin.twin.prototype.field_status import StruckStatus
     from fieldtwin.twin.site.system import load_system
 
     words = argv[1:] if argv[:1] == ("--",) else argv
@@ -90,7 +91,7 @@ def command(
                 continue
             stderr.print(f"  {name}={escape(value)}", soft_wrap=True)
 
-    def tell_struck(struck: list[dict[str, Any]]) -> None:
+    def tell_struck(struck: list[StruckStatus]) -> None:
         if not quiet:
             for one in struck:
                 stderr.print(f"fault {struck_of(one).text}", soft_wrap=True, markup=False, highlight=False)

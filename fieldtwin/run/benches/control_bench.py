@@ -19,6 +19,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from fieldtwin.conformance.core.case import Impact
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.concurrency.async_resource import AsyncResource
@@ -46,7 +48,7 @@ from fieldtwin.run.processes.with_program import environment_from
 from fieldtwin.scenarios.bench import Can, Stopped, TagReading, variable
 from fieldtwin.scenarios.language.probe_form import Probe
 from fieldtwin.twin.plant.physical import attached, gateway_lost_ms, image_layout
-from fieldtwin.twin.prototype.field_status import FieldStatus
+from fieldtwin.twin.prototype.field_status import FieldStatus, StruckStatus
 from fieldtwin.twin.site.system import System
 
 PLC_EVERY_S = 0.25
@@ -253,7 +255,7 @@ class ControlBench(AsyncResource):
         """Return the endpoint at which the gateway serves `name` of the system file; wait until it does."""
         assert self._gateway is not None
         until_s = self.now_s() + SERVED_WITHIN_S
-        while not (listening := (await self._gateway.ask("get", GatewayStatus)).serve[name]["listening"]):
+        while not (listening := (await self._gateway.ask("get", GatewayStatus)).serve[name].listening):
             if self.now_s() > until_s:
                 raise Unreachable(f"the gateway does not serve {name!r}")
             await asyncio.sleep(SERVED_LOOK_S)
@@ -341,8 +343,8 @@ class ControlBench(AsyncResource):
     async def struck(self) -> list[Struck]:
         if not self._fault_numbers:
             return []
-        told = (await self._to_field("get"))["struck"]
-        return [struck_of(one) for one in told if one["number"] in self._fault_numbers]
+        told = msgspec.convert((await self._to_field("get"))["struck"], list[StruckStatus])
+        return [struck_of(one) for one in told if one.number in self._fault_numbers]
 
     async def clear(self, id: str) -> None:
         await self._to_field("clear", id=id)

@@ -10,6 +10,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from msgspec.structs import asdict
+
 from fieldtwin.conformance.core.case import Impact
 from fieldtwin.emulators.models.packet_link import ModemEnd
 from fieldtwin.emulators.virtual.loop import VirtualLoop
@@ -165,7 +167,7 @@ class VirtualBench(AsyncResource):
         self.note(Kind.STATE, change.tag, {"value": self._named(change.tag, change.after)})
 
     def _refused(self, entry: Refusal) -> None:
-        self.note(Kind.REFUSED, entry.tag, refusal_data(entry.describe()))
+        self.note(Kind.REFUSED, entry.tag, refusal_data(asdict(entry.status())))
 
     def _named(self, tag: str, value: Any) -> Any:
         """Return a value; a state is replaced by its name."""
@@ -253,7 +255,7 @@ class VirtualBench(AsyncResource):
         self.note(Kind.FAULT, id, {"name": fault["name"], "on": True, "target": target, "said": fault})
 
     async def struck(self) -> list[Struck]:
-        return [struck_of(one) for one in self.run.field.faults.history.describe()]
+        return [struck_of(one) for one in self.run.field.faults.history.struck()]
 
     async def clear(self, id: str) -> None:
         self.run.field.faults.clear(id)

@@ -12,6 +12,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import msgspec
+
 from fieldtwin.gateway.connections.os_connector import OsConnector
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.concurrency.nursery import Nursery
@@ -120,7 +122,9 @@ async def run_bridge(options: BridgeOptions, say: Callable[[str], None]) -> dict
                     await asyncio.wait([stopping, failing], return_when=asyncio.FIRST_COMPLETED)
                     if failing.done():
                         failing.result()
-                    return {**bridge.describe(), "target": dict(bus.totals()), "target_error": bus.error}
+                    status = msgspec.to_builtins(bridge.status())
+                    counters = status.pop("counters")
+                    return {**status, **counters, "target": dict(bus.totals()), "target_error": bus.error}
                 finally:
                     failing.cancel()
         finally:

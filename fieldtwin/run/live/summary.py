@@ -103,7 +103,7 @@ def summarise(run: RunFacts) -> dict[str, Any]:
         "states": {program: list(seen) for program, seen in run.states.sequences.items()},
         "transitions": {p: [[round(t, 3), s] for t, s in seen] for p, seen in run.states.transitions.items()},
         "exchanges": exchanges,
-        "faults": field.struck if field is not None else [],
+        "faults": msgspec.to_builtins(field.struck) if field is not None else [],
         "published": {"values": seen.get("published"), **run.published},
         "mailboxes": seen.get("mailboxes", {}),
         "topside": run.topside,
@@ -112,7 +112,7 @@ def summarise(run: RunFacts) -> dict[str, Any]:
         "learnt": seen.get("learnt", {}),
         "logged": seen.get("logged", 0),
         "writes": seen.get("writes", {}),
-        "refused": gateway.refusals.entries if gateway is not None else [],
+        "refused": msgspec.to_builtins(gateway.refusals.entries) if gateway is not None else [],
         "invariants": list(run.invariants),
         "outputs_safe": run.outputs_confirmed_safe,
         "plc": {
@@ -282,8 +282,8 @@ def _refusal_checks(refusals: RefusalsStatus, expected: Collection[str], *, dist
     found: dict[tuple[str, str, str], str] = {}
     faults = ("program",) if disturbed else ("program", "device")
     for entry in refusals.entries:
-        if entry["fault"] in faults and entry["tag"] not in expected:
-            found[entry["tag"], entry["cause"], entry["place"]] = refusal_text(entry["tag"], entry)
+        if entry.fault in faults and entry.tag not in expected:
+            found[entry.tag, entry.cause, entry.place] = refusal_text(entry.tag, msgspec.structs.asdict(entry))
     told = list(found.values())
     if len(told) > MOST_REFUSED:
         told[MOST_REFUSED:] = [f"{len(told) - MOST_REFUSED} more outputs were refused"]

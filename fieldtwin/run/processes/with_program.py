@@ -27,7 +27,7 @@ from fieldtwin.run.processes.field_contact import FieldContact, contact_here, re
 from fieldtwin.twin.plant.instance import Instance
 from fieldtwin.twin.plant.mapping import mapped_endpoint
 from fieldtwin.twin.prototype.field_process import FieldConfig, resolve
-from fieldtwin.twin.prototype.field_status import FieldStatus
+from fieldtwin.twin.prototype.field_status import FieldStatus, StruckStatus
 from fieldtwin.twin.prototype.prototype import DigitalTwinPrototype
 from fieldtwin.twin.site.resolved import write_resolved
 from fieldtwin.twin.site.system import System
@@ -102,7 +102,7 @@ async def run_with(
     instance: str = "",
     faults: Sequence[dict[str, Any]] = (),
     tell: Tell,
-    tell_struck: Callable[[list[dict[str, Any]]], None] = lambda struck: None,
+    tell_struck: Callable[[list[StruckStatus]], None] = lambda struck: None,
 ) -> int:
     """Start the field simulator of `config`, run `argv`, and stop both. Return the exit status of `argv`.
 
@@ -142,7 +142,7 @@ async def _inside(
     argv: list[str],
     faults: Sequence[dict[str, Any]],
     tell: Tell,
-    tell_struck: Callable[[list[dict[str, Any]]], None],
+    tell_struck: Callable[[list[StruckStatus]], None],
 ) -> int:
     system = twin.ecs.system
     resolved = write_resolved(home.path("prototype.pickle"), system, twin.prototype)

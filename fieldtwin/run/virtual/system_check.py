@@ -18,7 +18,7 @@ from fieldtwin.gateway.core.concurrency.nursery import Nursery
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.statemachine import encode_period
 from fieldtwin.gateway.core.values import Quality, TagValue
-from fieldtwin.gateway.runtime.buses.learnt_gaps import describe_learnt
+from fieldtwin.gateway.runtime.buses.learnt_gaps import learnt_statuses
 from fieldtwin.gateway.runtime.gateway import stale_limits
 from fieldtwin.gateway.runtime.gateway_status import GatewayStatus, OutputStatus
 from fieldtwin.gateway.runtime.status import describe
@@ -213,7 +213,7 @@ class SystemCheck:
     def _take_status(self, bench: VirtualBench, outputs: list[OutputStatus]) -> None:
         now_ns = bench.loop.now_ns
         gateway, plc = bench.run.gateway, bench.run.plc
-        learnt = describe_learnt(gateway.drivers.values())
+        learnt = learnt_statuses(gateway.drivers.values())
         self.gateway_status = replace(describe(gateway, now_ns), outputs=outputs, learnt=learnt)
         self.plc_status = plc.status()
         self.field_status = bench.run.field.status()

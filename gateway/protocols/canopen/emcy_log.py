@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 
-from fieldtwin.gateway.core.clock import NS_PER_MS
 from fieldtwin.gateway.protocols.canopen.emcy import Emcy
 
 MAX_ENTRIES = 32
@@ -55,19 +54,6 @@ class EmcyLog:
     def entries(self) -> tuple[EmcyEntry, ...]:
         """Return the entries, newest first, as in 1003h."""
         return tuple(reversed(self._entries))
-
-    def describe(self, now_ns: int) -> list[dict[str, object]]:
-        """Return the entries as plain data, newest first."""
-        return [
-            {
-                "age_ms": (now_ns - entry.t_ns) // NS_PER_MS,
-                "code": f"{entry.emcy.code:04X}h",
-                "meaning": entry.emcy.meaning,
-                "register": entry.emcy.register,
-                "vendor": entry.emcy.vendor.hex(),
-            }
-            for entry in self.entries
-        ]
 
     @property
     def active(self) -> tuple[int, ...]:

@@ -12,7 +12,6 @@ import asyncio
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
-from typing import Any
 
 from fieldtwin.gateway.connections.listeners import TcpListener
 from fieldtwin.gateway.core.clock import NS_PER_S, Clock
@@ -52,6 +51,7 @@ from fieldtwin.gateway.runtime.bridge.tcp import Answer, Caller, TcpFront
 from fieldtwin.gateway.runtime.buses.backoff import Backoff
 from fieldtwin.gateway.runtime.buses.bridge_queue import BridgeRequest
 from fieldtwin.gateway.runtime.buses.modbus_bus import ModbusBus
+from fieldtwin.gateway.runtime.gateway_status import BridgeStatus
 
 LAST_LINE_UNIT = 247
 """Unit IDs 248 to 255 are reserved on a serial line (SL 2.2)."""
@@ -180,14 +180,16 @@ class Bridge:
         """Serve clients until cancelled. The buses have to be running."""
         await self.front.run()
 
-    def describe(self) -> dict[str, Any]:
-        """Return the bridge's part of the status."""
-        return {
-            **self.front.describe(),
-            **asdict(self.counters),
-            "cache_hits": self.cache.hits,
-            "away": [f"{r.bus}/{r.unit}" for r, a in self._away.items() if a.until_ns > self._clock.monotonic_ns()],
-        }
+    def status(self) -> BridgeStatus:
+        """Return where the bridge listens, its clients, its counters, and the units that are away."""
+        front, now_ns = self.front.status(), self._clock.monotonic_ns()
+        return BridgeStatus(
+            listening=front.listening,
+            error=front.error,
+            clients=front.clients,
+            counters={**front.counters, **asdict(self.counters), "cache_hits": self.cache.hits},
+            away=[f"{route.bus}/{route.unit}" for route, away in self._away.items() if away.until_ns > now_ns],
+        )
 
     # -- one request ------------------------------------------------------------------------------------------------
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from typing import Any
 
 from fieldtwin.gateway.core.clock import NS_PER_S, Clock
 from fieldtwin.gateway.core.connection import ByteConnection, Connector
@@ -20,6 +19,7 @@ from fieldtwin.gateway.protocols.modbus.server_line import LineRequest, RtuReque
 from fieldtwin.gateway.runtime.bridge.policy import LINE
 from fieldtwin.gateway.runtime.bridge.tcp import Answer, Ask, Caller
 from fieldtwin.gateway.runtime.buses.backoff import Backoff
+from fieldtwin.gateway.runtime.gateway_status import FrontStatus
 
 
 @dataclass
@@ -57,10 +57,10 @@ class LineFront:
         """Return the serial line while it is open, else None."""
         return self.endpoint if self.connected else None
 
-    def describe(self) -> dict[str, Any]:
-        """Return the line's part of the status."""
+    def status(self) -> FrontStatus:
+        """Return whether the line is open, and its counters."""
         listening = str(self.endpoint) if self.connected else None
-        return {"listening": listening, "error": self.error, **asdict(self.counters)}
+        return FrontStatus(listening=listening, error=self.error, counters=asdict(self.counters))
 
     async def run(self) -> None:
         """Open, listen, and open again, until cancelled."""

@@ -12,8 +12,7 @@ from __future__ import annotations
 import asyncio
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import asdict, dataclass
 
 from fieldtwin.gateway.connections.listeners import TcpListener
 from fieldtwin.gateway.core.clock import NS_PER_S, Clock
@@ -25,6 +24,7 @@ from fieldtwin.gateway.protocols.modbus.refusals import refusal
 from fieldtwin.gateway.protocols.modbus.server import SERVER_BUSY, exception_pdu
 from fieldtwin.gateway.protocols.modbus.server_mbap import MbapRequests, TcpRequest
 from fieldtwin.gateway.runtime.buses.backoff import Backoff
+from fieldtwin.gateway.runtime.gateway_status import FrontStatus
 
 REQUEST_WITHIN_S = 10.0
 """A request that has begun must be complete within this time; otherwise its client is closed. Without this limit, a
@@ -127,24 +127,22 @@ class TcpFront:
             await self.listener.aclose()
             self.listener = None
 
-    def describe(self) -> dict[str, Any]:
-        """Return the server's part of the status."""
-        c, listener = self.counters, self.listener
-        return {
-            "listening": str(listener.bound) if listener is not None else None,
-            "error": self.error,
-            "clients": [f"{x.peer}:{x.peer_port}" for x in listener.clients] if listener is not None else [],
-            "accepted": listener.accepted if listener is not None else 0,
-            "evicted": listener.evicted if listener is not None else 0,
-            "turned_away": listener.refused if listener is not None else 0,
-            "unshaken": listener.unshaken if listener is not None else 0,
-            "retired": listener.retired if listener is not None else 0,
-            "requests": c.requests,
-            "busy": c.busy,
-            "foreign": c.foreign,
-            "desyncs": c.desyncs,
-            "unfinished": c.unfinished,
-        }
+    def status(self) -> FrontStatus:
+        """Return where the server listens, its clients and its counters."""
+        listener = self.listener
+        return FrontStatus(
+            listening=str(listener.bound) if listener is not None else None,
+            error=self.error,
+            clients=[f"{x.peer}:{x.peer_port}" for x in listener.clients] if listener is not None else [],
+            counters={
+                "accepted": listener.accepted if listener is not None else 0,
+                "evicted": listener.evicted if listener is not None else 0,
+                "turned_away": listener.refused if listener is not None else 0,
+                "unshaken": listener.unshaken if listener is not None else 0,
+                "retired": listener.retired if listener is not None else 0,
+                **asdict(self.counters),
+            },
+        )
 
     async def _serve(self, connection: Client) -> None:
         session = _Session(connection, self._ask, self._in_flight, self.counters, self._clock)

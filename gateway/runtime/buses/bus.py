@@ -10,12 +10,13 @@ from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
+from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
 from fieldtwin.gateway.core.errors import FieldtwinError, NotAllowed
 from fieldtwin.gateway.core.histogram import Histogram
 from fieldtwin.gateway.core.values import COMMAND
 from fieldtwin.gateway.devices.config import BusConfig
 from fieldtwin.gateway.runtime.buses.pending_config import PendingConfig
-from fieldtwin.gateway.runtime.gateway_status import BusStatus, DeviceStatus
+from fieldtwin.gateway.runtime.gateway_status import BusStatus, DeviceStatus, LatencyStatus
 
 Ended = Callable[[str, FieldtwinError | None], None]
 """Called once for each tag with the result of its write: None, or the error; `HeldBack` for a tag that was not sent."""
@@ -105,5 +106,14 @@ def status_of(bus: Bus) -> BusStatus:
         local=sorted({address for address in bus.locals if address}),
         error=bus.error,
         counters=dict(bus.totals()),
-        latency=bus.latency.describe(),
+        latency=latency_status(bus.latency),
+    )
+
+
+def latency_status(times: Histogram) -> LatencyStatus:
+    """Return the response times of a bus as its status reports them."""
+    return LatencyStatus(
+        bounds_ms=[ns // NS_PER_MS for ns in times.limits_ns],
+        counts=list(times.counts),
+        total_s=times.total_ns / NS_PER_S,
     )

@@ -51,7 +51,7 @@ from fieldtwin.gateway.runtime.buses.modbus_bus import MOST_LOCALS, reason_of
 from fieldtwin.gateway.runtime.buses.node_writes import Done, InOrder, NodeWrites
 from fieldtwin.gateway.runtime.buses.pending_config import PendingConfig
 from fieldtwin.gateway.runtime.buses.poll_schedule import PollSchedule
-from fieldtwin.gateway.runtime.gateway_status import BusStatus, DeviceStatus
+from fieldtwin.gateway.runtime.gateway_status import BusStatus, DeviceStatus, EmcyStatus, TpdoStatus
 from fieldtwin.gateway.runtime.tags import TagTable
 
 SETTLE_NS = 100 * NS_PER_MS
@@ -248,11 +248,20 @@ class CanopenBus:
                 bring_ups=node.bring_ups,
                 emcys=node.emcys,
                 emcy=[f"{code:04X}h" for code in node.emcy_log.active],
-                emcy_log=node.emcy_log.describe(now_ns),
+                emcy_log=[
+                    EmcyStatus(
+                        age_ms=(now_ns - entry.t_ns) // NS_PER_MS,
+                        code=f"{entry.emcy.code:04X}h",
+                        meaning=entry.emcy.meaning,
+                        register=entry.emcy.register,
+                        vendor=entry.emcy.vendor.hex(),
+                    )
+                    for entry in node.emcy_log.entries
+                ],
                 errors=node.driver.malformed_pdos + node.poll_errors,
                 polls=node.polls,
                 tpdos={
-                    str(t.number): {"cob_id": f"{t.cob_id:03X}h", "tags": list(t.tags), "frames": t.frames}
+                    str(t.number): TpdoStatus(cob_id=f"{t.cob_id:03X}h", tags=list(t.tags), frames=t.frames)
                     for t in node.driver.tpdos
                 },
                 rpdos={str(r.number): [tag for tag in r.tags if tag] for r in node.driver.rpdos},

@@ -11,7 +11,6 @@ import json
 import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
@@ -20,6 +19,7 @@ from fieldtwin.gateway.core.files.profile import RegisterRange, gap_text, resolv
 from fieldtwin.gateway.devices.config import BusConfig
 from fieldtwin.gateway.devices.read_plan import Learnt
 from fieldtwin.gateway.devices.register_device import RegisterDriver
+from fieldtwin.gateway.runtime.gateway_status import LearntStatus
 
 MOST_BYTES = 4_000_000
 """Our files are never larger; a larger file is not read."""
@@ -114,20 +114,18 @@ def _learnt(driver: RegisterDriver, entry: Entry) -> Learnt | None:
     return Learnt(gaps, list(entry.missing))
 
 
-def describe_learnt(drivers: Iterable[object]) -> dict[str, Any]:
-    """Return, for every device with an entry, the learnt `gaps`, `borders` and `missing` tags, and a `line` for its profile.
-
-    The `line` replaces the `gaps` in the profile; it is "" if there is nothing to state."""
-    found: dict[str, Any] = {}
+def learnt_statuses(drivers: Iterable[object]) -> dict[str, LearntStatus]:
+    """Return what the gateway has learnt about each device, by name; devices without an entry are left out."""
+    found: dict[str, LearntStatus] = {}
     for driver in drivers:
         if isinstance(driver, RegisterDriver) and (driver.learnt.gaps or driver.learnt.missing):
             learnt, profile = driver.learnt, driver.profile
             gaps = [gap_text(g) for g in learnt.profile_gaps]
-            found[driver.config.name] = {
-                "profile": profile.name,
-                "gaps": gaps,
-                "borders": [f"{g.table}:{g.address}" for g in learnt.gaps if not g.count],
-                "missing": list(learnt.missing),
-                "line": f"gaps: {json.dumps([*profile.form.gaps, *gaps])}" if gaps else "",
-            }
+            found[driver.config.name] = LearntStatus(
+                profile=profile.name,
+                gaps=gaps,
+                borders=[f"{g.table}:{g.address}" for g in learnt.gaps if not g.count],
+                missing=list(learnt.missing),
+                line=f"gaps: {json.dumps([*profile.form.gaps, *gaps])}" if gaps else "",
+            )
     return found

@@ -12,7 +12,6 @@ from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any
 
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.errors import (
@@ -25,6 +24,7 @@ from fieldtwin.gateway.core.errors import (
 )
 from fieldtwin.gateway.runtime.audit_log import AuditLog
 from fieldtwin.gateway.runtime.buses.bus import HeldBack
+from fieldtwin.gateway.runtime.gateway_status import RefusalsStatus, RefusalStatus
 
 KEPT = 256
 """How many entries are kept."""
@@ -124,24 +124,24 @@ class Refusal:
             return ""
         return "program" if self.cause in OF_PROGRAM else "device" if self.cause in OF_DEVICE else ""
 
-    def describe(self) -> dict[str, Any]:
-        """Return the entry as plain data."""
-        return {
-            "number": self.number,
-            "tag": self.tag,
-            "first": self.first,
-            "value": self.value,
-            "cause": self.cause.value,
-            "reason": self.reason,
-            "by": self.by,
-            "t_ns": self.t_ns,
-            "last_ns": self.last_ns,
-            "count": self.count,
-            "program": self.program,
-            "place": self.place,
-            "fault": self.fault,
-            "standing": self.standing,
-        }
+    def status(self) -> RefusalStatus:
+        """Return the entry as it is reported."""
+        return RefusalStatus(
+            number=self.number,
+            tag=self.tag,
+            first=self.first,
+            value=self.value,
+            cause=self.cause.value,
+            reason=self.reason,
+            by=self.by,
+            t_ns=self.t_ns,
+            last_ns=self.last_ns,
+            count=self.count,
+            program=self.program,
+            place=self.place,
+            fault=self.fault,
+            standing=self.standing,
+        )
 
 
 class Refusals:
@@ -262,13 +262,13 @@ class Refusals:
                 found.append(entry)
         return found
 
-    def describe(self) -> dict[str, Any]:
-        """Return the journal's part of the status: counts by cause, and the entries that are kept."""
-        return {
-            "total": self.total,
-            "entries_made": self._number,
-            "unrecorded": self.unrecorded,
-            "faults": {"program": self.faults["program"], "device": self.faults["device"]},
-            "counts": {cause.value: n for cause, n in sorted(self.counts.items(), key=lambda item: item[0].value)},
-            "entries": [entry.describe() for entry in self._entries],
-        }
+    def status(self) -> RefusalsStatus:
+        """Return counts by cause, and the entries that are kept."""
+        return RefusalsStatus(
+            total=self.total,
+            entries_made=self._number,
+            unrecorded=self.unrecorded,
+            faults={"program": self.faults["program"], "device": self.faults["device"]},
+            counts={cause.value: n for cause, n in sorted(self.counts.items(), key=lambda item: item[0].value)},
+            entries=[entry.status() for entry in self._entries],
+        )

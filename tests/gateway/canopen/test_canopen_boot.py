@@ -351,7 +351,7 @@ def test_emergencies_are_kept(tmp_path: Path) -> None:
             await asyncio.sleep(0.5)
             assert r.status.emcys == 1
             assert r.status.emcy_log.active == (0x8110,)
-            assert r.status.emcy_log.describe(2_000_000_000)[0]["meaning"] == "CAN overrun (objects lost)"
+            assert r.status.emcy_log.entries[0].emcy.meaning == "CAN overrun (objects lost)"
             r.peer.command(0x82)
             await asyncio.sleep(0.001)
             assert r.status.emcy_log.active == ()  # it boots again; the history remains

@@ -61,11 +61,9 @@ def test_an_empty_histogram_has_zeros() -> None:
 def test_response_times_have_few_buckets_and_the_longest_of_the_last_64() -> None:
     times = response_times()
     filled(times, [-5, 0, 1_000_000, 1_000_001, 10**15])
-    assert times.describe() == {
-        "bounds_ms": list(RESPONSE_MS),
-        "counts": [3, 1, *[0] * (len(RESPONSE_MS) - 2), 1],
-        "total_s": (2_000_001 + 10**15) / 1e9,
-    }
+    assert list(times.limits_ns) == [ms * 1_000_000 for ms in RESPONSE_MS]
+    assert list(times.counts) == [3, 1, *[0] * (len(RESPONSE_MS) - 2), 1]
+    assert times.total_ns == 2_000_001 + 10**15
     assert times.recent_longest_ns == 10**15
     filled(times, [7] * 63)
     assert times.recent_longest_ns == 10**15

@@ -103,7 +103,7 @@ def test_a_master_on_a_line_reaches_units_on_tcp(tmp_path: Path) -> None:
             with pytest.raises(ReplyTimeout):  # MB-029: a foreign unit
                 await client.read_registers(3, "holding", 1, 1, timeout_s=0.1)
             assert (await client.read_registers(7, "holding", 2, 1)).registers == (302,)
-            assert bridge.describe()["requests"] == 2
+            assert bridge.status().counters["requests"] == 2
 
     run(main())
 
@@ -117,6 +117,6 @@ def test_mb_012_an_answer_that_comes_after_the_master_went_on_is_never_sent(tmp_
             assert (await client.read_registers(7, "holding", 2, 1)).registers == (302,)
             assert client.counters.desyncs == 0
             front = bridge.front
-            assert front.describe()["too_late"] + client.counters.late_bytes > 0
+            assert front.status().counters["too_late"] + client.counters.late_bytes > 0
 
     run(main())

@@ -54,7 +54,7 @@ def test_clients_of_other_networks_are_turned_away(tmp_path: Path) -> None:
         async with rig(tmp_path, BridgeConfig("b", ANY_PORT, to="line", policy=policy)) as r, r.raw() as raw:
             with pytest.raises(ConnectionLost):
                 await take(raw, 1)
-            assert r.bridge.describe()["turned_away"] == 1
+            assert r.bridge.status().counters["turned_away"] == 1
 
     run(main())
 

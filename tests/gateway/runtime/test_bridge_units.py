@@ -72,7 +72,7 @@ def test_mb_059_a_unit_that_comes_back_is_asked_again(tmp_path: Path) -> None:
                     return False
 
             await eventually(answers)
-            assert r.bridge.describe()["away"] == []
+            assert r.bridge.status().away == []
 
     run(main())
 
@@ -277,9 +277,9 @@ def test_mb_064_a_reset_in_the_middle_of_a_frame(tmp_path: Path) -> None:
         async with rig(tmp_path) as r, r.client() as other:
             async with r.raw() as raw:
                 await raw.write(read_adu(1, 1, 0, 1)[:5])
-                await eventually(lambda: len(r.bridge.front.describe()["clients"]) == 2)
+                await eventually(lambda: len(r.bridge.front.status().clients) == 2)
                 raw._wire.transport.abort()
-            await eventually(lambda: len(r.bridge.front.describe()["clients"]) == 1)
+            await eventually(lambda: len(r.bridge.front.status().clients) == 1)
             assert (await other.read_registers(1, "holding", 0, 1)).registers == (100,)
 
     run(main())
@@ -295,6 +295,6 @@ def test_mb_065_the_oldest_unused_client_makes_room(tmp_path: Path) -> None:
                 assert (await third.read_registers(1, "holding", 0, 1)).registers == (100,)
                 assert (await first.read_registers(1, "holding", 0, 1)).registers == (100,)
                 await eventually(lambda: second.closed)
-                assert r.bridge.front.describe()["evicted"] == 1
+                assert r.bridge.front.status().counters["evicted"] == 1
 
     run(main())

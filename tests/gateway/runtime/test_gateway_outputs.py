@@ -294,7 +294,7 @@ def test_a_failing_write_is_recorded_with_its_requester(tmp_path: Path) -> None:
             await eventually(lambda: r.holding(0) == 0xFFFF, within_s=15)
             await eventually(lambda: str(r.audit[-1]["result"]) == "done")
             assert {(e["new"], e["by"]) for e in r.audit} == {(5, "plc"), (-1, "safe: a test")}
-            assert [entry["by"] for entry in r.writer.journal.describe()["entries"]] == ["plc"]
+            assert [entry.by for entry in r.writer.journal.status().entries] == ["plc"]
 
     run(main())
 

@@ -146,7 +146,7 @@ class Play:
                 if "at_ms" in say and self.how == "whole":
                     assert abs(at_ms - say["at_ms"]) < TOLERANCE_MS, f"{data.hex(' ')} said at {at_ms} ms"
         if self.how != "garbage":
-            counters = {**self.bus.totals(), **self.bridge.describe()}
+            counters = {**self.bus.totals(), **self.bridge.status().counters}
             for name, value in self.row.get("state", {}).items():
                 assert counters[name] == value, name
 

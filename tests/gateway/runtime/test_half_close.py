@@ -35,7 +35,7 @@ def test_the_bridge_answers_requests_that_are_followed_by_fin(tmp_path: Path) ->
             assert data.hex(" ", 11) == " ".join(
                 ["0001000000050103020064", "00020000000502030200c8", "0003000000050103020065"]
             )
-            await eventually(lambda: r.bridge.describe()["clients"] == [])
+            await eventually(lambda: r.bridge.status().clients == [])
 
     run(main())
 
@@ -75,7 +75,7 @@ def test_a_client_that_closes_both_directions_costs_the_line_two_requests_at_mos
             with socket.create_connection(("127.0.0.1", r.port)) as goes:
                 goes.sendall(b"".join(read_adu(n, 1, n, 1) for n in range(1, 9)))
                 await eventually(lambda: len(r.heard) == 1)
-            await eventually(lambda: r.bridge.describe()["clients"] == [])
+            await eventually(lambda: r.bridge.status().clients == [])
             async with r.client() as stays:
                 await stays.read_registers(2, "holding", 0, 1)
             assert sum(frame[0] == 1 for frame in r.heard) <= 3

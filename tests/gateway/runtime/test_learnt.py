@@ -20,7 +20,8 @@ from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import Unreachable
 from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig
 from fieldtwin.gateway.devices.register_device import RegisterDriver, SensorDriver
-from fieldtwin.gateway.runtime.buses.learnt_gaps import LearntFile, describe_learnt
+from fieldtwin.gateway.runtime.buses.learnt_gaps import LearntFile, learnt_statuses
+from fieldtwin.gateway.runtime.gateway_status import LearntStatus
 from fieldtwin.gateway.runtime.tags import TagTable
 from fieldtwin.gateway.wallclock import WallClock
 
@@ -49,7 +50,7 @@ class Site:
         self.requests = 0
         self.driver: RegisterDriver
 
-    def run(self, seconds: float = 2.05, spans: list[Span] = HERE) -> dict[str, object]:
+    def run(self, seconds: float = 2.05, spans: list[Span] = HERE) -> LearntStatus | None:
         async def main() -> None:
             def make(tags: TagTable) -> list[RegisterDriver]:
                 config = DeviceConfig("meter", self.profile, "line", self.unit, poll={"values": 1000})
@@ -66,7 +67,14 @@ class Site:
             await run_bus(make, {self.unit: ModbusUnit(MapBank(spans), limits=self.limits)}, scenario)
 
         run_virtually(main())
-        return describe_learnt([self.driver]).get("meter", {})
+        return learnt_statuses([self.driver]).get("meter")
+
+
+def learnt(site: Site, spans: list[Span] = HERE) -> LearntStatus:
+    """Run the site, and return what it has learnt: something."""
+    found = site.run(spans=spans)
+    assert found is not None
+    return found
 
 
 @pytest.fixture
@@ -75,24 +83,24 @@ def site(tmp_path: Path) -> Site:
 
 
 def test_mb_025_what_was_learnt_is_said_and_not_asked_again(site: Site) -> None:
-    assert site.run() == {
-        "profile": "test/device",
-        "gaps": ["holding:2..4"],
-        "borders": [],
-        "missing": ["gone"],
-        "line": 'gaps: ["holding:2..4"]',
-    }
+    assert site.run() == LearntStatus(
+        profile="test/device",
+        gaps=["holding:2..4"],
+        borders=[],
+        missing=["gone"],
+        line='gaps: ["holding:2..4"]',
+    )
     assert site.exceptions > 1
-    known = site.run()
+    known = learnt(site)
     assert (site.exceptions, site.requests) == (1, 3 + 2 + 2)  # a missing one is requested once, separately
-    assert known["line"] == 'gaps: ["holding:2..4"]'
+    assert known.line == 'gaps: ["holding:2..4"]'
 
 
 def test_mb_025_with_its_line_in_the_profile_nothing_is_left_to_learn(site: Site) -> None:
     site.profile = profile(TAGS.replace('  gone: {at: "holding:12"}\n', ""))
-    line = site.run()["line"]
+    line = learnt(site).line
     site.profile = profile(f"{line}\n" + TAGS.replace('  gone: {at: "holding:12"}\n', ""))
-    assert site.run() == {}
+    assert site.run() is None
     assert (site.exceptions, site.requests) == (0, 2 * 3)
     assert json.loads(site.path.read_text()) != {}  # facts learned with the old profile, until a new fact is learned
 
@@ -113,7 +121,7 @@ def test_a_different_device_is_asked_again(site: Site, change: str) -> None:
 
 def test_a_gap_that_answers_again_is_forgotten(site: Site) -> None:
     site.run()
-    assert site.run(spans=[Span("holding", 0, 2), Span("holding", 5, 8)])["missing"] == []
+    assert learnt(site, [Span("holding", 0, 2), Span("holding", 5, 8)]).missing == []
     assert site.exceptions == 0
 
 
@@ -146,9 +154,9 @@ def test_a_disk_that_refuses_is_reported(site: Site, tmp_path: Path) -> None:
 def test_a_device_that_accepts_less_than_its_profile_states_keeps_its_limits(site: Site) -> None:
     site.profile = profile('tags:\n  x1..9: {at: "holding:0"}\n')
     site.limits = UnitLimits(read_registers=4)
-    learnt = site.run(spans=[Span("holding", 0, 9)])
-    assert (learnt["gaps"], learnt["missing"], learnt["line"]) == ([], [], "")
-    assert learnt["borders"]
+    known = learnt(site, [Span("holding", 0, 9)])
+    assert (known.gaps, known.missing, known.line) == ([], [], "")
+    assert known.borders
     assert site.exceptions >= 1
     site.run(spans=[Span("holding", 0, 9)])
     assert site.exceptions == 0

@@ -233,7 +233,7 @@ def test_a_request_that_drips_ends_its_connection_and_other_clients_are_served(
                 await hostile.read()
             await drip
             assert counters.unfinished == 1
-            assert r.bridge.front.describe()["unfinished"] == 1
+            assert r.bridge.front.status().counters["unfinished"] == 1
 
     run(main())
 

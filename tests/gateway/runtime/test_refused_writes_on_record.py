@@ -99,7 +99,7 @@ def test_the_journal_keeps_the_newest_entries_and_counts_all(tmp_path: Path) -> 
     audit.close()
     entries = kept.since(0)
     assert (len(entries), entries[0].number, entries[-1].number) == (KEPT, 51, KEPT + 50)
-    assert kept.describe()["faults"]["program"] == KEPT + 50
+    assert kept.status().faults["program"] == KEPT + 50
 
 
 def test_an_entry_whose_line_is_being_looked_up_delays_the_later_ones(tmp_path: Path) -> None:

@@ -323,8 +323,8 @@ def test_a_value_that_the_new_limits_forbid_is_a_refused_output_and_the_gateway_
         edit(plant.with_name("tank.yaml"), ("range: [0, 50]", "range: [0, 1.5]"))
         await p.reload()
         await asyncio.sleep(3)
-        entries = p.run.gateway.outputs.journal.describe()["entries"]
-        assert [(e["tag"], e["cause"], e["by"]) for e in entries] == [("tank.target", "limit", "plc")]
+        entries = p.run.gateway.outputs.journal.status().entries
+        assert [(e.tag, e.cause, e.by) for e in entries] == [("tank.target", "limit", "plc")]
         assert held() == 20
         assert await p.run.stop_gateway()
         assert held() == 10  # the safe value

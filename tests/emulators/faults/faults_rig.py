@@ -215,9 +215,9 @@ class _Run(VirtualRun):
         elif seen.well_s is None:
             seen.well_s = max(0.0, at_s - LASTS_S)
         if at_s >= LASTS_S - 0.2:
-            for known in bench.run.field.faults.describe():
-                if known["id"] == f"{row.wire} {row.name}":
-                    seen.struck = known["struck"]
+            for known in bench.run.field.faults.active():
+                if known.id == f"{row.wire} {row.name}":
+                    seen.struck = known.struck
 
 
 def _said_by_driver(bench: VirtualBench, device: str) -> set[str]:

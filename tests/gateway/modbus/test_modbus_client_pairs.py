@@ -68,7 +68,8 @@ def test_mb_013_the_quarantine_learns_the_longest_latency() -> None:
         timed_out_ns = CLOCK.monotonic_ns()
         answering(device, 3)
         assert (await client.read_registers(1, "holding", 0, 1)).registers == (3,)
-        assert device.requests[2][0] - timed_out_ns >= latency_ns * 0.95  # although this timeout was only 20 ms
+        # This timeout was only 20 ms. Half of the latency is the limit, because a busy computer resumes this test late.
+        assert device.requests[2][0] - timed_out_ns >= latency_ns * 0.5 > 20_000_000
 
     with_client(scenario)
 

@@ -138,7 +138,7 @@ def test_a_missing_field_simulator_is_unreachable(invoke: Invoke) -> None:
         ("fieldtwin.plc.relay:Relay", "fieldtwin.plc.relay:Realy", "fieldtwin.plc.relay:Realy", "Realy"),
         ("response: modem.outbox", "respons: modem.outbox", "respons: modem.outbox", "response"),
         ("fieldtwin: 1", "fieldtwin: 2", "fieldtwin: 2", "fieldtwin"),
-        ("    relay:\n", "    relay:\n      task: fats\n", "task: fats", "expected main; got fats"),
+        ("    relay:\n", "    relay:\n      task: fats\n", "task: fats", "no task 'fats'; expected main"),
         ("cycle_ms: 10", "tasks: {a: {interval_ms: 9}, b: {single: ctd.nought}}", "single: ctd.nought", "got ctd.nought"),
         ("cycle_ms: 10", "tasks: {b: {single: modem.link_state}}", "tasks: {b:", "only SINGLE tasks"),
     ],

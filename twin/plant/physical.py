@@ -18,6 +18,8 @@ from fieldtwin.gateway.connections.listeners import TcpListener
 from fieldtwin.gateway.core.clock import Clock
 from fieldtwin.gateway.core.connection import Connector, Listen
 from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid, Unreachable
+from fieldtwin.gateway.core.files.error_collector import ErrorCollector
+from fieldtwin.gateway.core.files.nearest import did_you_mean
 from fieldtwin.gateway.core.files.profile import Tag
 from fieldtwin.gateway.core.image.image import Image, ImageLayout, TagKind, TagSpec, message_tag
 from fieldtwin.gateway.devices.canopen_device import CanopenDriver
@@ -108,17 +110,10 @@ def _start_policy(form: StartForm) -> StartPolicy:
 
 def image_layout(system: System) -> ImageLayout:
     """Return the process image of a system: the tags to which its programs are bound, and every other number for watchers."""
-    _check_tasks(system)
-    folder = str(system.path.parent)
+    errors = ErrorCollector()
+    bound = bound_programs(system, errors)
+    errors.raise_all()
     plant = plant_tags(system)
-    bound = []
-    for config in programs_of(system):
-        try:
-            program = config.bind((folder,))
-        except FieldtwinError as e:
-            raise system.file.error(("plc", "programs", config.name, "source"), str(e)) from e
-        _check_variables(system, program)
-        bound.append(program)
     watched = [
         f"{d.name}.{t.name}"
         for d in system.devices.values()
@@ -135,7 +130,36 @@ def image_layout(system: System) -> ImageLayout:
         raise system.file.error(at or ("plc", "programs"), e.message, expected=e.expected, got=e.got) from e
 
 
-def _check_tasks(system: System) -> None:
+def bound_programs(system: System, errors: ErrorCollector) -> list[BoundProgram]:
+    """Create the programs of a system, and check each name to which their variables are bound.
+
+    Errors are added to `errors`; the result contains the programs that could be created.
+    """
+    _check_tasks(system, errors)
+    bound = []
+    for config in programs_of(system):
+        try:
+            bound.append(config.bind((str(system.path.parent),)))
+        except FieldtwinError as e:
+            errors.add(system.file.error(("plc", "programs", config.name, "source"), str(e)))
+    for program in bound:
+        _check_variables(system, program, errors)
+    published = {program.name: [tag for _, tag in program.published()] for program in bound}
+    for program in bound:
+        for variable, binding in program.inputs.items():
+            source = binding.tag.partition(".")[0]
+            if source in published and source not in system.devices and binding.tag not in published[source]:
+                error = system.file.error(
+                    ("plc", "programs", program.name, "inputs", variable, "tag"),
+                    f"program {source!r} publishes no {binding.tag!r}",
+                    expected=", ".join(published[source]),
+                    hint=did_you_mean(binding.tag, published[source]),
+                )
+                errors.add(error)
+    return bound
+
+
+def _check_tasks(system: System, errors: ErrorCollector) -> None:
     """Check that every program's task exists and that at least one task is cyclic: cyclic tasks evaluate the triggers
     of the SINGLE tasks.
     """
@@ -143,22 +167,28 @@ def _check_tasks(system: System) -> None:
     for program, form in system.plc.programs.items():
         if form.task and form.task not in names:
             at = ("plc", "programs", program, "task")
-            raise system.file.error(at, "a task that there is not", expected=", ".join(names), got=form.task)
+            error = system.file.error(
+                at, f"no task {form.task!r}", expected=", ".join(names), hint=did_you_mean(form.task, names)
+            )
+            errors.add(error)
     if system.plc.tasks and all(form.single for form in system.plc.tasks.values()):
-        raise system.file.error(("plc", "tasks"), "only SINGLE tasks", expected="at least one with interval_ms")
+        error = system.file.error(("plc", "tasks"), "only SINGLE tasks", expected="at least one with interval_ms")
+        errors.add(error)
 
 
-def _check_variables(system: System, bound: BoundProgram) -> None:
+def _check_variables(system: System, bound: BoundProgram, errors: ErrorCollector) -> None:
     """Check that every name that the file binds is a variable of the program with the right role."""
     for key, role, names in (("inputs", Role.INPUT, bound.inputs), ("outputs", Role.OUTPUT, bound.outputs)):
         declared = [v.name for v in bound.variables(role)]
         for name in names:
             if name not in declared:
-                raise system.file.error(
+                error = system.file.error(
                     ("plc", "programs", bound.name, key, name),
                     f"program {bound.name!r} has no {role.value} {name!r}",
                     expected=", ".join(declared) or "none",
+                    hint=did_you_mean(name, declared),
                 )
+                errors.add(error)
 
 
 def gateway_config(

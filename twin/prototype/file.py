@@ -13,6 +13,8 @@ from typing import NamedTuple
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.gateway.core.files.candump import SUFFIX
+from fieldtwin.gateway.core.files.error_collector import ErrorCollector, collecting
+from fieldtwin.gateway.core.files.nearest import did_you_mean
 from fieldtwin.gateway.core.files.profile import DeviceProfile, load_profile
 from fieldtwin.gateway.core.files.recording import shown
 from fieldtwin.gateway.core.files.yaml_file import Key, YamlFile, load, validate
@@ -93,8 +95,12 @@ def prototype_path(system: System) -> Path:
     return system.path.with_name(f"{system.path.stem}.prototype.yaml")
 
 
-def load_prototype(system: System, path: Path | None = None) -> Prototype:
-    """Read the prototype file of `system`. Raises `FileInvalid` or `UsageError`."""
+def load_prototype(system: System, path: Path | None = None, errors: ErrorCollector | None = None) -> Prototype:
+    """Read the prototype file of `system`. Raises `FileInvalid` or `UsageError`.
+
+    With `errors`, the errors of separate entries are added to it, and the result contains the entries without error, which
+    must not be run. `system` may have been read in the same way.
+    """
     if path is None and not prototype_path(system).exists():
         raise FileInvalid(
             f"there is no prototype file of {system.path.name}",
@@ -112,25 +118,38 @@ def load_prototype(system: System, path: Path | None = None) -> Prototype:
             expected=system.path.name,
             got=form.prototype_of,
         )
-    for name in form.buses:
-        if name not in system.buses:
-            raise file.error(("buses", name), f"the system has no bus {name!r}", expected=", ".join(system.buses))
-    for name in form.devices:
-        if name not in system.devices:
-            raise file.error(
-                ("devices", name), f"the system has no device {name!r}", expected=", ".join(system.devices)
-            )
-    check_simulations(file, form, system)
-    buses = {name: _bus(file, system, form, name) for name in system.buses}
-    _check_wires(file, system, buses)
-    devices = {
-        name: _device(file, system, name, form)
-        for name in system.devices
-        if name in form.devices and buses[system.devices[name].bus].listen is not None
-    }
-    missing = [n for n, d in system.devices.items() if buses[d.bus].listen is not None and n not in devices]
-    if missing:
-        raise file.error(("devices",), f"no entry for {', '.join(missing)}", expected="an entry each")
+    with collecting(errors) as collector:
+        return _resolve(file, form, path, system, collector)
+
+
+def _resolve(file: YamlFile, form: PrototypeForm, path: Path, system: System, errors: ErrorCollector) -> Prototype:
+    for section, names in (("buses", form.buses), ("devices", form.devices)):
+        declared = list(system.file.data[section])
+        for name in names:
+            if name not in declared:
+                what = "bus" if section == "buses" else "device"
+                error = file.error(
+                    (section, name),
+                    f"the system has no {what} {name!r}",
+                    expected=", ".join(declared),
+                    hint=did_you_mean(name, declared),
+                )
+                errors.add(error)
+    check_simulations(file, form, system, errors)
+    buses: dict[str, EmulatedBus] = {}
+    for name in system.buses:
+        with errors.collect():
+            buses[name] = _bus(file, system, form, name)
+    with errors.collect():
+        _check_wires(file, system, buses)
+    emulated = [n for n, d in system.devices.items() if d.bus in buses and buses[d.bus].listen is not None]
+    devices: dict[str, EmulatedDevice] = {}
+    for name in emulated:
+        if name in form.devices:
+            with errors.collect():
+                devices[name] = _device(file, system, name, form, errors)
+    if missing := [name for name in emulated if name not in form.devices]:
+        errors.add(file.error(("devices",), f"no entry for {', '.join(missing)}", expected="an entry each"))
     return Prototype(path, form.seed, buses, devices, file, form)
 
 
@@ -213,7 +232,7 @@ def _check_wires(file: YamlFile, system: System, buses: Mapping[str, EmulatedBus
     raise file.error(("buses", clash.buses[0], "listen"), clash.message, expected=clash.expected, hint=hint)
 
 
-def _device(file: YamlFile, system: System, name: str, whole: PrototypeForm) -> EmulatedDevice:
+def _device(file: YamlFile, system: System, name: str, whole: PrototypeForm, errors: ErrorCollector) -> EmulatedDevice:
     config, form = system.devices[name], whole.devices[name]
     loc = ("devices", name)
     profile = config.profile
@@ -221,14 +240,14 @@ def _device(file: YamlFile, system: System, name: str, whole: PrototypeForm) -> 
         try:
             profile = load_profile(find("devices", form.profile, beside=file_path(file)))
         except UsageError as e:
-            raise file.error((*loc, "profile"), e.message, expected=e.expected) from e
+            raise file.error((*loc, "profile"), e.message, expected=e.expected, hint=e.hint) from e
     if [form.recording, form.model, form.simulation].count(None) != 2:
         raise file.error(
             loc,
             f"the data source of {name!r}",
             expected="one of `recording: FILE`, `simulation: NAME` and `model: NAME`",
         )
-    check_plays(file, whole, name, profile)
+    check_plays(file, whole, name, profile, errors)
     if form.model == "mailbox" and (profile.inbox is None or form.far is None):
         raise file.error(
             loc, f"the mailbox model for {name!r}", expected="a profile with a mailbox, and `far: ENDPOINT`"
@@ -236,24 +255,35 @@ def _device(file: YamlFile, system: System, name: str, whole: PrototypeForm) -> 
     if form.model == "profile" and (profile.sampled is not None or profile.inbox is not None):
         expected = "`recording: FILE`, of its signals" if profile.sampled is not None else "`model: mailbox`"
         raise file.error((*loc, "model"), f"{name!r} needs more than its registers", expected=expected)
-    _check_stated(file, loc, form, profile)
+    _check_stated(file, loc, form, profile, errors)
     recording = None
     if form.recording is not None:
         try:
             recording = find_recording(form.recording, beside=file_path(file))
         except UsageError as e:
-            raise file.error((*loc, "recording"), e.message, expected=e.expected) from e
+            raise file.error((*loc, "recording"), e.message, expected=e.expected, hint=e.hint) from e
         if recording.suffix == SUFFIX and profile.protocol != "canopen":
             raise file.error(
                 (*loc, "recording"), "a log of a CAN bus", expected="a recording (JSON Lines)", got=recording.name
             )
     for tag in form.identity:
         if tag not in profile.tags:
-            raise FileInvalid(f"{profile.name} has no tag {tag!r}", path=file.path, expected=", ".join(profile.tags))
+            errors.add(_no_tag(file, (*loc, "identity", tag), profile, tag))
     return EmulatedDevice(name, profile, form, recording)
 
 
-def _check_stated(file: YamlFile, loc: tuple[Key, ...], form: EmulatedForm, profile: DeviceProfile) -> None:
+def _no_tag(file: YamlFile, loc: tuple[Key, ...], profile: DeviceProfile, tag: str) -> FileInvalid:
+    return file.error(
+        loc,
+        f"{profile.name} has no tag {tag!r}",
+        expected=", ".join(profile.tags),
+        hint=did_you_mean(tag, profile.tags),
+    )
+
+
+def _check_stated(
+    file: YamlFile, loc: tuple[Key, ...], form: EmulatedForm, profile: DeviceProfile, errors: ErrorCollector
+) -> None:
     """Check keys that apply to some devices only: `busy` to Modbus devices, `values` to Modbus devices without a
     recording, and the keys about a data sheet to CANopen devices."""
     for key, said in (("cia", form.cia is not None), ("parameter_values", not form.parameter_values)):
@@ -268,9 +298,7 @@ def _check_stated(file: YamlFile, loc: tuple[Key, ...], form: EmulatedForm, prof
         raise file.error((*loc, "values"), "values of registers", expected=expected)
     for tag in form.values:
         if tag not in profile.tags:
-            raise file.error(
-                (*loc, "values", tag), f"{profile.name} has no tag {tag!r}", expected=", ".join(profile.tags)
-            )
+            errors.add(_no_tag(file, (*loc, "values", tag), profile, tag))
 
 
 def file_path(file: YamlFile) -> Path:

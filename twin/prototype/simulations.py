@@ -16,55 +16,72 @@ from fieldtwin.emulators.simulation.signals import SimulatedSignals
 from fieldtwin.emulators.simulation.simulation import Simulation, by_formulas, by_model
 from fieldtwin.gateway.core.clock import NS_PER_MS
 from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.files.error_collector import ErrorCollector, FollowingError
+from fieldtwin.gateway.core.files.nearest import did_you_mean
 from fieldtwin.gateway.core.files.profile import DeviceProfile, Tag
 from fieldtwin.gateway.core.files.yaml_file import YamlFile
 from fieldtwin.twin.site.schema import EmulatedForm, PrototypeForm, SimulationForm
 from fieldtwin.twin.site.system import System
 
 
-def check_simulations(file: YamlFile, form: PrototypeForm, system: System) -> None:
+def check_simulations(file: YamlFile, form: PrototypeForm, system: System, errors: ErrorCollector) -> None:
     """Check everything that can be known about a prototype's simulations without running its Python code.
 
-    Raises `FileInvalid`.
+    Errors are added to `errors`.
     """
     for name, simulation in form.simulations.items():
         loc = ("simulations", name)
-        if (simulation.python is None) == (not simulation.formulas):
-            raise file.error(
-                loc, f"the simulation of {name!r}", expected="either `formulas:` or `python: FILE.py:CLASS`"
-            )
-        if simulation.python is not None and not _python(file, simulation.python)[0].is_file():
-            raise file.error((*loc, "python"), "no such file", expected="FILE.py:CLASS", got=simulation.python)
+        with errors.collect():
+            _check_source(file, simulation, name)
         for key, known in simulation.inputs.items():
-            _check_input(file, form, system, (*loc, "inputs", key), known)
-        _check_formulas(file, simulation, name)
+            with errors.collect():
+                _check_input(file, form, system, (*loc, "inputs", key), known)
+        with errors.collect():
+            _check_formulas(file, simulation, name)
     for name, device in form.devices.items():
         if device.simulation is not None and device.simulation not in form.simulations:
-            raise file.error(
+            error = file.error(
                 ("devices", name, "simulation"),
                 f"no simulation {device.simulation!r}",
                 expected=", ".join(form.simulations) or "one under `simulations:`",
+                hint=did_you_mean(device.simulation, form.simulations),
             )
+            errors.add(error)
 
 
-def check_plays(file: YamlFile, form: PrototypeForm, name: str, profile: DeviceProfile) -> None:
-    """Check that a device plays numeric tags of its own, from names that its simulation computes where those are known."""
+def _check_source(file: YamlFile, simulation: SimulationForm, name: str) -> None:
+    loc = ("simulations", name)
+    if (simulation.python is None) == (not simulation.formulas):
+        raise file.error(loc, f"the simulation of {name!r}", expected="either `formulas:` or `python: FILE.py:CLASS`")
+    if simulation.python is not None and not _python(file, simulation.python)[0].is_file():
+        raise file.error((*loc, "python"), "no such file", expected="FILE.py:CLASS", got=simulation.python)
+
+
+def check_plays(file: YamlFile, form: PrototypeForm, name: str, profile: DeviceProfile, errors: ErrorCollector) -> None:
+    """Check that a device plays numeric tags of its own, from names that its simulation computes where those are known.
+
+    Raises `FileInvalid` if nothing can be checked; errors of single tags are added to `errors`.
+    """
     device = form.devices[name]
     if device.plays and device.simulation is None:
         raise file.error(
             ("devices", name, "plays"), "`plays` without a simulation", expected="`simulation: NAME` beside it"
         )
     for tag, value in device.plays.items():
+        loc = ("devices", name, "plays", tag)
         if tag not in profile.tags or profile.tags[tag].is_text:
-            expected = ", ".join(t.name for t in profile.tags.values() if not t.is_text)
-            raise file.error(
-                ("devices", name, "plays", tag), f"{profile.name} has no numeric tag {tag!r}", expected=expected
+            numbers = [t.name for t in profile.tags.values() if not t.is_text]
+            error = file.error(
+                loc,
+                f"{profile.name} has no numeric tag {tag!r}",
+                expected=", ".join(numbers),
+                hint=did_you_mean(tag, numbers),
             )
-        formulas = form.simulations[device.simulation or ""].formulas
+            errors.add(error)
+        simulation = form.simulations.get(device.simulation or "")
+        formulas = simulation.formulas if simulation is not None else {}
         if formulas and value not in formulas:
-            raise file.error(
-                ("devices", name, "plays", tag), f"no formula or step computes {value!r}", expected=", ".join(formulas)
-            )
+            errors.add(file.error(loc, f"no formula or step computes {value!r}", expected=", ".join(formulas)))
 
 
 def _check_formulas(file: YamlFile, simulation: SimulationForm, name: str) -> None:
@@ -89,6 +106,8 @@ def _check_formulas(file: YamlFile, simulation: SimulationForm, name: str) -> No
 
 def _check_input(file: YamlFile, form: PrototypeForm, system: System, loc: tuple[str, ...], text: str) -> None:
     device, _, tag = text.partition(".")
+    if device in form.devices and device in system.file.data["devices"] and device not in system.devices:
+        raise FollowingError(f"the device {device!r} has an error", path=file.path)
     if device not in form.devices or device not in system.devices:
         raise file.error(loc, f"no emulated device {device!r}", expected=", ".join(form.devices))
     tags = system.devices[device].profile.tags

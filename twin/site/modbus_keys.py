@@ -79,7 +79,7 @@ def connect_pauses(
     asked = dict.fromkeys(buses, 0)
     for device in devices.values():
         asked[device.bus] = max(asked[device.bus], device.profile.form.timing.connect_pause_ms)
-    silent = [name for name, bus in form.buses.items() if bus.connect_pause_ms is None]
+    silent = [name for name in buses if form.buses[name].connect_pause_ms is None]
     return buses | {name: replace(buses[name], connect_pause_s=asked[name] / 1000) for name in silent}
 
 

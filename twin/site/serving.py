@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from fieldtwin.gateway.connections.tls_listen import check_files
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.files.error_collector import ErrorCollector, FollowingError
 from fieldtwin.gateway.core.files.nearest import did_you_mean
 from fieldtwin.gateway.core.files.profile import Tag
 from fieldtwin.gateway.core.files.yaml_file import Key, YamlFile
@@ -21,6 +22,7 @@ from fieldtwin.gateway.protocols.modbus.server import READ_FUNCTIONS, WRITE_FUNC
 from fieldtwin.gateway.runtime.bridge.bridge import BridgeConfig, Route
 from fieldtwin.gateway.runtime.bridge.policy import AllowRule, Network, Policy, network
 from fieldtwin.gateway.runtime.serve import BIT_TABLES, QUALITY_TABLE, ServeConfig, ServedTag
+from fieldtwin.twin.site.references import no_device
 from fieldtwin.twin.site.schema import AllowForm, BridgeForm, ServedTagForm, ServeForm
 
 TABLES: tuple[ServedTable, ...] = ("input", "holding", "discrete", "coil")
@@ -61,11 +63,18 @@ def resolve_serving(
     buses: Mapping[str, BusConfig],
     devices: Mapping[str, DeviceConfig],
     plc_outputs: Iterable[str],
+    errors: ErrorCollector,
 ) -> Serving:
-    """Resolve and check both sections. Raises `FileInvalid`."""
+    """Resolve and check both sections. Errors are added to `errors`; the result contains the entries without error."""
     outputs = set(plc_outputs)
-    servers = tuple(_server(file, name, form, devices, outputs) for name, form in serve.items())
-    bridges = tuple(_bridge(file, name, form, buses) for name, form in bridge.items())
+    servers: list[ServeConfig] = []
+    for name, form in serve.items():
+        with errors.collect():
+            servers.append(_server(file, name, form, devices, outputs, errors))
+    bridges: list[BridgeConfig] = []
+    for name, bridge_form in bridge.items():
+        with errors.collect():
+            bridges.append(_bridge(file, name, bridge_form, buses, errors))
     taken: dict[str, str] = {str(b.endpoint): f"bus {b.name!r}" for b in buses.values() if b.endpoint.is_serial}
     for section, name, listen in [
         *(("serve", s.name, s.listen) for s in servers),
@@ -74,25 +83,33 @@ def resolve_serving(
         if not listen.is_serial and listen.port == 0:
             continue  # the operating system chooses a free port
         if str(listen) in taken:
-            raise file.error((section, name, "url"), f"{listen} is taken by {taken[str(listen)]}")
+            errors.add(file.error((section, name, "url"), f"{listen} is taken by {taken[str(listen)]}"))
         taken[str(listen)] = f"{section} {name!r}"
-    return Serving(servers, bridges)
+    return Serving(tuple(servers), tuple(bridges))
 
 
 # -- serve ---------------------------------------------------------------------------------------------------------------
 
 
 def _server(
-    file: YamlFile, name: str, form: ServeForm, devices: Mapping[str, DeviceConfig], outputs: set[str]
+    file: YamlFile,
+    name: str,
+    form: ServeForm,
+    devices: Mapping[str, DeviceConfig],
+    outputs: set[str],
+    errors: ErrorCollector,
 ) -> ServeConfig:
     loc: tuple[Key, ...] = ("serve", name)
-    tags = tuple(_served(file, (*loc, "tags", tag), tag, f, devices, outputs) for tag, f in form.tags.items())
+    tags: list[ServedTag] = []
+    for tag, tag_form in form.tags.items():
+        with errors.collect():
+            tags.append(_served(file, (*loc, "tags", tag), tag, tag_form, devices, outputs))
     _check_overlaps(file, loc, tags)
     return ServeConfig(
         name=name,
         listen=_endpoint(file, loc, form.url, ("tcp", "tls")),
         unit=form.unit,
-        tags=tags,
+        tags=tuple(tags),
         if_bad=form.if_bad,
         networks=_networks(file, (*loc, "from"), form.networks),
         clients=form.clients,
@@ -137,9 +154,7 @@ def _tag(
     device_name, _, local = name.partition(".")
     device = devices.get(device_name)
     if device is None:
-        raise file.error(
-            loc, f"no device {device_name!r}", expected=", ".join(devices), hint=did_you_mean(device_name, devices)
-        )
+        raise no_device(file, loc, device_name)
     tag = device.profile.tags.get(local)
     if tag is None:
         known = device.profile.tags
@@ -192,14 +207,19 @@ def _check_overlaps(file: YamlFile, loc: tuple[Key, ...], tags: Iterable[ServedT
 # -- bridge --------------------------------------------------------------------------------------------------------------
 
 
-def _bridge(file: YamlFile, name: str, form: BridgeForm, buses: Mapping[str, BusConfig]) -> BridgeConfig:
+def _bridge(
+    file: YamlFile, name: str, form: BridgeForm, buses: Mapping[str, BusConfig], errors: ErrorCollector
+) -> BridgeConfig:
     loc: tuple[Key, ...] = ("bridge", name)
     listen = _endpoint(file, loc, form.url, ("tcp", "tls", "rtu"))
     if form.to is None and not form.units:
         raise file.error(loc, "this bridge has no target", expected="`to: BUS`, or `units: {1: BUS/1}`")
     if form.to is not None:
         _modbus_bus(file, (*loc, "to"), form.to, buses)
-    routes = {unit: _route(file, (*loc, "units", unit), unit, text, buses) for unit, text in form.units.items()}
+    routes: dict[int, Route] = {}
+    for unit, text in form.units.items():
+        with errors.collect():
+            routes[unit] = _route(file, (*loc, "units", unit), unit, text, buses)
     rules = tuple(_rule(file, (*loc, "allow", i), rule, form.url) for i, rule in enumerate(form.allow)) or (
         AllowRule(),
     )
@@ -221,6 +241,8 @@ def _bridge(file: YamlFile, name: str, form: BridgeForm, buses: Mapping[str, Bus
 
 def _modbus_bus(file: YamlFile, loc: tuple[Key, ...], name: str, buses: Mapping[str, BusConfig]) -> None:
     known = [b.name for b in buses.values() if not b.endpoint.is_can]
+    if name in file.data["buses"] and name not in buses:
+        raise FollowingError(f"the bus {name!r} has an error", path=file.path)
     if name not in known:
         raise file.error(
             loc, f"no Modbus bus {name!r}", expected=", ".join(known) or "none", hint=did_you_mean(name, known)

@@ -14,6 +14,7 @@ from pathlib import Path
 
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.files.error_collector import ErrorCollector, FollowingError, collecting
 from fieldtwin.gateway.core.files.nearest import did_you_mean
 from fieldtwin.gateway.core.files.profile import DeviceProfile, Tag, load_profile
 from fieldtwin.gateway.core.files.yaml_file import Key, YamlFile, load, validate
@@ -23,6 +24,7 @@ from fieldtwin.twin.site.data_files import find
 from fieldtwin.twin.site.groups import kind_of
 from fieldtwin.twin.site.modbus_keys import connect_pauses, device_pace, modbus_bus
 from fieldtwin.twin.site.read_back_warnings import never_read_back
+from fieldtwin.twin.site.references import no_device
 from fieldtwin.twin.site.schema import BusForm, CommandsForm, DeviceForm, InvariantsForm, PlcForm, SystemForm
 from fieldtwin.twin.site.serving import Serving, resolve_serving
 from fieldtwin.twin.site.start_warnings import waits_for_its_command
@@ -57,8 +59,12 @@ class System:
         return [d for d in self.devices.values() if d.bus == bus]
 
 
-def load_system(name: str, profiles: Iterable[Path] = ()) -> System:
-    """Read a system by path or bare name. Raises `FileInvalid` or `UsageError`."""
+def load_system(name: str, profiles: Iterable[Path] = (), errors: ErrorCollector | None = None) -> System:
+    """Read a system by path or bare name. Raises `FileInvalid` or `UsageError`.
+
+    With `errors`, the errors of separate entries are added to it, and the result contains the entries without error. Such
+    a result is for checks of other files that refer to the system; it must not be run.
+    """
     path = find("systems", name, extra=profiles)
     file = load(path)
     if kind := kind_of(file.data):
@@ -67,11 +73,24 @@ def load_system(name: str, profiles: Iterable[Path] = ()) -> System:
         hint = f"run --prototype, simulate and test take a {kind}" + (f"; its systems are {named}" if named else "")
         raise file.error((kind,), f"a {kind}, not a system", expected="a system file", hint=hint)
     form = validate(file, SystemForm)
-    buses = {n: _bus(file, n, b) for n, b in form.buses.items()}
+    with collecting(errors) as collector:
+        return _resolve(file, form, path, tuple(profiles), collector)
+
+
+def _resolve(
+    file: YamlFile, form: SystemForm, path: Path, profiles: tuple[Path, ...], errors: ErrorCollector
+) -> System:
+    buses: dict[str, BusConfig] = {}
+    for name, bus in form.buses.items():
+        with errors.collect():
+            buses[name] = _bus(file, name, bus)
     known: dict[Path, DeviceProfile] = {}  # so that a profile used by a hundred devices is read once
-    devices = {n: _device(file, n, d, buses, path, profiles, known) for n, d in form.devices.items()}
+    devices: dict[str, DeviceConfig] = {}
+    for name, device in form.devices.items():
+        with errors.collect():
+            devices[name] = _device(file, name, device, buses, path, profiles, known, errors)
     buses = connect_pauses(buses, form, devices)
-    _check_addresses(file, buses, devices)
+    _check_addresses(file, buses, devices, errors)
     system = System(
         name=form.system,
         path=path,
@@ -84,10 +103,10 @@ def load_system(name: str, profiles: Iterable[Path] = ()) -> System:
         commands=form.commands,
         invariants=form.invariants,
         warnings=never_read_back(file, devices) + waits_for_its_command(file, form.plc, devices),
-        serving=resolve_serving(file, form.serve, form.bridge, buses, devices, _outputs(form.plc)),
+        serving=resolve_serving(file, form.serve, form.bridge, buses, devices, _outputs(form.plc), errors),
     )
-    _check_programs(system)
-    _check_write_groups(system)
+    _check_programs(system, errors)
+    _check_write_groups(system, errors)
     return system
 
 
@@ -118,9 +137,12 @@ def _device(
     path: Path,
     profiles: Iterable[Path],
     known: dict[Path, DeviceProfile],
+    errors: ErrorCollector,
 ) -> DeviceConfig:
     loc: tuple[Key, ...] = ("devices", name)
     if d.bus not in buses:
+        if d.bus in file.data["buses"]:
+            raise FollowingError(f"the bus {d.bus!r} has an error", path=file.path)
         raise file.error(
             (*loc, "bus"), f"no bus {d.bus!r}", expected="one of " + ", ".join(buses), hint=did_you_mean(d.bus, buses)
         )
@@ -128,7 +150,7 @@ def _device(
         found = find("devices", d.profile, beside=path, extra=profiles)
         profile = known[found] if found in known else known.setdefault(found, load_profile(found))
     except UsageError as e:
-        raise file.error((*loc, "profile"), e.message, expected=e.expected) from e
+        raise file.error((*loc, "profile"), e.message, expected=e.expected, hint=e.hint) from e
     is_can = buses[d.bus].endpoint.is_can
     if is_can != (profile.protocol == "canopen"):
         raise file.error((*loc, "bus"), f"a {profile.protocol} device on {buses[d.bus].endpoint}")
@@ -146,67 +168,77 @@ def _device(
         expect=dict(d.expect),
         stale_after_ms=d.stale_after_ms,
         writable=frozenset(d.writable),
-        safe=_safe_outputs(file, loc, d, profile),
+        safe=_safe_outputs(file, loc, d, profile, errors),
         write_groups={group: tuple(tags) for group, tags in d.write_groups.items()},
         heartbeat=Heartbeat(d.heartbeat.producer_ms, d.heartbeat.consumer_ms) if d.heartbeat else None,
         tpdo1=Tpdo(tuple(d.tpdo1.map), d.tpdo1.event_ms) if d.tpdo1 else None,
         start=d.start,
         canopen=canopen_node(file, loc, d, path, profiles, is_can=is_can),
     )
-    _check_device(file, loc, d, config)
+    _check_device(file, loc, d, config, errors)
     check_rpdo1(file, loc, d, profile, bool(buses[d.bus].canopen.sync_ms))
     return device_pace(file, loc, d, config)
 
 
-def _check_device(file: YamlFile, loc: tuple[Key, ...], d: DeviceForm, config: DeviceConfig) -> None:
+def _check_device(
+    file: YamlFile, loc: tuple[Key, ...], d: DeviceForm, config: DeviceConfig, errors: ErrorCollector
+) -> None:
     """Check that every tag and poll group in the device's entry exists in its profile and fits its use."""
     profile = config.profile
     groups = [*profile.groups, *(["inbox"] if profile.inbox else [])]
     for group in d.poll:
         if group not in groups:
-            raise file.error(
+            error = file.error(
                 (*loc, "poll", group),
                 f"no poll group {group!r}",
                 expected=", ".join(groups),
                 hint=did_you_mean(group, groups),
             )
+            errors.add(error)
     for tag in d.expect:
-        _known(file, (*loc, "expect", tag), profile, tag)
+        with errors.collect():
+            _known(file, (*loc, "expect", tag), profile, tag)
     for i, tag in enumerate(d.tpdo1.map if d.tpdo1 else []):
-        _known(file, (*loc, "tpdo1", "map", i), profile, tag)
+        with errors.collect():
+            _known(file, (*loc, "tpdo1", "map", i), profile, tag)
 
 
 def _safe_outputs(
-    file: YamlFile, loc: tuple[Key, ...], d: DeviceForm, profile: DeviceProfile
+    file: YamlFile, loc: tuple[Key, ...], d: DeviceForm, profile: DeviceProfile, errors: ErrorCollector
 ) -> dict[str, int | float]:
     """Check `writable` and `safe`. Return the safe value of each tag as a number; the file may give the name of a value."""
     mailbox = {"outbox", "inbox_ack"} if profile.inbox else set()
     for i, tag in enumerate(d.writable):
         if tag not in mailbox:
-            _writable(file, (*loc, "writable", i), profile, tag)
+            with errors.collect():
+                _writable(file, (*loc, "writable", i), profile, tag)
     numbers: dict[str, int | float] = {}
     for tag, given in d.safe.items():
-        spot = (*loc, "safe", tag)
-        described = _writable(file, spot, profile, tag)
-        if tag not in d.writable:
-            raise file.error(spot, f"{tag!r} has a safe value and is not in `writable`")
-        value = described.number_of(given)
-        names = [name for _, name in described.values]
-        if isinstance(value, str) or (isinstance(given, bool) and not described.is_bit):
-            raise file.error(
-                spot,
-                f"the safe value of {tag!r}",
-                expected=" or ".join(["true or false" if described.is_bit else "a number", *names]),
-                got=str(given).lower() if isinstance(given, bool) else repr(given),
-                hint=did_you_mean(value, names) if isinstance(value, str) else "",
-            )
-        limits = described.limits
-        if limits and not limits[0] <= value <= limits[1]:
-            raise file.error(
-                spot, f"the safe value of {tag!r}", expected=f"{limits[0]:g} to {limits[1]:g}", got=f"{given}"
-            )
-        numbers[tag] = int(value) if isinstance(value, bool) else value
+        with errors.collect():
+            numbers[tag] = _safe_output(file, (*loc, "safe", tag), d, profile, tag, given)
     return numbers
+
+
+def _safe_output(
+    file: YamlFile, loc: tuple[Key, ...], d: DeviceForm, profile: DeviceProfile, tag: str, given: float | bool | str
+) -> int | float:
+    described = _writable(file, loc, profile, tag)
+    if tag not in d.writable:
+        raise file.error(loc, f"{tag!r} has a safe value and is not in `writable`")
+    value = described.number_of(given)
+    names = [name for _, name in described.values]
+    if isinstance(value, str) or (isinstance(given, bool) and not described.is_bit):
+        raise file.error(
+            loc,
+            f"the safe value of {tag!r}",
+            expected=" or ".join(["true or false" if described.is_bit else "a number", *names]),
+            got=str(given).lower() if isinstance(given, bool) else repr(given),
+            hint=did_you_mean(value, names) if isinstance(value, str) else "",
+        )
+    limits = described.limits
+    if limits and not limits[0] <= value <= limits[1]:
+        raise file.error(loc, f"the safe value of {tag!r}", expected=f"{limits[0]:g} to {limits[1]:g}", got=f"{given}")
+    return int(value) if isinstance(value, bool) else value
 
 
 def _known(file: YamlFile, loc: tuple[Key, ...], profile: DeviceProfile, tag: str) -> Tag:
@@ -227,7 +259,9 @@ def _writable(file: YamlFile, loc: tuple[Key, ...], profile: DeviceProfile, name
     return tag
 
 
-def _check_addresses(file: YamlFile, buses: dict[str, BusConfig], devices: dict[str, DeviceConfig]) -> None:
+def _check_addresses(
+    file: YamlFile, buses: dict[str, BusConfig], devices: dict[str, DeviceConfig], errors: ErrorCollector
+) -> None:
     """Check that the devices on a bus have different addresses. Two buses on one CAN interface count as one."""
     taken: dict[tuple[str, int], str] = {}
     for name, device in devices.items():
@@ -236,16 +270,17 @@ def _check_addresses(file: YamlFile, buses: dict[str, BusConfig], devices: dict[
         if key in taken:
             what, other = "node" if device.profile.protocol == "canopen" else "unit", taken[key]
             where = "" if devices[other].bus == device.bus else f" on {devices[other].bus!r}"
-            raise file.error(
+            error = file.error(
                 ("devices", name, what),
                 f"{name!r} has {what} {device.address} on {device.bus!r}, and so has {other!r}{where}",
-                expected=f"a {what} different id",
+                expected=f"a different {what} id",
                 hint=f"{other!r} is in line {file.line(('devices', other, what))}",
             )
+            errors.add(error)
         taken[key] = name
 
 
-def _check_programs(system: System) -> None:
+def _check_programs(system: System, errors: ErrorCollector) -> None:
     """Check that inputs and outputs of programs are tags or messages of devices, and that one program only writes an
     output.
     """
@@ -255,24 +290,34 @@ def _check_programs(system: System) -> None:
         for variable, form in program.inputs.items():
             if form.tag.partition(".")[0] in system.plc.programs:
                 continue  # another program's variable: checked where the programs are assembled
-            device, local = _split(system, (*loc, "inputs", variable, "tag"), form.tag)
-            names = [t.name for t in device.profile.tags.values() if t.readable and not t.is_text]
-            names += [*device.profile.messages, *(["inbox"] if device.profile.inbox else [])]
-            _in(system.file, (*loc, "inputs", variable, "tag"), device, local, names)
+            with errors.collect():
+                _check_input(system, (*loc, "inputs", variable, "tag"), form.tag)
         for variable, tag in program.outputs.items():
             spot = (*loc, "outputs", variable)
-            device, local = _split(system, spot, tag)
-            names = [t.name for t in device.profile.tags.values() if t.writable]
-            names += ["outbox"] if device.profile.outbox else []
-            _in(system.file, spot, device, local, names)
-            if local not in device.writable:
-                raise system.file.error(spot, f"{tag!r} is not in `writable` of {device.name!r}")
-            if tag in written:
-                raise system.file.error(spot, f"{tag!r} is already written by {written[tag]!r}")
-            written[tag] = name
+            with errors.collect():
+                _check_output(system, spot, tag)
+                if tag in written:
+                    raise system.file.error(spot, f"{tag!r} is already written by {written[tag]!r}")
+                written[tag] = name
 
 
-def _check_write_groups(system: System) -> None:
+def _check_input(system: System, loc: tuple[Key, ...], tag: str) -> None:
+    device, local = _split(system, loc, tag, system.plc.programs)
+    names = [t.name for t in device.profile.tags.values() if t.readable and not t.is_text]
+    names += [*device.profile.messages, *(["inbox"] if device.profile.inbox else [])]
+    _in(system.file, loc, device, local, names)
+
+
+def _check_output(system: System, loc: tuple[Key, ...], tag: str) -> None:
+    device, local = _split(system, loc, tag)
+    names = [t.name for t in device.profile.tags.values() if t.writable]
+    names += ["outbox"] if device.profile.outbox else []
+    _in(system.file, loc, device, local, names)
+    if local not in device.writable:
+        raise system.file.error(loc, f"{tag!r} is not in `writable` of {device.name!r}")
+
+
+def _check_write_groups(system: System, errors: ErrorCollector) -> None:
     """Check that members of groups are outputs of programs, each in one group only, so that none is written alone."""
     written = set(_outputs(system.plc))
     for name, device in system.devices.items():
@@ -282,23 +327,23 @@ def _check_write_groups(system: System) -> None:
                 at = ("devices", name, "write_groups", group, n)
                 if f"{name}.{tag}" not in written or device.profile.inbox is not None:
                     outputs = [t.partition(".")[2] for t in sorted(written) if t.partition(".")[0] == name]
-                    raise system.file.error(
+                    error = system.file.error(
                         at,
                         f"{tag!r} is not an output of a program, so it cannot be in a group",
                         expected=", ".join(outputs) or "outputs of programs; this device has none",
                         hint=did_you_mean(tag, outputs),
                     )
+                    errors.add(error)
                 if tag in seen:
-                    raise system.file.error(at, f"{tag!r} is already in the group {seen[tag]!r}")
+                    errors.add(system.file.error(at, f"{tag!r} is already in the group {seen[tag]!r}"))
                 seen[tag] = group
 
 
-def _split(system: System, loc: tuple[Key, ...], tag: str) -> tuple[DeviceConfig, str]:
+def _split(system: System, loc: tuple[Key, ...], tag: str, programs: Iterable[str] = ()) -> tuple[DeviceConfig, str]:
+    """Return the device and the local name of DEVICE.TAG. `programs` may be meant instead, for the error."""
     device, _, local = tag.partition(".")
     if device not in system.devices:
-        raise system.file.error(
-            loc, f"no device {device!r}", expected=", ".join(system.devices), hint=did_you_mean(device, system.devices)
-        )
+        raise no_device(system.file, loc, device, programs)
     return system.devices[device], local
 
 

@@ -19,6 +19,7 @@ from fieldtwin.cli.option_groups import GroupedCommand, group, option
 from fieldtwin.cli.options import Duration
 from fieldtwin.cli.test.check_device_command import canopen, modbus
 from fieldtwin.cli.test.check_options import IMPACTS, CaseOptions, ResultOptions
+from fieldtwin.cli.test.check_site_command import site
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.results.subject import who
@@ -36,7 +37,7 @@ _OBJECT = re.compile(r"^([0-9A-Fa-f]{4}):([0-9A-Fa-f]{2})=((?:[0-9A-Fa-f]{2})+)$
 
 @click.group("check")
 def command() -> None:
-    """Run conformance tests on a device, or on a client or master with devices that misbehave.
+    """Run conformance tests on a device, or on a client or master with devices that misbehave; or check a site's files.
 
     Exit code 0 if test cases passed and none that --fail-on counts has failed, else 1. SKIPPED and INCONCLUSIVE neither pass
     nor fail.
@@ -322,3 +323,4 @@ def _held(texts: tuple[str, ...]) -> dict[tuple[Table, int], int]:
 
 command.add_command(modbus)
 command.add_command(canopen)
+command.add_command(site)

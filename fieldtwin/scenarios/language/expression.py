@@ -11,7 +11,7 @@ from itertools import pairwise
 from math import isnan
 from typing import Any
 
-from fieldtwin.gateway.core.expressions import ARITHMETIC, COMPARE, OF_NUMBERS, Parsed, dotted
+from fieldtwin.gateway.core.expressions import ARITHMETIC, COMPARE, OF_NUMBERS, NotUnderstood, Parsed, dotted
 from fieldtwin.gateway.core.files.nearest import did_you_mean
 from fieldtwin.gateway.core.values import Quality, Reason
 
@@ -27,6 +27,15 @@ _OWN = ("plc.late", "command_pending")
 """``plc.late``: the seconds by which the last scan was late; ``command pending``: the remote client commanded within 5 s."""
 Look = Callable[[str, str], Any]
 """``look(function, name)`` returns the current value of a function of a tag or variable, or None if it is unknown."""
+
+
+class UnknownName(NotUnderstood):
+    """An expression contains a `name` that the system does not have. `others` are the errors of its further unknown names."""
+
+    def __init__(self, name: str, error: NotUnderstood) -> None:
+        super().__init__(error.message, error.at_column, expected=error.expected, hint=error.hint)
+        self.name = name
+        self.others: list[UnknownName] = []
 
 
 class Expression:
@@ -55,7 +64,12 @@ class Expression:
         self._known = known
         self._words = words
         self._prefix = prefix
+        self._unknown: list[UnknownName] = []
         self._check(self._tree)
+        if self._unknown:
+            first = self._unknown[0]
+            first.others = self._unknown[1:]
+            raise first
 
     def evaluate(self, look: Look) -> Any:
         """Return its value now, or None if the value is unknown.
@@ -132,7 +146,8 @@ class Expression:
         if name not in self._known:
             hint = did_you_mean(name, self._known)
             expected = "DEVICE.TAG or PROGRAM.VARIABLE"
-            raise self._parsed.error(f"no tag or variable {name!r}", node, expected=expected, hint=hint)
+            error = self._parsed.error(f"no tag or variable {name!r}", node, expected=expected, hint=hint)
+            self._unknown.append(UnknownName(name, error))
         self.names.append(self._prefix + name)
 
 

@@ -2,20 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from fieldtwin.emulators.faults.schema import FaultSpec, checked, parse_fault, seconds
-from fieldtwin.gateway.core.errors import FileInvalid, UsageError
-from fieldtwin.gateway.core.expressions import NotUnderstood
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.files.error_collector import ErrorCollector, FollowingError, collecting
 from fieldtwin.gateway.core.files.nearest import did_you_mean
 from fieldtwin.gateway.core.files.yaml_file import Key, YamlFile, load, validate
 from fieldtwin.scenarios.bench import Can
 from fieldtwin.scenarios.language.expression import QUALITIES, Expression
 from fieldtwin.scenarios.language.invariants import Invariants, load_invariants
+from fieldtwin.scenarios.language.located_expression import read_expression
 from fieldtwin.scenarios.language.probe_form import Probe, read_probe
-from fieldtwin.scenarios.language.words import WORDS, Bounds, Expect, ScenarioForm, Set, Step, Time, WireForm
+from fieldtwin.scenarios.language.words import (
+    WORDS,
+    Bounds,
+    Cycle,
+    Expect,
+    Rate,
+    ScenarioForm,
+    Set,
+    Step,
+    Time,
+    WireForm,
+)
 from fieldtwin.twin.prototype.fault_aims import target
 from fieldtwin.twin.prototype.group import SystemGroup, load_group
 from fieldtwin.twin.site.schema import NONE_STATED
@@ -56,6 +68,8 @@ class Scenario:
     """The tags and variables that the scenario uses."""
     invariants: Invariants = field(default_factory=Invariants)
     """The invariants of the system file, or of each system file of the group."""
+    incomplete: frozenset[str] = frozenset()
+    """The devices, buses and programs that have errors in the system file, so that references to them cannot be checked."""
 
     def line(self, *loc: Key) -> str:
         """Return FILE:LINE of a part of the scenario."""
@@ -64,35 +78,20 @@ class Scenario:
 
     def expression(self, text: str, *loc: Key) -> Expression:
         """Return `text` as an expression. Raises `FileInvalid` with its place."""
-        try:
-            expression = Expression(text, self.known, self.words)
-        except UsageError as e:
-            error = self.file.error(loc, e.message, expected=e.expected, got=e.got, hint=e.hint)
-            raise self._inside(error, text, e.at_column if isinstance(e, NotUnderstood) else 0) from e
+        expression = read_expression(self.file, loc, text, self.known, self.words, incomplete=self.incomplete)
         self.used.update(expression.names)
         return expression
 
-    def _inside(self, error: FileInvalid, text: str, offset: int) -> FileInvalid:
-        """Return the error with its exact place inside the expression, if the file has the expression unchanged in one
-        line.
-        """
-        try:
-            line = self.path.read_text(encoding="utf-8").splitlines()[(error.line or 1) - 1]
-        except (OSError, IndexError):
-            return error
-        begins = line.find(text, (error.column or 1) - 1)
-        if begins < 0:
-            return error
-        return FileInvalid(
-            error.message, path=error.path, line=error.line, column=begins + 1 + offset, expected=error.expected,
-            got=error.got, hint=error.hint,
-        )  # fmt: skip
 
-
-def names_of(system: System, group: SystemGroup | None = None) -> dict[str, tuple[str, ...]]:
+def names_of(
+    system: System, group: SystemGroup | None = None, errors: ErrorCollector | None = None
+) -> dict[str, tuple[str, ...]]:
     """Return the names that expressions may contain: DEVICE.TAG and PROGRAM.VARIABLE, in a group after the name of
-    their system. The value is a tuple of the words that a program's state can be, and empty for all other names."""
-    from fieldtwin.twin.plant.physical import image_layout
+    their system. The value is a tuple of the words that a program's state can be, and empty for all other names.
+
+    Raises `FileInvalid` for a program that cannot be created or bound; with `errors`, such errors are added to it.
+    """
+    from fieldtwin.twin.plant.physical import bound_programs
 
     if group is not None:
         of_all = [(m.name, names_of(m.system)) for m in group.members.values()]
@@ -100,73 +99,114 @@ def names_of(system: System, group: SystemGroup | None = None) -> dict[str, tupl
     names: dict[str, tuple[str, ...]] = {
         f"{d.name}.{t.name}": () for d in system.devices.values() for t in d.profile.tags.values()
     }
-    states = {f"{program}.state" for program in system.plc.programs}
-    for region in image_layout(system).regions:
-        for spec in region.tags:
-            names[spec.name] = tuple(word for _, word in spec.words) if spec.name in states else ()
+    with collecting(errors) as collector:
+        for program in bound_programs(system, collector):
+            inputs = [binding.tag for binding in program.inputs.values()]
+            names |= {tag: () for tag in inputs if tag.partition(".")[0] in system.devices}
+            for variable, tag in program.published():
+                if tag.partition(".")[0] in (program.name, *system.devices):
+                    is_state = tag == f"{program.name}.state"
+                    names[tag] = tuple(word for _, word in variable.words) if is_state else ()
     return names
 
 
-def invariants_of(system: System, group: SystemGroup | None = None) -> Invariants:
-    """Return the invariants of a system, or of all systems of a group. Raises `FileInvalid`."""
-    if group is None:
-        return load_invariants(system, names_of(system)) if system.invariants != NONE_STATED else Invariants()
-    every = [load_invariants(m.system, names_of(m.system), m.prefix) for m in group.members.values()]
-    return sum(every, Invariants())
+def invariants_of(system: System, group: SystemGroup | None = None, errors: ErrorCollector | None = None) -> Invariants:
+    """Return the invariants of a system, or of all systems of a group.
+
+    Raises `FileInvalid`; with `errors`, the errors are added to it.
+    """
+    members = [("", system)] if group is None else [(m.prefix, m.system) for m in group.members.values()]
+    every = Invariants()
+    with collecting(errors) as collector:
+        for prefix, one in members:
+            if one.invariants != NONE_STATED:
+                names = names_of(one, errors=collector)
+                every += load_invariants(one, names, collector, incomplete_parts(one, names), prefix)
+    return every
 
 
-def load_scenario(path: Path, profiles: tuple[Path, ...] = ()) -> Scenario:
-    """Read a scenario and check it. Raises `FileInvalid`, `UsageError`."""
+def incomplete_parts(system: System, names: Iterable[str]) -> frozenset[str]:
+    """Return the devices, buses and programs of the system file that were not resolved because of errors.
+
+    `names` are those of the resolved parts, as `names_of` returns them.
+    """
+    known = {*system.devices, *system.buses, *(name.partition(".")[0] for name in names)}
+    return frozenset({*system.file.data["devices"], *system.file.data["buses"], *system.plc.programs} - known)
+
+
+def load_scenario(path: Path, profiles: tuple[Path, ...] = (), errors: ErrorCollector | None = None) -> Scenario:
+    """Read a scenario and check it. Raises `FileInvalid`, `UsageError`.
+
+    With `errors`, the errors of its separate parts, and those of its system file, are added to it; the result must not be
+    run then.
+    """
     file = load(path)
     _check_one_thing(file)
     form = validate(file, ScenarioForm)
-    system, group = _system(file, form, profiles)
+    with collecting(errors) as collector:
+        return _resolve(path, file, form, profiles, collector)
+
+
+def _resolve(
+    path: Path, file: YamlFile, form: ScenarioForm, profiles: tuple[Path, ...], errors: ErrorCollector
+) -> Scenario:
+    system, group = _system(file, form, profiles, errors)
     served = [one.name for one in system.serving.serve]
-    probes = tuple(read_probe(file, name, one, served) for name, one in form.probes.items())
-    own = names_of(system, group)
-    for probe in probes:
-        if probe.name in system.devices or probe.name in system.plc.programs:
-            raise file.error(("probes", probe.name), f"{probe.name!r} is already a device or program of the system")
+    probes: list[Probe] = []
+    for name, one in form.probes.items():
+        with errors.collect():
+            probes.append(read_probe(file, name, one, served))
+            if name in system.devices or name in system.plc.programs:
+                raise file.error(("probes", name), f"{name!r} is already a device or program of the system")
+    own = names_of(system, group, errors)
+    incomplete = incomplete_parts(system, own) if group is None else frozenset()
     known = tuple(dict.fromkeys([*own, *(name for probe in probes for name in probe.names)]))
     scenario = Scenario(
         path,
         form,
         file,
         system,
-        _needs(file, form),
+        _needs(file, form, errors),
         (),
         (),
         known,
         tuple(own),
         {name: words for name, words in own.items() if words},
-        probes,
+        tuple(probes),
         profiles,
         group,
-        invariants=invariants_of(system, group),
+        invariants=invariants_of(system, group, errors),
+        incomplete=incomplete,
     )
-    always = tuple(_looks(scenario, text, ("always", n)) for n, text in enumerate(form.always))
+    always: list[Expression] = []
+    for n, text in enumerate(form.always):
+        with errors.collect():
+            always.append(_looks(scenario, text, ("always", n)))
     never: list[Expression | WireForm] = []
-    for n, one in enumerate(form.never):
-        if isinstance(one, str):
-            never.append(_looks(scenario, one, ("never", n)))
-        else:
-            _known(file, ("never", n, "wire"), "device", one.wire, list(system.devices))
-            _check_register(scenario, one.wire, one.register_, one.value, ("never", n))
-            if one.unless is not None:
-                scenario.expression(one.unless, "never", n, "unless")
-            never.append(one)
-    scenario = replace(scenario, always=always, never=tuple(never))
-    _check_whole_run(scenario)
+    for n, banned in enumerate(form.never):
+        with errors.collect():
+            if isinstance(banned, str):
+                never.append(_looks(scenario, banned, ("never", n)))
+            else:
+                _check_wire(scenario, banned.wire, banned.register_, banned.value, ("never", n))
+                if banned.unless is not None:
+                    scenario.expression(banned.unless, "never", n, "unless")
+                never.append(banned)
+    scenario = replace(scenario, always=tuple(always), never=tuple(never))
+    _check_whole_run(scenario, errors)
     for n, tag in enumerate(form.refused):
-        _known(file, ("refused", n), "tag", tag, scenario.own)
-        scenario.used.add(tag)
+        with errors.collect():
+            _known(file, ("refused", n), "tag", tag, scenario.own, incomplete)
+            scenario.used.add(tag)
     faults: list[str] = []
     for n, step in enumerate(form.steps):
-        _check_step(scenario, step, n)
+        with errors.collect():
+            _check_step(scenario, step, n)
         if step.fault is not None:
             faults.append(str(step.fault.get("id", f"step {n + 1}")))
         if step.clear is not None:
-            _known(file, ("steps", n, "clear"), "fault of an earlier step", step.clear, faults)
+            with errors.collect():
+                _known(file, ("steps", n, "clear"), "fault of an earlier step", step.clear, faults)
     return scenario
 
 
@@ -181,7 +221,9 @@ def _check_one_thing(file: YamlFile) -> None:
             )
 
 
-def _system(file: YamlFile, form: ScenarioForm, profiles: tuple[Path, ...]) -> tuple[System, SystemGroup | None]:
+def _system(
+    file: YamlFile, form: ScenarioForm, profiles: tuple[Path, ...], errors: ErrorCollector
+) -> tuple[System, SystemGroup | None]:
     """Return the system that the file names, from its folder or the shipped ones, or the `whole` of a group."""
     folder = Path(file.path).parent
     beside = folder / form.system
@@ -191,21 +233,23 @@ def _system(file: YamlFile, form: ScenarioForm, profiles: tuple[Path, ...]) -> t
         if group is not None:
             _check_of_group(file, form, group)
             return group.whole, group
-        system = load_system(named, list(profiles))
+        system = load_system(named, list(profiles), errors)
     except UsageError as e:
         raise file.error(("system",), e.message, expected=e.expected, got=e.got, hint=e.hint) from e
     if form.prototype is not None and not (folder / form.prototype).is_file():
         there = [one.name for one in sorted(folder.glob("*.yaml"))]
         hint = did_you_mean(form.prototype, there)
-        raise file.error(("prototype",), f"no file {form.prototype!r} beside it", hint=hint)
+        errors.add(file.error(("prototype",), f"no file {form.prototype!r} beside it", hint=hint))
     return system, None
 
 
-def _needs(file: YamlFile, form: ScenarioForm) -> tuple[Can, ...]:
+def _needs(file: YamlFile, form: ScenarioForm, errors: ErrorCollector) -> tuple[Can, ...]:
     words = [can.value for can in Can]
+    asked = []
     for n, need in enumerate(form.needs):
-        _known(file, ("needs", n), "need", need, words)
-    asked = [Can(need) for need in form.needs]
+        with errors.collect():
+            _known(file, ("needs", n), "need", need, words)
+            asked.append(Can(need))
     if form.probes:
         asked.append(Can.PROBE)
     if form.start is not None:
@@ -256,7 +300,7 @@ def _check_step(scenario: Scenario, step: Step, n: int) -> None:
 
 
 def _check_set(scenario: Scenario, said: Set, loc: tuple[Key, ...]) -> None:
-    _known(scenario.file, (*loc, "tag"), "tag", said.tag, scenario.own)
+    _known(scenario.file, (*loc, "tag"), "tag", said.tag, scenario.own, scenario.incomplete)
     device, _, name = said.tag.rpartition(".")
     found = scenario.system.devices.get(device)
     if found is None or name not in found.profile.tags or said.value is None:
@@ -268,6 +312,8 @@ def _check_set(scenario: Scenario, said: Set, loc: tuple[Key, ...]) -> None:
 
 def _aim(scenario: Scenario, spec: FaultSpec) -> None:
     """Check a fault's aim. Raises `WrongAim` if it is neither in the system nor in what the systems of a group share."""
+    if not scenario.incomplete.isdisjoint((spec.aim.device, spec.aim.bus)):
+        raise FollowingError("a part of the system has an error", path=scenario.file.path)
     if scenario.group is not None:
         scenario.group.check_fault(spec)
     else:
@@ -301,24 +347,23 @@ def _check_expect(scenario: Scenario, expect: Expect, loc: tuple[Key, ...]) -> N
     _check_numbers(scenario.file, expect, loc)
     if expect.quality is not None:
         _known(scenario.file, (*loc, "quality"), "quality", expect.quality, QUALITIES)
-    if expect.like is not None and (expect.tag or "").rpartition(".")[0] not in scenario.system.devices:
-        raise scenario.file.error((*loc, "like"), "`like: device` needs a tag of a device", expected="tag: DEVICE.TAG")
     if expect.tag is not None:
-        _known(scenario.file, (*loc, "tag"), "tag", expect.tag, scenario.known)
+        _known(scenario.file, (*loc, "tag"), "tag", expect.tag, scenario.known, scenario.incomplete)
         words = scenario.words.get(expect.tag, ())
         if words and isinstance(expect.value, str):
             _known(scenario.file, (*loc, "value"), f"value of {expect.tag}", expect.value, words)
         scenario.used.add(expect.tag)
+    if expect.like is not None and (expect.tag or "").rpartition(".")[0] not in scenario.system.devices:
+        raise scenario.file.error((*loc, "like"), "`like: device` needs a tag of a device", expected="tag: DEVICE.TAG")
     if expect.wire is not None:
-        devices = scenario.system.devices
-        _known(scenario.file, (*loc, "wire"), "device", expect.wire, list(devices))
-        _check_register(scenario, expect.wire, expect.register_, expect.value, loc)
+        _check_wire(scenario, expect.wire, expect.register_, expect.value, loc)
     if expect.that is not None:
         _looks(scenario, expect.that, (*loc, "that"))
 
 
-def _check_register(scenario: Scenario, device: str, register: str | None, value: object, loc: tuple[Key, ...]) -> None:
+def _check_wire(scenario: Scenario, device: str, register: str | None, value: object, loc: tuple[Key, ...]) -> None:
     """Check that `register` is a tag of the device. A `value` needs a register: without one it would never match."""
+    _known(scenario.file, (*loc, "wire"), "device", device, list(scenario.system.devices), scenario.incomplete)
     if register is not None:
         tags = list(scenario.system.devices[device].profile.tags)
         _known(scenario.file, (*loc, "register"), f"tag of {device}", register, tags)
@@ -367,51 +412,61 @@ def _check_bounds(file: YamlFile, loc: tuple[Key, ...], bounds: Bounds | None) -
         raise file.error(loc, "these bounds can never be met", got=f"min {bounds.min:g}, max {bounds.max:g}")
 
 
-def _check_whole_run(scenario: Scenario) -> None:
+def _check_whole_run(scenario: Scenario, errors: ErrorCollector) -> None:
     """Check the rules of the whole run: `within`, `rate`, `cycle`."""
-    file, form = scenario.file, scenario.form
-    for n, within in enumerate(form.within):
-        _looks(scenario, within.after, ("within", n, "after"))
-        _looks(scenario, within.then, ("within", n, "then"))
-        _time(file, ("within", n, "within"), within.within)
-    for n, rate in enumerate(form.rate):
-        loc: tuple[Key, ...] = ("rate", n)
-        ours = (rate.tag is not None, rate.updates_per_s is not None, rate.wire is None, rate.requests_per_s is None)
-        if len(set(ours)) != 1:
-            expected = "tag and updates_per_s, or wire and requests_per_s"
-            raise file.error(loc, "a rate needs a tag or a wire", expected=expected)
-        if rate.tag is not None:
-            _known(file, (*loc, "tag"), "tag", rate.tag, scenario.known)
-            scenario.used.add(rate.tag)
-        if rate.wire is not None:
-            _known(file, (*loc, "wire"), "device", rate.wire, list(scenario.system.devices))
-        _check_bounds(file, (*loc, "updates_per_s"), rate.updates_per_s)
-        _check_bounds(file, (*loc, "requests_per_s"), rate.requests_per_s)
-        if _time(file, (*loc, "over"), rate.over) <= 0:
-            raise file.error((*loc, "over"), "a rate needs a time", expected="over: 10s")
-        if rate.while_ is not None:
-            scenario.expression(rate.while_, *loc, "while")
-    for n, cycle in enumerate(form.cycle):
-        loc = ("cycle", n)
-        bounds = (cycle.min is not None or cycle.max is not None) and cycle.changes_of is not None
-        if bounds == (cycle.late is not None):
-            raise file.error(loc, "a cycle needs bounds", expected="changes_of: NAME with min or max; or late: 5ms")
-        if cycle.changes_of is not None:
-            _known(file, (*loc, "changes_of"), "tag or variable", cycle.changes_of, scenario.known)
-            scenario.used.add(cycle.changes_of)
-        times = {
-            key: _time(file, (*loc, key), said)
-            for key in ("min", "max", "late")
-            if (said := getattr(cycle, key)) is not None
-        }
-        if times == {"min": 0}:
-            raise file.error(
-                (*loc, "min"), "this bound holds whatever comes", expected="min above 0, or max", got="min 0"
-            )
-        if times.get("min", 0) > times.get("max", times.get("min", 0)):
-            raise file.error(loc, "these bounds can never be met", got=f"min {cycle.min}, max {cycle.max}")
-        if cycle.while_ is not None:
-            scenario.expression(cycle.while_, *loc, "while")
+    for n, within in enumerate(scenario.form.within):
+        for key, text in (("after", within.after), ("then", within.then)):
+            with errors.collect():
+                _looks(scenario, text, ("within", n, key))
+        with errors.collect():
+            _time(scenario.file, ("within", n, "within"), within.within)
+    for n, rate in enumerate(scenario.form.rate):
+        with errors.collect():
+            _check_rate(scenario, rate, ("rate", n))
+    for n, cycle in enumerate(scenario.form.cycle):
+        with errors.collect():
+            _check_cycle(scenario, cycle, ("cycle", n))
+
+
+def _check_rate(scenario: Scenario, rate: Rate, loc: tuple[Key, ...]) -> None:
+    file = scenario.file
+    ours = (rate.tag is not None, rate.updates_per_s is not None, rate.wire is None, rate.requests_per_s is None)
+    if len(set(ours)) != 1:
+        expected = "tag and updates_per_s, or wire and requests_per_s"
+        raise file.error(loc, "a rate needs a tag or a wire", expected=expected)
+    if rate.tag is not None:
+        _known(file, (*loc, "tag"), "tag", rate.tag, scenario.known, scenario.incomplete)
+        scenario.used.add(rate.tag)
+    if rate.wire is not None:
+        _known(file, (*loc, "wire"), "device", rate.wire, list(scenario.system.devices), scenario.incomplete)
+    _check_bounds(file, (*loc, "updates_per_s"), rate.updates_per_s)
+    _check_bounds(file, (*loc, "requests_per_s"), rate.requests_per_s)
+    if _time(file, (*loc, "over"), rate.over) <= 0:
+        raise file.error((*loc, "over"), "a rate needs a time", expected="over: 10s")
+    if rate.while_ is not None:
+        scenario.expression(rate.while_, *loc, "while")
+
+
+def _check_cycle(scenario: Scenario, cycle: Cycle, loc: tuple[Key, ...]) -> None:
+    file = scenario.file
+    bounds = (cycle.min is not None or cycle.max is not None) and cycle.changes_of is not None
+    if bounds == (cycle.late is not None):
+        raise file.error(loc, "a cycle needs bounds", expected="changes_of: NAME with min or max; or late: 5ms")
+    if cycle.changes_of is not None:
+        known, incomplete = scenario.known, scenario.incomplete
+        _known(file, (*loc, "changes_of"), "tag or variable", cycle.changes_of, known, incomplete)
+        scenario.used.add(cycle.changes_of)
+    times = {
+        key: _time(file, (*loc, key), said)
+        for key in ("min", "max", "late")
+        if (said := getattr(cycle, key)) is not None
+    }
+    if times == {"min": 0}:
+        raise file.error((*loc, "min"), "this bound is always met", expected="min above 0, or max", got="min 0")
+    if times.get("min", 0) > times.get("max", times.get("min", 0)):
+        raise file.error(loc, "these bounds can never be met", got=f"min {cycle.min}, max {cycle.max}")
+    if cycle.while_ is not None:
+        scenario.expression(cycle.while_, *loc, "while")
 
 
 def _time(file: YamlFile, loc: tuple[Key, ...], text: Time) -> float:
@@ -421,8 +476,17 @@ def _time(file: YamlFile, loc: tuple[Key, ...], text: Time) -> float:
         raise file.error(loc, e.message, expected=e.expected, got=e.got, hint=e.hint) from e
 
 
-def _known(file: YamlFile, loc: tuple[Key, ...], what: str, name: str, known: Sequence[str]) -> None:
+def _known(
+    file: YamlFile,
+    loc: tuple[Key, ...],
+    what: str,
+    name: str,
+    known: Sequence[str],
+    incomplete: Container[str] = frozenset(),
+) -> None:
     if name in known:
         return
+    if name.partition(".")[0] in incomplete:
+        raise FollowingError("a part of the system has an error", path=file.path)
     hint = did_you_mean(name, known)
     raise file.error(loc, f"no {what} {name!r}", expected=", ".join(known) if len(known) < 30 else "", hint=hint)

@@ -4,13 +4,15 @@ system.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Container, Mapping
 from dataclasses import dataclass
 
 from fieldtwin.emulators.faults.schema import seconds
 from fieldtwin.gateway.core.errors import UsageError
-from fieldtwin.gateway.core.files.yaml_file import Key
+from fieldtwin.gateway.core.files.error_collector import ErrorCollector
+from fieldtwin.gateway.core.files.yaml_file import Key, YamlFile
 from fieldtwin.scenarios.language.expression import Expression
+from fieldtwin.scenarios.language.located_expression import read_expression
 from fieldtwin.twin.site.system import System
 
 
@@ -59,44 +61,57 @@ class Invariants:
         return {name for expression in every for name in expression.names}
 
 
-def load_invariants(system: System, names: Mapping[str, tuple[str, ...]], prefix: str = "") -> Invariants:
+def load_invariants(
+    system: System,
+    names: Mapping[str, tuple[str, ...]],
+    errors: ErrorCollector,
+    incomplete: Container[str] = frozenset(),
+    prefix: str = "",
+) -> Invariants:
     """Read the invariants of a system file. `names` are the names that expressions may contain, with the words that a
-    state can be.
+    state can be; `incomplete` are the devices and programs that have errors.
 
-    `prefix` is the system's name in its network, with a dot; the names of the result begin with it. Raises
-    `FileInvalid`.
+    `prefix` is the system's name in its network, with a dot; the names of the result begin with it. Errors are added to
+    `errors`; the result contains the invariants without error.
     """
-    form = system.invariants
+    form, file = system.invariants, system.file
     words = {name: states for name, states in names.items() if states}
+    stated: list[Stated] = []
+    followed: list[Followed] = []
 
     def expression(text: str, *loc: Key) -> Expression:
-        try:
-            read = Expression(text, names, words, prefix)
-        except UsageError as e:
-            raise system.file.error(loc, e.message, expected=e.expected, got=e.got, hint=e.hint) from e
+        read = read_expression(file, loc, text, names, words, prefix=prefix, incomplete=incomplete)
         if read.is_constant:
-            raise system.file.error(
-                loc, "the expression refers to no value", expected="a tag or a variable in it", got=text
-            )
+            expected = "a tag or a variable in it"
+            raise file.error(loc, "the expression refers to no value", expected=expected, got=text)
         return read
 
     def where(*loc: Key) -> str:
-        return f"{system.path}:{system.file.line(loc)}"
+        return f"{system.path}:{file.line(loc)}"
 
-    def stated() -> Iterator[Stated]:
-        for word, texts, wanted in (("always", form.always, True), ("never", form.never, False)):
-            for n, text in enumerate(texts):
-                loc = ("invariants", word, n)
-                yield Stated(f"{prefix}invariant {word} {n + 1}", where(*loc), expression(text, *loc), wanted)
+    for word, texts, wanted in (("always", form.always, True), ("never", form.never, False)):
+        for n, text in enumerate(texts):
+            loc: tuple[Key, ...] = ("invariants", word, n)
+            with errors.collect():
+                number = f"{prefix}invariant {word} {n + 1}"
+                stated.append(Stated(number, where(*loc), expression(text, *loc), wanted))
+    for n, one in enumerate(form.within):
+        loc = ("invariants", "within", n)
+        after = then = None
+        with errors.collect():
+            after = expression(one.after, *loc, "after")
+        with errors.collect():
+            then = expression(one.then, *loc, "then")
+        with errors.collect():
+            limit_s = _seconds(file, (*loc, "within"), one.within)
+            if after is not None and then is not None:
+                number = f"{prefix}invariant within {n + 1}"
+                followed.append(Followed(number, where(*loc), after, then, limit_s))
+    return Invariants(tuple(stated), tuple(followed))
 
-    def followed() -> Iterator[Followed]:
-        for n, one in enumerate(form.within):
-            loc = ("invariants", "within", n)
-            try:
-                limit_s = seconds(one.within)
-            except UsageError as e:
-                raise system.file.error((*loc, "within"), e.message, expected=e.expected, got=e.got, hint=e.hint) from e
-            after, then = expression(one.after, *loc, "after"), expression(one.then, *loc, "then")
-            yield Followed(f"{prefix}invariant within {n + 1}", where(*loc), after, then, limit_s)
 
-    return Invariants(tuple(stated()), tuple(followed()))
+def _seconds(file: YamlFile, loc: tuple[Key, ...], text: str) -> float:
+    try:
+        return seconds(text)
+    except UsageError as e:
+        raise file.error(loc, e.message, expected=e.expected, got=e.got, hint=e.hint) from e

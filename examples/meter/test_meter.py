@@ -1,4 +1,4 @@
-"""The driver's tests, against an emulated meter: `pip install fieldtwin[test]`, `pytest`."""
+"""The driver's tests, against an emulated meter; run them with `pytest`."""
 
 from __future__ import annotations
 

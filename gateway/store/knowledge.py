@@ -8,6 +8,7 @@ from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.core.url_secrets import has_password, without_password
 from fieldtwin.gateway.store.event import KnowledgeStore
 from fieldtwin.gateway.store.sqlite_knowledge import Offload, SqliteKnowledge
+from fieldtwin.installation import install_hint
 
 URLS = ("postgresql://", "postgres://")
 
@@ -32,5 +33,5 @@ async def open_knowledge(place: str, *, max_bytes: int = 0, offload: Offload | N
     try:
         from fieldtwin.gateway.store.postgres_knowledge import PostgresKnowledge  # an extra
     except ModuleNotFoundError as e:
-        raise UsageError("PostgreSQL needs an extra", hint="pip install 'fieldtwin[postgres]'") from e
+        raise UsageError("PostgreSQL needs an extra", hint=install_hint("postgres")) from e
     return await PostgresKnowledge.open(place)

@@ -17,6 +17,7 @@ from fieldtwin.gateway.core.clock import Clock
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.core.url_secrets import without_password
+from fieldtwin.installation import install_hint
 from fieldtwin.twin.site.system import System
 from fieldtwin.twin.thread.link import Carrier
 from fieldtwin.twin.thread.thread import schema_of
@@ -42,7 +43,7 @@ def broker_carrier(place: str, clock: Clock, plant: System | None) -> Carrier:
     try:
         from fieldtwin.twin.thread.mqtt import Broker, MqttCarrier  # an extra
     except ModuleNotFoundError as e:
-        raise UsageError("MQTT needs an extra", hint="pip install 'fieldtwin[mqtt]'") from e
+        raise UsageError("MQTT needs an extra", hint=install_hint("mqtt")) from e
     from fieldtwin.twin.thread.sparkplug import EdgeNode, HostApplication, types_of
 
     url, group, node, said = _split(place)

@@ -31,6 +31,7 @@ from fieldtwin.gateway.core.files.profile import DeviceProfile
 from fieldtwin.gateway.core.files.recording import RecordedExchange, RecordingHeader, RecordingReader, SignalRow
 from fieldtwin.gateway.core.values import Scalar
 from fieldtwin.gateway.protocols.modbus.crc import with_crc
+from fieldtwin.installation import install_hint
 
 BATCH = 10_000
 """Number of rows of a Parquet file that are held in memory."""
@@ -192,7 +193,7 @@ def _write_parquet(out: Path, columns: Sequence[Column], rows: Rows) -> int:
         import pyarrow as pa
         import pyarrow.parquet as pq
     except ImportError:
-        raise UsageError("Parquet needs pyarrow", hint='pip install "fieldtwin[parquet]"') from None
+        raise UsageError("Parquet needs pyarrow", hint=install_hint("parquet")) from None
     kinds: dict[type, Any] = {float: pa.float64(), int: pa.int64(), str: pa.string()}
     schema = pa.schema([(c.name, kinds[c.kind]) for c in columns])
     count, batch = 0, list[Sequence[Cell]]()

@@ -1,4 +1,4 @@
-"""Plot histories. This is the only file that uses matplotlib, an optional extra: ``pip install fieldtwin[plot]``."""
+"""Plot histories. This is the only file that uses matplotlib, an optional extra."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 from fieldtwin.commissioning.access.watching import History
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.gateway.core.files.profile import Tag
+from fieldtwin.installation import install_hint
 
 MOST_PANELS = 24
 FORMATS = (".png", ".svg", ".pdf")
@@ -20,7 +21,7 @@ def check_plot(path: Path) -> None:
         raise UsageError("unsupported image format", expected=", ".join(FORMATS), got=path.name)
     if not _there():
         raise UsageError(
-            "--plot needs matplotlib", hint="pip install 'fieldtwin[plot]', or --json and your own plotting program"
+            "--plot needs matplotlib", hint=f"{install_hint('plot')}; or use --json and your own plotting program"
         )
 
 

@@ -6,9 +6,9 @@ import json
 from pathlib import Path
 from typing import Any
 
-from fieldtwin.cli.system.schema_command import SCHEMAS
 from fieldtwin.emulators.faults.registry import FAULTS
 from fieldtwin.gateway.core.files.profile import load_profile
+from fieldtwin.site.schemas import SCHEMAS
 
 KINDS = {
     "system": "The plant: buses, devices, programs. `NAME.yaml`",

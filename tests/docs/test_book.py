@@ -19,8 +19,8 @@ import stage as book
 
 import fieldtwin
 from fieldtwin.cli.main import COMMANDS
-from fieldtwin.cli.system.schema_command import SCHEMAS
 from fieldtwin.explain.lookup import everything
+from fieldtwin.site.schemas import SCHEMAS
 
 
 def test_links_between_files_work():

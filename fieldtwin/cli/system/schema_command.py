@@ -1,84 +1,28 @@
-"""`fieldtwin schema`: print the JSON schema of a kind of file, for editors and checks."""
+"""`fieldtwin schema`: print the JSON schema of a kind of file, or write all schemas to a folder, for editors and checks."""
 
 from __future__ import annotations
 
-import json
+import shutil
 import sys
-from collections.abc import Callable
-from typing import Any
+from pathlib import Path
 
 import click
 
-
-def _system() -> dict[str, Any]:
-    from fieldtwin.twin.site.schema import SystemForm
-
-    return SystemForm.model_json_schema()
-
-
-def _prototype() -> dict[str, Any]:
-    from fieldtwin.twin.site.schema import PrototypeForm
-
-    return PrototypeForm.model_json_schema()
-
-
-def _network() -> dict[str, Any]:
-    from fieldtwin.run.virtual.group_kinds import kind_named
-
-    return kind_named("network").schema()
-
-
-def _profile() -> dict[str, Any]:
-    from fieldtwin.gateway.core.files.profile_schema import ProfileForm
-
-    return ProfileForm.model_json_schema()
-
-
-def _faults() -> dict[str, Any]:
-    from fieldtwin.emulators.faults.json_schema import fault_file_schema
-
-    return fault_file_schema()
-
-
-def _scenario() -> dict[str, Any]:
-    """Return the schema of scenarios; the faults of their steps are those of fault files."""
-    from fieldtwin.emulators.faults.json_schema import fault_defs
-    from fieldtwin.scenarios.language.words import ScenarioForm
-
-    schema = ScenarioForm.model_json_schema()
-    schema["$defs"] |= fault_defs()
-    schema["$defs"]["Step"]["properties"]["fault"] = {"$ref": "#/$defs/Fault"}
-    return schema
-
-
-def _waivers() -> dict[str, Any]:
-    from fieldtwin.conformance.core.waivers import WaiversForm
-
-    return WaiversForm.model_json_schema()
-
-
-def _rules() -> dict[str, Any]:
-    from fieldtwin.run.shadow.rules import RulesForm
-
-    return RulesForm.model_json_schema()
-
-
-SCHEMAS: dict[str, Callable[[], dict[str, Any]]] = {
-    "system": _system,
-    "prototype": _prototype,
-    "network": _network,
-    "profile": _profile,
-    "faults": _faults,
-    "scenario": _scenario,
-    "waivers": _waivers,
-    "rules": _rules,
-}
-"""The kinds of files that users write."""
+from fieldtwin.console import stderr
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.site.schemas import SCHEMAS, schema_text, shipped
 
 
 @click.command("schema")
-@click.argument("kind", type=click.Choice(list(SCHEMAS)))
-def command(kind: str) -> int:
+@click.argument("kind", required=False, type=click.Choice(list(SCHEMAS)))
+@click.option(
+    "--write",
+    "folder",
+    type=click.Path(file_okay=False, path_type=Path),
+    metavar="DIR",
+    help="Write the schemas of all kinds of files to this folder, as KIND.schema.json.",
+)
+def command(kind: str | None, folder: Path | None) -> int:
     """Print the JSON schema of a kind of file that users write.
 
     \b
@@ -90,8 +34,21 @@ def command(kind: str) -> int:
     scenario    steps and expected results, for test
     waivers     accepted failures with an owner, for check and test
     rules       a digital twin's commands for its findings, for twin --plan
+
+    An editor reads the schema that the first line of a YAML file names:
+
+    \b
+      # yaml-language-server: $schema=.fieldtwin/system.schema.json
+
+    `fieldtwin schema --write .fieldtwin` writes these files, and after an update writes them again.
     """
-    schema = {"$schema": "https://json-schema.org/draft/2020-12/schema", **SCHEMAS[kind]()}
-    json.dump(schema, sys.stdout, indent=2)
-    sys.stdout.write("\n")
+    if (kind is None) == (folder is None):
+        raise UsageError("what to do with which schema is not clear", expected="either a kind of file, or --write DIR")
+    if kind is not None:
+        sys.stdout.write(schema_text(kind))
+    if folder is not None:
+        folder.mkdir(parents=True, exist_ok=True)
+        for each in SCHEMAS:
+            shutil.copyfile(shipped(each), folder / shipped(each).name)
+        stderr.print(f"{len(SCHEMAS)} schemas in {folder}", soft_wrap=True, markup=False, highlight=False)
     return 0

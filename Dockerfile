@@ -2,7 +2,7 @@
 #
 #   docker build -t fieldtwin . && docker run --rm fieldtwin run observatory --prototype --for 20s
 #
-# For a real serial port or CAN interface add --device=/dev/ttyUSB0 or --network=host. docs/compose.md has the rest.
+# For a real serial port or CAN interface add --device=/dev/ttyUSB0 or --network=host. docs/how-to/compose.md has the rest.
 FROM python:3.11-slim-bookworm AS build
 WORKDIR /src
 ENV PIP_NO_CACHE_DIR=1 PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_ROOT_USER_ACTION=ignore

@@ -17,7 +17,7 @@ NOTE = (
     else f"fieldtwin {__version__} is not on PyPI yet. In commands such as `pip install '{CLONE}[mqtt]'`, `{CLONE}` is the folder"
     " of a clone, and the path of a wheel file can replace it."
 )
-"""The paragraph about releases in docs/start.md."""
+"""The paragraph about releases in docs/how-to/install.md."""
 
 
 def install_command(extra: str = "", source: str = CLONE) -> str:

@@ -2,7 +2,7 @@
 
 Loaded in every test run of whoever has fieldtwin installed, so it imports pytest and nothing else until a test asks for
 something: neither pymodbus nor canopen, and none of fieldtwin but `fieldtwin.testing`. What is emulated runs in another process
-(docs/testing.md).
+(docs/how-to/pytest.md).
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line(
         "markers",
         "fieldtwin(device=, on=, unit=, values=, recording=, system=, plc=, ...): what the fixtures device, prototype and plc "
-        "are (docs/testing.md)",
+        "are (docs/how-to/pytest.md)",
     )
     config.addinivalue_line("markers", "requirement(*ids): requirements that the test covers")
     if config.getoption("--fieldtwin-html") and not hasattr(config, "workerinput"):  # with xdist, once for all workers

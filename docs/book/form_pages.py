@@ -36,7 +36,7 @@ def _forms() -> str:
     parts = [
         "# Forms\n",
         "Every key of every kind of file, as `fieldtwin schema KIND` has them. What they mean, with examples, is in"
-        " [files](../files.md), [scenarios](../scenarios.md), [faults](../faults.md) and [conformance](../conformance.md).\n",
+        " [files](files.md), [scenarios](scenarios.md), [faults](../how-to/faults.md) and [conformance](conformance.md).\n",
     ]
     for kind, about in KINDS.items():
         schema = SCHEMAS[kind]()
@@ -117,7 +117,7 @@ def _faults() -> str:
     parts = [
         "# Faults, one by one\n",
         "What `fieldtwin faults` lists, of this version. How they are put in and what each of them takes:"
-        " [faults](../faults.md).\n",
+        " [faults](../how-to/faults.md).\n",
     ]
     for on in dict.fromkeys(kind.kind for kind in FAULTS.values()):
         parts += [f"## {on.value}\n", _row(("name", "is", "may be told")), _row(["---"] * 3)]

@@ -1,4 +1,4 @@
-"""Generate the paper's schemas as classes: the table of docs/paper.md, resolved to existing classes, with their docstrings."""
+"""Generate the paper's schemas as classes: the table of docs/explanation/paper.md, as existing classes with their docstrings."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 from pkgutil import iter_modules
 from types import ModuleType
 
-PAPER = Path(__file__).resolve().parents[1] / "paper.md"
+PAPER = Path(__file__).resolve().parents[1] / "explanation" / "paper.md"
 _NAME = re.compile(r"[A-Za-z]\w+")
 
 
@@ -61,7 +61,7 @@ def paper_page() -> str:
     """Return Markdown: each schema, its classes, and their docstrings."""
     parts = [
         "# The paper's classes\n",
-        "Each schema of [the paper](../paper.md), the classes that stand for it, and what those say of themselves."
+        "Each schema of [the paper](../explanation/paper.md), the classes that stand for it, and what those say of themselves."
         " `pytest tests/spec` holds the schemas against them.\n",
     ]
     for row in rows(PAPER.read_text("utf-8")):

@@ -30,8 +30,15 @@ PAPERS = {  # file of the repository: page of the book
     "SECURITY.md": "security.md",
     "benchmarks/README.md": "benchmarks.md",
 }
-FOLDERS = {"examples": "tutorials/examples.md", "docs/decisions": "decisions/README.md", "docs": "index.md"}
-LISTS = {"decisions/README.md": "\n```{toctree}\n:hidden:\n:glob:\n\n0*\n```\n"}
+KINDS = {
+    "tutorials": "Tutorials",
+    "how-to": "How-to guides",
+    "reference": "Reference",
+    "explanation": "Explanation",
+}
+"""The folders of docs/, which are the four parts of the sidebar."""
+FOLDERS = {"docs/decisions": "decisions/README.md", "docs": "index.md", "examples": "tutorials/README.md"}
+FOLDERS |= {f"docs/{kind}": f"{kind}/README.md" for kind in KINDS}
 GENERATED = (
     *("reference/cli.md", "reference/forms.md", "reference/faults.md", "reference/profiles.md"),
     *("reference/explanations.md", "reference/paper.md"),
@@ -95,16 +102,42 @@ def _target(link: str, source: str, number: int, book: dict[str, str], beside: d
     return beside[wanted]
 
 
-def contents(index: str) -> str:
-    """Return the book's tables of contents, hidden: one for each heading of index.md, of the pages linked below it, in order."""
-    parts, seen = [], set()
-    for section in index.split("\n## ")[1:]:
-        title, _, text = section.partition("\n")
-        names = [link.removesuffix(".md") for _, link, _, _ in _LINK.findall(text) if link.endswith(".md")]
-        own = [name for name in names if name not in seen]
-        seen.update(own)
-        parts.append("\n".join(["", "```{toctree}", ":hidden:", f":caption: {title}", "", *own, "```", ""]))
-    return "".join(parts)
+def contents(page: str, text: str, book: set[str]) -> str:
+    """Return the hidden table of contents of an index page.
+
+    The book's first page lists the four kinds, the decisions and the papers. The README.md of a folder lists the pages of this
+    folder: first those to which it links, in that order, then all others by name. A folder below it is listed as its README.md.
+    """
+    folder = Path(page).parent.as_posix()
+    if page == "index.md":
+        project = ["decisions/README.md", *PAPERS.values()]
+        first = [f"{kind}/README.md" for kind in KINDS]
+        top = {name for name in book if "/" not in name or (name.count("/") == 1 and name.endswith("/README.md"))}
+        others = sorted(top - {*first, *project, page})
+        return _toctree([*first, *others]) + _toctree([name for name in project if name in book], "Project")
+    if Path(page).name != "README.md":
+        return ""
+    names = {name for name in book if Path(name).parent.as_posix() == folder}
+    names |= {name for name in book if Path(name).parent.parent.as_posix() == folder and Path(name).name == "README.md"}
+    linked = [os.path.normpath(Path(folder, link).as_posix()) for _, link, _, _ in _LINK.findall(text)]
+    ordered = [name for name in dict.fromkeys(linked) if name in names]
+    ordered += sorted(names - {*ordered})
+    return _toctree([os.path.relpath(name, folder) for name in ordered if name != page])
+
+
+def _toctree(names: list[str], caption: str = "") -> str:
+    entries = [name.removesuffix(".md") for name in names]
+    options = [":hidden:", *([f":caption: {caption}"] if caption else [])]
+    return "\n".join(["", "```{toctree}", *options, "", *entries, "```", ""])
+
+
+def list_of(folder: str, title: str, texts: dict[str, str]) -> str:
+    """Return an index page of a folder that has none: its title, and the titles of its pages."""
+    lines = [f"# {title}", ""]
+    for page in sorted(page for page in texts if Path(page).parent.as_posix() == folder):
+        heading = next((line[2:] for line in texts[page].splitlines() if line.startswith("# ")), Path(page).stem)
+        lines.append(f"- [{heading}]({Path(page).name})")
+    return "\n".join([*lines, ""])
 
 
 def generated() -> dict[str, str]:
@@ -122,17 +155,23 @@ def stage(target: Path) -> None:
     shutil.rmtree(target, ignore_errors=True)
     target.mkdir(parents=True)
     shutil.copy(Path(__file__).parent / "conf.py", target / "conf.py")
-    book = pages()
+    book, texts = pages(), generated()
     for source, page in book.items():
-        text, beside = with_links((ROOT / source).read_text("utf-8"), source, page, book)
-        _write(target / page, text + (contents(text) if page == "index.md" else LISTS.get(page, "")))
+        texts[page], beside = with_links((ROOT / source).read_text("utf-8"), source, page, book)
         for name, place in beside.items():
             (target / place).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy(ROOT / name, target / place)
+    for page, text in with_indexes(texts).items():
+        _write(target / page, text)
     left_out = shutil.ignore_patterns("__pycache__", ".*")
     shutil.copytree(ROOT / "examples", target / "files" / "examples", ignore=left_out, dirs_exist_ok=True)
-    for page, text in generated().items():
-        _write(target / page, text)
+
+
+def with_indexes(texts: dict[str, str]) -> dict[str, str]:
+    """Return all pages of the book with an index page for each kind, and with tables of contents."""
+    missing = {f"{kind}/README.md": list_of(kind, title, texts) for kind, title in KINDS.items()}
+    texts = missing | texts
+    return {page: text + contents(page, text, {*texts}) for page, text in texts.items()}
 
 
 def _write(path: Path, text: str) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from fieldtwin.explain.explanation import Explanation
 from fieldtwin.gateway.core import errors as e
 
-_SOURCE = "docs/design.md"
+_SOURCE = "docs/explanation/design.md"
 _TODO: dict[type[e.FieldtwinError], str] = {
     e.CheckFailed: "Read which test case failed; `fieldtwin explain MB-015` explains a case.",
     e.UsageError: "Correct the command line. The text names what was expected, and often the nearest known word.",

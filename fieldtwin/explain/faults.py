@@ -18,7 +18,7 @@ def _entry(kind: type[Fault]) -> Explanation:
         kind.name, "fault", f"for {kind.kind.value}", f"{summary}.{_parameters(kind)}",
         f"Inject it with a step `- fault: {{name: {kind.name}, device: NAME, from: 5s, until: 12s}}` of a scenario, or with the "
         "same line in a file for `--faults`. A scenario fails if it never took effect.",
-        "docs/faults.md", (f"fault {kind.name}",),
+        "docs/how-to/faults.md", (f"fault {kind.name}",),
     )  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""The examples of docs/plc.md run: its programs, its proof, its commands."""
+"""The examples of docs/reference/plc.md run: its programs, its proof, its commands."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from fieldtwin.cli.run.plc_command import command
 from fieldtwin.plc.program import Role, ScanInfo
 from fieldtwin.plc.prove import prove
 
-PAGE = (Path(__file__).parents[2] / "docs" / "plc.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).parents[2] / "docs" / "reference" / "plc.md").read_text(encoding="utf-8")
 MS = 1_000_000
 
 
@@ -26,7 +26,7 @@ def python() -> dict[str, Any]:
     """Return all Python code of the page, in order, as one module."""
     space: dict[str, Any] = {"__name__": "docs_plc"}
     for text in snippets("python"):
-        exec(compile(text, "docs/plc.md", "exec"), space)
+        exec(compile(text, "docs/reference/plc.md", "exec"), space)
     return space
 
 

@@ -1,4 +1,4 @@
-"""Every option that docs/commissioning.md names for line, scan and identify exists."""
+"""Every option that docs/how-to/commissioning.md names for line, scan and identify exists."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 
 from fieldtwin.cli.main import cli
 
-PAGE = (Path(__file__).parents[2] / "docs" / "commissioning.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).parents[2] / "docs" / "how-to" / "commissioning.md").read_text(encoding="utf-8")
 LINES = [line for line in re.findall(r"```sh\n(.*?)```", PAGE, re.S)[0].splitlines() if line]
 
 

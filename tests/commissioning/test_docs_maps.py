@@ -1,4 +1,4 @@
-"""Every command line of docs/maps.md is accepted by the commands."""
+"""Every command line of docs/how-to/maps.md is accepted by the commands."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 
 from fieldtwin.cli.main import cli
 
-PAGE = (Path(__file__).parents[2] / "docs" / "maps.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).parents[2] / "docs" / "how-to" / "maps.md").read_text(encoding="utf-8")
 BLOCKS = "\n".join(re.findall(r"```sh\n(.*?)```", PAGE, re.S))
 LINES = [line for line in BLOCKS.splitlines() if line.startswith("fieldtwin ")]
 VERBS = ("read", "write", "watch", "dump", "diff", "infer")

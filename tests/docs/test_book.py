@@ -30,22 +30,36 @@ def test_links_between_files_work():
 
 
 def test_a_link_to_nothing_is_named_with_its_line():
-    with pytest.raises(book.BrokenLink, match=r"docs/plc\.md:2: nothing is at gone\.md"):
-        book.with_links("one\n[x](gone.md#y)\n", "docs/plc.md", "plc.md", book.pages())
+    with pytest.raises(book.BrokenLink, match=r"docs/reference/plc\.md:2: nothing is at gone\.md"):
+        book.with_links("one\n[x](gone.md#y)\n", "docs/reference/plc.md", "reference/plc.md", book.pages())
 
 
 def test_links_are_those_of_the_book():
-    shown = "[a](docs/plc.md#x) ![b](docs/picture.svg)"
+    shown = "[a](docs/reference/plc.md#x) ![b](docs/pictures/picture.svg)"
     text, beside = book.with_links(shown, "README.md", "readme.md", book.pages())
-    assert text == "[a](plc.md#x) ![b](picture.svg)"
-    assert beside == {"docs/picture.svg": "picture.svg"}
+    assert text == "[a](reference/plc.md#x) ![b](pictures/picture.svg)"
+    assert beside == {"docs/pictures/picture.svg": "pictures/picture.svg"}
 
 
-def test_every_page_is_in_the_contents():
-    text, _ = book.with_links((ROOT / "docs/index.md").read_text("utf-8"), "docs/index.md", "index.md", book.pages())
-    listed = set(re.findall(r"^[\w/.-]+$", book.contents(text), re.MULTILINE))
-    pages = {page.removesuffix(".md") for page in [*book.pages().values(), *book.GENERATED]}
-    assert {page for page in pages if not page.startswith("decisions/0")} - {"index"} == listed
+def test_every_page_is_in_one_table_of_contents(tmp_path):
+    book.stage(tmp_path)
+    listed = []
+    for page in tmp_path.rglob("*.md"):
+        for entries in re.findall(
+            r"^```{toctree}\n(?::[^\n]*\n)*\n(.*?)^```", page.read_text("utf-8"), re.MULTILINE | re.DOTALL
+        ):
+            listed += [
+                (page.parent / f"{entry}.md").resolve().relative_to(tmp_path.resolve()) for entry in entries.split()
+            ]
+    pages = [
+        page.relative_to(tmp_path) for page in tmp_path.rglob("*.md") if "files" not in page.relative_to(tmp_path).parts
+    ]
+    assert sorted(listed) == sorted(page for page in pages if page.as_posix() != "index.md")
+
+
+def test_every_page_lies_in_the_folder_of_its_kind():
+    folders = {page.relative_to(ROOT / "docs").parts[0] for page in (ROOT / "docs").rglob("*.md")}
+    assert folders - {"troubleshooting", "troubleshooting.md"} == {*book.KINDS, "decisions", "index.md"}
 
 
 def test_every_schema_of_the_paper_has_classes_that_there_are():

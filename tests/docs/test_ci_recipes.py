@@ -1,4 +1,4 @@
-"""docs/ci.md: the recipes are YAML in the form of the services, and call fieldtwin with existing options."""
+"""docs/how-to/ci.md: the recipes are YAML in the form of the services, and call fieldtwin with existing options."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from click.testing import CliRunner
 
 from fieldtwin.cli.main import cli
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "ci.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "how-to" / "ci.md"
 RECIPES = re.findall(r"^<!-- recipe: (\w+) -->\n```yaml\n(.*?)^```$", PAGE.read_text("utf-8"), re.MULTILINE | re.DOTALL)
 
 

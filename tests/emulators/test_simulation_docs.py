@@ -1,4 +1,4 @@
-"""The examples of docs/simulation.md run; and errors in the simulations of a prototype file are reported with their place."""
+"""The examples of docs/reference/simulation.md run; and errors in the simulations of a prototype file are reported with their place."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from fieldtwin.twin.site.schema import SimulationForm
 from fieldtwin.twin.site.system import load_system
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGE = (ROOT / "docs" / "simulation.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs" / "reference" / "simulation.md").read_text(encoding="utf-8")
 SHIPPED = ROOT / "profiles" / "systems"
 
 
@@ -47,7 +47,7 @@ def test_the_pond_of_the_page(tmp_path: Path) -> None:
 
 
 def test_the_pages_name_every_function() -> None:
-    language = (ROOT / "docs" / "expressions.md").read_text(encoding="utf-8")
+    language = (ROOT / "docs" / "reference" / "expressions.md").read_text(encoding="utf-8")
     named = set(re.findall(r"`([a-z0-9]+)\(", PAGE + language))
     assert set(FUNCTIONS) <= named
     for example in re.findall(r"`((?:ramp|sine|square|triangle|sawtooth|pulse)\([^`]*\))`", PAGE):

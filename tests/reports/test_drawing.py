@@ -128,16 +128,16 @@ def test_lines_stay_in_a_narrow_terminal():
         assert max(map(len, leaves)) <= 80
 
 
-PICTURES = sorted((ROOT / "docs" / "wires").glob("*.svg"))
+PICTURES = sorted((ROOT / "docs" / "pictures" / "wires").glob("*.svg"))
 
 
 @pytest.mark.parametrize("picture", PICTURES, ids=lambda path: path.stem)
 def test_a_picture_of_the_book_is_of_today_and_on_its_page(picture: Path):
-    command = f"fieldtwin draw {picture.stem} --prototype -o docs/wires/{picture.name}"
+    command = f"fieldtwin draw {picture.stem} --prototype -o docs/pictures/wires/{picture.name}"
     network = group_file(picture.stem)
     today = water.svg(water.network_map(load_network(network[1]))) if network else svg(of(picture.stem))
     assert picture.read_text("utf-8") == today, command
-    assert any(f"(wires/{picture.name})" in page.read_text("utf-8") for page in (ROOT / "docs").glob("*.md"))
+    assert any(f"pictures/wires/{picture.name})" in page.read_text("utf-8") for page in (ROOT / "docs").rglob("*.md"))
 
 
 def test_the_book_has_the_wires_of_each_kind_of_system():

@@ -1,4 +1,4 @@
-"""The examples of docs/reports.md run."""
+"""The examples of docs/how-to/reports.md run."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from report_rig import run_trace
 
 from fieldtwin.results.trace import Trace
 
-PAGE = (Path(__file__).parents[2] / "docs" / "reports.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).parents[2] / "docs" / "how-to" / "reports.md").read_text(encoding="utf-8")
 
 
 def test_the_python_of_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -23,7 +23,7 @@ def test_the_python_of_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         trace.flush()
     space: dict[str, Any] = {}
     for text in re.findall(r"^```python\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE):
-        exec(compile(text, "docs/reports.md", "exec"), space)
+        exec(compile(text, "docs/how-to/reports.md", "exec"), space)
     assert space["slow"] == []
     assert "<svg" in Path("report.html").read_text(encoding="utf-8")
     assert "the sensor is quick" in Path("report.xml").read_text(encoding="utf-8")

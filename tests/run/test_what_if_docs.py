@@ -1,4 +1,4 @@
-"""The plans in docs/what-if.md are valid, and so are the rules and the planner of docs/twin.md."""
+"""The plans in docs/how-to/what-if.md are valid, and so are the rules and the planner of docs/how-to/twin.md."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from fieldtwin.twin.model.mape.plan import RulePlanner
 from fieldtwin.twin.model.model import DigitalModel
 from fieldtwin.twin.site.system import load_system
 
-DOCS = Path(__file__).resolve().parents[2] / "docs"
+DOCS = Path(__file__).resolve().parents[2] / "docs" / "how-to"
 PAGE = DOCS / "what-if.md"
 
 

@@ -1,4 +1,4 @@
-"""The scenario on the page docs/scenarios.md runs and passes."""
+"""The scenario on the page docs/reference/scenarios.md runs and passes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from fieldtwin.run.targets.virtual_scenario import run_virtual
 from fieldtwin.scenarios.language.form import load_scenario
 from fieldtwin.scenarios.language.words import WORDS, ScenarioForm
 
-PAGE = (Path(__file__).resolve().parents[2] / "docs" / "scenarios.md").read_text()
+PAGE = (Path(__file__).resolve().parents[2] / "docs" / "reference" / "scenarios.md").read_text()
 
 BLOCKS = re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)
 

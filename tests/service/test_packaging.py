@@ -16,7 +16,7 @@ from fieldtwin.service.metrics import families
 
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-SERVICE = (ROOT / "docs" / "service.md").read_text()
+SERVICE = (ROOT / "docs" / "how-to" / "service.md").read_text()
 
 
 def unit() -> configparser.ConfigParser:

@@ -1,4 +1,4 @@
-"""Every row of the specification has a test here: the schemas in the table of docs/paper.md, the prose, the rulings."""
+"""Every row of the specification has a test here: the schemas in the table of docs/explanation/paper.md, the prose, the rulings."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ RULINGS = 18
 
 
 def test_index_every_schema_of_the_paper_is_looked_at() -> None:
-    page = (HERE.parents[1] / "docs" / "paper.md").read_text(encoding="utf-8")
+    page = (HERE.parents[1] / "docs" / "explanation" / "paper.md").read_text(encoding="utf-8")
     table = page[page.index("## Schemas and classes") : page.index("## Where the emulated connection is")]
     rows = [line.split("|")[1] for line in table.splitlines() if line.startswith("| ")][1:]
     schemas = {word for row in rows for word in re.findall(r"\b[A-Z][A-Za-z0-9]{3,}\b", row)}
@@ -34,7 +34,7 @@ def rulings_named(text: str) -> set[int]:
 
 def test_index_every_ruling_is_named_by_a_test_that_shows_it() -> None:
     """In the test itself: its docstring, or the text of an assertion."""
-    page = (HERE.parents[1] / "docs" / "paper.md").read_text(encoding="utf-8")
+    page = (HERE.parents[1] / "docs" / "explanation" / "paper.md").read_text(encoding="utf-8")
     rulings = {int(number) for number in re.findall(r"^\*\*(\d+)\. ", page[page.index("## Rulings") :], re.M)}
     assert rulings == set(range(1, RULINGS + 1))
     shown: set[int] = set()

@@ -119,7 +119,7 @@ def pytest_collection_finish():
 
 
 def test_the_docs_examples_run_with_nothing_but_pytest_installed(pytester: pytest.Pytester) -> None:
-    blocks = re.findall(r"```python\n(.*?)```", (HERE / "docs/testing.md").read_text(), re.DOTALL)
+    blocks = re.findall(r"```python\n(.*?)```", (HERE / "docs/how-to/pytest.md").read_text(), re.DOTALL)
     for block in blocks:
         assert len([line for line in block.splitlines() if line]) <= 10, block
     for example in ("meter/meter.py", "pump/pump.st"):

@@ -24,7 +24,7 @@ _NEEDS = {"send": "send_command", "set": "set_value", "fault": "inject_fault", "
 
 
 def scenario(system: System, program: str, proof: Proof, result: Result) -> str:
-    """Return a scenario file (docs/scenarios.md) for the counterexample `result` of `program`."""
+    """Return a scenario file (docs/reference/scenarios.md) for the counterexample `result` of `program`."""
     steps = list(_steps(system, program, proof.make(), result.way))
     needs = list(dict.fromkeys(_NEEDS[word] for word, _ in steps if word in _NEEDS))
     lines = [

@@ -1,4 +1,4 @@
-"""docs/faults.md: its example is a valid fault file, and its keys exist."""
+"""docs/how-to/faults.md: its example is a valid fault file, and its keys exist."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 from fieldtwin.emulators.faults.fault import Aim
 from fieldtwin.emulators.faults.schema import load_faults
 
-TEXT = (Path(__file__).parents[3] / "docs" / "faults.md").read_text()
+TEXT = (Path(__file__).parents[3] / "docs" / "how-to" / "faults.md").read_text()
 
 
 def test_its_file_is_a_fault_file(tmp_path: Path) -> None:

@@ -1,7 +1,7 @@
 """Operators, standard functions, conversions and blocks against an independent reference written from IEC 61131-3.
 
 The reference does not use the compiler: it computes with Python's integers, `decimal` and `struct`, by the clauses and tables
-that each test names. Where the standard leaves a result open, docs/plc.md defines it.
+that each test names. Where the standard leaves a result open, docs/reference/plc.md defines it.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """VAR_GLOBAL is one set of variables for all programs of a file that one PLC runs (IEC 61131-3, 6.5.2.2 and 6.8.1).
 
-Defect: each program had its own copy: A counted to 3 while B still saw 0, contrary to docs/plc.md.
+Defect: each program had its own copy: A counted to 3 while B still saw 0, contrary to docs/reference/plc.md.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The examples of docs/reference/simulation.md run; and errors in the simulations of a prototype file are reported with their place."""
+"""The examples of docs/reference/simulation.md run. Errors in simulations of a prototype file are reported with their place."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every row of the specification has a test here: the schemas in the table of docs/explanation/paper.md, the prose, the rulings."""
+"""Every row of the specification has a test here: the table of schemas in docs/explanation/paper.md, the prose, the rulings."""
 
 from __future__ import annotations
 

@@ -258,4 +258,6 @@ def test_a_wrong_relay_is_detected(broken: type[Watched], invariant: str) -> Non
 
 def test_the_drawing_in_the_docs_is_that_of_the_table() -> None:
     drawn = (Path(__file__).parents[2] / "docs/pictures/relay.svg").read_text(encoding="utf-8")
-    assert drawn == svg(Relay.table, "observatory: relay"), "fieldtwin plc diagram observatory -o docs/pictures/relay.svg"
+    assert drawn == svg(Relay.table, "observatory: relay"), (
+        "fieldtwin plc diagram observatory -o docs/pictures/relay.svg"
+    )

@@ -29,7 +29,9 @@ GOODBYE_S = 1.0
 
 FAILURE = 0x80
 """SUBACK codes from here on are refusals (MQTT 3.9.3)."""
-ACCESS = "the user needs permission to read and write the topics of group and node, and STATE (docs/explanation/thread.md)"
+ACCESS = (
+    "the user needs permission to read and write the topics of group and node, and STATE (docs/explanation/thread.md)"
+)
 
 
 class _Socket(ssl.SSLSocket):

@@ -68,6 +68,11 @@ _REASONS: dict[Reason, tuple[str, str]] = {
         "The device sent one of the values that mean `no measurement`, as listed under `sentinels` of the tag.",
         "The sensor is missing or broken, or measures nothing yet.",
     ),
+    Reason.NOT_EXACT: (
+        "The stored value differs from the one that the device sent: a text or payload was cut off at 4096 bytes, a text has "
+        "a character that databases refuse, or an integer has more than 63 bits. It is stored as uncertain.",
+        "Read the tag from the gateway or the trace, which have the whole value. Map a shorter text if the twin needs it.",
+    ),
 }
 _QUALITIES: dict[Quality, tuple[str, str]] = {
     Quality.GOOD: ("The value was read within its maximum age and passed all checks.", "Nothing."),

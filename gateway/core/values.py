@@ -81,6 +81,7 @@ class Reason(IntEnum):
     WRONG_DEVICE = 12
     GATEWAY_DEAD = 13
     SENTINEL = 14
+    NOT_EXACT = 15
 
     def __str__(self) -> str:
         return self.name.lower().replace("_", " ")

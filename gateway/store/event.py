@@ -17,7 +17,7 @@ from fieldtwin.gateway.core.values import Quality, Reason, Scalar, TagValue
 
 INT_MIN, INT_MAX = -(1 << 63), (1 << 63) - 1
 MAX_VALUE_BYTES = 4096
-"""A text or a payload is cut off at this length."""
+"""A text or a payload is cut off at this length, and is then uncertain (`Reason.NOT_EXACT`)."""
 
 
 class Kind(IntEnum):
@@ -60,10 +60,18 @@ class Event(NamedTuple):
 
 def of_tag(t_ms: int, name: str, value: TagValue) -> Event:
     """Return a tag's value as an event. NaN, which databases cannot store, becomes None with a reason."""
-    kept, quality, reason = plain(value.value), value.quality, value.reason
+    quality, reason = value.quality, value.reason
     if isinstance(value.value, float) and math.isnan(value.value) and quality < Quality.BAD:
         quality, reason = Quality.BAD, Reason.NOT_A_NUMBER
-    return Event(0, t_ms, Kind.VALUE, name, kept, int(quality), int(reason))
+    return stored(Event(0, t_ms, Kind.VALUE, name, None, int(quality), int(reason)), value.value)
+
+
+def stored(event: Event, value: Scalar | None) -> Event:
+    """Return `event` with `value` in the form of `plain`; it is uncertain at best if that form differs from `value`."""
+    kept = plain(value)
+    if value is not None and kept is not None and kept != value and event.quality < Quality.UNCERTAIN:
+        event = event._replace(quality=int(Quality.UNCERTAIN), reason=int(Reason.NOT_EXACT))
+    return event._replace(value=kept)
 
 
 def plain(value: Scalar | None) -> Value:

@@ -14,7 +14,7 @@ from fieldtwin.gateway.core.clock import NS_PER_MS, Clock
 from fieldtwin.gateway.core.concurrency.events import EventHandler
 from fieldtwin.gateway.core.errors import Bug
 from fieldtwin.gateway.core.values import DATA, RESPONSE, STATUS, TagValue
-from fieldtwin.gateway.store.event import Event, Kind, of_tag, plain
+from fieldtwin.gateway.store.event import Event, Kind, of_tag, stored
 
 KNOWLEDGE = 10_000
 """Number of events that a process keeps to be shared."""
@@ -46,7 +46,7 @@ class DigitalThreadProcess(ABC):  # noqa: B024  the schema has state and no oper
         if isinstance(value, TagValue):
             event = of_tag(t_ms, name, value)._replace(kind=int(kind))
         else:
-            event = Event(0, t_ms, int(kind), name, plain(value.data if isinstance(value, DATA) else value))
+            event = stored(Event(0, t_ms, int(kind), name), value.data if isinstance(value, DATA) else value)
         if len(self.knowledge) == self.knowledge.maxlen:
             self.dropped += 1
         self.knowledge.append(event)

@@ -20,12 +20,14 @@ from postgres_here import server
 from support import run
 
 from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid, Unreachable, UsageError
-from fieldtwin.gateway.core.values import Quality, Reason, TagValue
+from fieldtwin.gateway.core.values import RESPONSE, Quality, Reason, TagValue
 from fieldtwin.gateway.store.event import Event, Kind, KnowledgeStore, StoreFull, merged, of_tag, plain, without
 from fieldtwin.gateway.store.exchange_log import ExchangeLog
 from fieldtwin.gateway.store.knowledge import open_knowledge
 from fieldtwin.gateway.store.schema import LATEST, SCRIPTS, script
 from fieldtwin.gateway.store.sqlite_knowledge import SqliteKnowledge, in_place
+from fieldtwin.gateway.wallclock import WallClock
+from fieldtwin.twin.model.thread_process import PTDigitalThreadProcess
 
 CHECKOUT = Path(__file__).resolve().parents[3]
 
@@ -243,6 +245,25 @@ def test_values_that_cannot_be_stored_exactly_are_reported() -> None:
     assert plain(1 << 64) == float(1 << 64)
     assert plain(True) == 1
     assert plain("a\0b\udc80") == "ab?"
+
+
+@pytest.mark.parametrize("value", ["x" * 4097, b"x" * 4097, "a\0b", "a\udc80", (1 << 64) - 1, "\u00e9" * 2049])
+def test_a_value_that_is_not_stored_exactly_is_uncertain_and_says_why(value: str | bytes | int) -> None:
+    """Defect: the store cut off a text at 4096 bytes, and kept it with the quality good."""
+    assert of_tag(5, "x", TagValue(value, Quality.GOOD))[5:] == (Quality.UNCERTAIN, Reason.NOT_EXACT)
+    stale = of_tag(5, "x", TagValue(value, Quality.BAD, Reason.STALE))
+    assert stale[5:] == (Quality.BAD, Reason.STALE)  # the worse of both
+
+
+@pytest.mark.parametrize("value", ["x" * 4096, b"x" * 4096, True, 1 << 64, (1 << 63) - 1, 0.1, None, "\u00e9" * 2048])
+def test_a_value_that_is_stored_exactly_keeps_its_quality(value: str | bytes | float | None) -> None:
+    assert of_tag(5, "x", TagValue(value, Quality.GOOD))[4:] == (value, Quality.GOOD, Reason.NONE)
+
+
+def test_a_payload_that_does_not_fit_is_shared_as_uncertain() -> None:
+    process = PTDigitalThreadProcess("gateway", WallClock())
+    assert process.share(Kind.PAYLOAD, "modem", RESPONSE(b"x" * 4096))[5:] == (Quality.GOOD, Reason.NONE)
+    assert process.share(Kind.PAYLOAD, "modem", RESPONSE(b"x" * 4097))[5:] == (Quality.UNCERTAIN, Reason.NOT_EXACT)
 
 
 @given(

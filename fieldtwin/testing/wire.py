@@ -193,7 +193,7 @@ class Wire:
         ended = len(found) if late or like.get("problem") == "pending" else sum(e.problem != "pending" for e in found)
         if len(found) > wanted.most or (late and len(found) < wanted.least):
             there = "\n".join(f"  {e}" for e in self.exchanges(strays=True)[-SHOWN:]) or "  nothing"
-            raise AssertionError(f"{wanted} expected, {len(found)} seen; on the wire was:\n{there}")
+            raise AssertionError(f"expected {wanted}; got {len(found)}; on the wire was:\n{there}")
         return found, late or (ended >= wanted.least and not wanted.to_the_end)
 
     @contextmanager
@@ -246,12 +246,13 @@ class _Wanted:
             raise TypeError(f"at least {at_least} and at most {at_most} can never be met")
         if times is None and at_least is None and at_most is None:
             times = 1
-        words = ", ".join(f"{key}={value!r}" for key, value in like.items()) or "exchanges"
+        fields = ", ".join(f"{key}={value!r}" for key, value in like.items())
+        words = "exchange(s)" + (f" with {fields}" if fields else "")
         if times is not None:
-            return cls(times, times, times == 0, f"{times} times {words}")
+            return cls(times, times, times == 0, f"{times} {words}")
         bounds = [f"at least {at_least}"] * (at_least is not None) + [f"at most {at_most}"] * (at_most is not None)
         most = float("inf") if at_most is None else at_most
-        return cls(at_least or 0, most, at_most is not None, f"{' and '.join(bounds)} times {words}")
+        return cls(at_least or 0, most, at_most is not None, f"{' and '.join(bounds)} {words}")
 
     def __str__(self) -> str:
         return self.words

@@ -91,7 +91,7 @@ def publishes_nothing_bad(seen: Observation) -> Finding | None:
         if shown.word is Word.POISON:
             return failed(f"published {shown.text}, the value of the bad frame, {_when(seen, shown.t_ns)}")
         if shown.word is Word.OTHER:
-            return failed(f"published {shown.text}, which no correct answer contained,  {_when(seen, shown.t_ns)}")
+            return failed(f"published {shown.text}, which no correct answer contained, {_when(seen, shown.t_ns)}")
     return None
 
 

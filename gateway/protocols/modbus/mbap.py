@@ -80,7 +80,7 @@ class MbapFramer(Framer):
         self._awaiting = False
         got = self._seen or (f"{len(self._buffer)} bytes of an unfinished ADU" if self._buffer else "")
         return ReplyTimeout(
-            f"no reply within {waited_s:g} s", expected=f"transaction {self._transaction}, unit {self._unit}", got=got
+            f"no reply within {waited_s:.3g} s", expected=f"transaction {self._transaction}, unit {self._unit}", got=got
         )
 
     def _header_for(self, adu: bytes) -> bytes | None:

@@ -121,7 +121,7 @@ class RtuFramer(Framer):
                 hint="check baud rate, parity and wiring",
             )
         got = short_hex(self._buffer) if self._buffer else self._seen
-        return ReplyTimeout(f"no reply within {waited_s:g} s", expected=self._expectation(), got=got)
+        return ReplyTimeout(f"no reply within {waited_s:.3g} s", expected=self._expectation(), got=got)
 
     # -- reading from the front ----------------------------------------------------------------------------------
 

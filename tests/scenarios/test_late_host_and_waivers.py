@@ -72,7 +72,7 @@ TODAY = date(2027, 1, 10)
 def test_a_waiver_holds_until_its_expiry(found: Verdict, expires: date, verdict: Verdict, well: bool) -> None:
     passed = ScenarioResult("good", Verdict.PASSED, file="good.scenario.yaml")
     result = ScenarioResult("a test", found, file="/x/ctd-silent.scenario.yaml", reason="step 3")
-    waived = waive(result, Waivers((Waiver("ctd-silent", "ticket 4711", expires),)), TODAY)
+    waived = waive(result, Waivers((Waiver("ctd-silent", "A. Berg", "ticket 4711", expires),)), TODAY)
     assert waived.verdict is verdict
     assert all_well([passed, waived]) is well
     assert not all_well([] if verdict is Verdict.PASSED else [waived])
@@ -82,10 +82,10 @@ def test_waivers_are_read_and_reported(tmp_path: Path) -> None:
     path = tmp_path / "x.scenario.yaml"
     path.write_text(HEAD + "steps:\n  - expect: {tag: relay.state, value: ACTIVE, within: 1s}\n")
     waivers = tmp_path / "waivers.yaml"
-    waivers.write_text("waivers:\n  - {id: x, reason: ticket 4711, expires: 2999-01-01}\n")
+    waivers.write_text("waivers:\n  - {id: x, owner: A. Berg, reason: ticket 4711, expires: 2999-01-01}\n")
     ended = CliRunner().invoke(command, [str(path), "--waivers", str(waivers)], standalone_mode=False)
-    assert "waived: ticket 4711, until 2999-01-01 (failed: step 1" in " ".join(ended.output.split())
+    assert "waived: ticket 4711; owner A. Berg, until 2999-01-01 (failed: step 1" in " ".join(ended.output.split())
     assert ended.return_value == 1, "nothing passed"
-    waivers.write_text("waivers:\n  - {id: y, reason: ticket 4711, expires: 2999-01-01}\n")
+    waivers.write_text("waivers:\n  - {id: y, owner: A. Berg, reason: ticket 4711, expires: 2999-01-01}\n")
     wrong = CliRunner().invoke(command, [str(path), "--waivers", str(waivers)], standalone_mode=False)
     assert "no case 'y'" in str(wrong.exception)

@@ -126,7 +126,7 @@ def test_errors_of_separate_files_are_reported_together(site: Path) -> None:
     changed(site / "observatory.yaml", "node: 5\n", "node: 300\n")
     (site / "bad.scenario.yaml").write_text("scenario: x\nsystem: observatory.yaml\nsteps: [{pauze: 1s}]\n")
     (site / "worse.yaml").write_text("system: [\n")
-    (site / "waivers.yaml").write_text("waivers: [{id: MB-013x, reason: none, expires: 2030-01-01}]\n")
+    (site / "waivers.yaml").write_text("waivers: [{id: MB-013x, owner: me, reason: none, expires: 2030-01-01}]\n")
     (site / "lost.prototype.yaml").write_text("fieldtwin: 1\nprototype_of: observatori.yaml\nbuses: {}\ndevices: {}\n")
     found = {Path(error.path).name: str(error) for error in check_site(site).errors}
     assert set(found) >= {"observatory.yaml", "bad.scenario.yaml", "worse.yaml", "waivers.yaml", "lost.prototype.yaml"}

@@ -45,7 +45,7 @@ class CaseOptions:
         "--for", type=Duration(), default="0", help="Begin no test case after this time.  [default: no limit]"
     )
     waivers_path: Path | None = option(
-        "--waivers", type=click.Path(path_type=Path), help="YAML file of accepted failures: id, reason, expires."
+        "--waivers", type=click.Path(path_type=Path), help="YAML file of accepted failures: id, owner, reason, expires."
     )
     fail_on: str = option(
         "--fail-on",

@@ -66,7 +66,7 @@ class _WithCommand(GroupedCommand):
     click.option(
         "--waivers",
         type=click.Path(exists=True, dir_okay=False),
-        help="YAML file of accepted failures: name, reason, expires.",
+        help="YAML file of accepted failures: id, owner, reason, expires.",
     ),
 )
 @group("Campaign of seeds, in virtual time", campaign=CampaignOptions)

@@ -16,7 +16,7 @@ from fieldtwin.results.model import CheckResult, ScenarioResult, Verdict
 
 @dataclass(frozen=True, slots=True)
 class CaseResult:
-    """A case and its finding. `waived`: the waiver's reason, if a failure is accepted."""
+    """A case and its finding. `waived`: the waiver's reason, owner and expiry date, if a failure is accepted."""
 
     case: About
     finding: Finding
@@ -50,9 +50,10 @@ def waive(result: R, waivers: Waivers, today: date) -> R:
         return result
     if waiver.expired(today):
         found = f"; {result.finding.verdict.value}: {result.finding.reason}" if result.finding.reason else ""
-        return replace(result, finding=failed(f"its waiver expired on {waiver.expires} ({waiver.reason}){found}"))
+        text = f"its waiver expired on {waiver.expires} ({waiver.reason}; owner {waiver.owner}){found}"
+        return replace(result, finding=failed(text))
     if result.finding.verdict is Verdict.FAILED:
-        return replace(result, waived=f"{waiver.reason}, until {waiver.expires}")
+        return replace(result, waived=str(waiver))
     return result
 
 

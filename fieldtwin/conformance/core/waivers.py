@@ -1,7 +1,8 @@
-"""Waivers: accepted failures, each with a reason and an expiry date.
+"""Waivers: accepted failures, each with an owner, a reason and an expiry date.
 
     waivers:
       - id: MB-013
+        owner: A. Berg
         reason: the driver is replaced in May, ticket 4711
         expires: 2027-05-31
 
@@ -29,6 +30,8 @@ class WaiverForm(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
     id: Annotated[str, Field(min_length=1)]
+    owner: Annotated[str, Field(min_length=1, pattern=r"\S")]
+    """The person or team that answers for the failure."""
     reason: Annotated[str, Field(min_length=3)]
     expires: date
 
@@ -43,11 +46,15 @@ class WaiversForm(BaseModel):
 
 @dataclass(frozen=True, slots=True)
 class Waiver:
-    """A waiver: failures of `id` are accepted for `reason`, until the end of the day `expires`."""
+    """A waiver: `owner` accepts failures of `id` for `reason`, until the end of the day `expires`."""
 
     id: str
+    owner: str
     reason: str
     expires: date
+
+    def __str__(self) -> str:
+        return f"{self.reason}; owner {self.owner}, until {self.expires}"
 
     def expired(self, today: date) -> bool:
         return today > self.expires
@@ -86,4 +93,4 @@ def read_waivers(file: YamlFile, known: Collection[str]) -> Waivers:
         if entry.id in seen:
             raise file.error(("waivers", at, "id"), f"{entry.id!r} is waived twice")
         seen.add(entry.id)
-    return Waivers(tuple(Waiver(e.id, e.reason, e.expires) for e in entries))
+    return Waivers(tuple(Waiver(e.id, e.owner, e.reason, e.expires) for e in entries))

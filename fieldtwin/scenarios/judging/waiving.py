@@ -29,10 +29,10 @@ def waive(result: ScenarioResult, waivers: Waivers, today: date) -> ScenarioResu
         return result
     found = f"; {result.verdict.value}: {result.reason}" if result.reason else ""
     if waiver.expired(today):
-        reason = f"its waiver expired on {waiver.expires} ({waiver.reason}){found}"
+        reason = f"its waiver expired on {waiver.expires} ({waiver.reason}; owner {waiver.owner}){found}"
         return replace(result, verdict=Verdict.FAILED, reason=reason)
     if result.verdict is Verdict.FAILED:
-        reason = f"{_WAIVED}{waiver.reason}, until {waiver.expires} (failed: {result.reason})"
+        reason = f"{_WAIVED}{waiver} (failed: {result.reason})"
         return replace(result, verdict=Verdict.SKIPPED, reason=reason)
     return result
 

@@ -23,6 +23,7 @@ KNOWN = {"MB-013", "MB-015", "MB-015a"}
 CASE = next(c.about for c in CASES if c.about.id == "MB-015a")
 GOOD = """waivers:
   - id: MB-015
+    owner: A. Berg
     reason: replaced in May
     expires: 2027-05-31
 """
@@ -39,7 +40,7 @@ def _waived(finding: Finding, day: date) -> CaseResult:
 def test_a_failure_is_waived_up_to_and_on_the_last_day() -> None:
     result = _waived(failed("published 3333"), date(2027, 5, 31))
     assert result.verdict is Verdict.SKIPPED
-    assert result.reason == "waived: replaced in May, until 2027-05-31 (failed: published 3333)"
+    assert result.reason == "waived: replaced in May; owner A. Berg, until 2027-05-31 (failed: published 3333)"
     assert exit_code([result]) == 1, "nothing passed"
     assert exit_code([result, CaseResult(CASE, passed())]) == 0
 
@@ -48,7 +49,7 @@ def test_a_failure_is_waived_up_to_and_on_the_last_day() -> None:
 def test_an_expired_waiver_is_a_failure_that_states_the_expiry(finding: Finding) -> None:
     result = _waived(finding, date(2027, 6, 1))
     assert result.verdict is Verdict.FAILED
-    assert "its waiver expired on 2027-05-31 (replaced in May)" in result.reason
+    assert "its waiver expired on 2027-05-31 (replaced in May; owner A. Berg)" in result.reason
 
 
 def test_a_passing_case_needs_no_waiver() -> None:
@@ -59,12 +60,14 @@ def test_a_passing_case_needs_no_waiver() -> None:
     ("old", "new", "says"),
     [
         ("MB-015", "MB-51a", "w.yaml:2:5: no case 'MB-51a'; expected MB-015a"),
-        ("2027-05-31", "soon", "w.yaml:4"),
+        ("2027-05-31", "soon", "w.yaml:5"),
         ("    reason: replaced in May\n", "", "w.yaml:2"),
+        ("    owner: A. Berg\n", "", "w.yaml:2:5: the key 'owner' is missing"),
+        ("A. Berg", "'  '", "w.yaml:3"),
         ("reason", "raeson", "raeson"),
         (
             "    expires: 2027-05-31\n",
-            "    expires: 2027-05-31\n  - {id: MB-015, reason: again, expires: 2027-05-31}\n",
+            "    expires: 2027-05-31\n  - {id: MB-015, owner: me, reason: again, expires: 2027-05-31}\n",
             "twice",
         ),
     ],

@@ -92,17 +92,17 @@ def test_files_and_exit_code(device: str, tmp_path: Path) -> None:
 
 def test_a_waived_failure_is_skipped_and_all_is_well(device: str, tmp_path: Path) -> None:
     waivers = tmp_path / "waivers.yaml"
-    waivers.write_text("waivers:\n  - {id: MB-036a, reason: replaced in May, expires: 2999-05-31}\n")
+    waivers.write_text("waivers:\n  - {id: MB-036a, owner: A. Berg, reason: replaced in May, expires: 2999-05-31}\n")
     result = check(device, "--waivers", waivers, "--json")
     assert result.return_value == 0, result.exception
     case = next(case for case in json.loads(result.stdout)["cases"] if case["id"] == "MB-036a")
     assert (case["verdict"], case["waived"]) == ("skipped", True)
-    assert "replaced in May" in case["reason"]
+    assert "replaced in May; owner A. Berg, until 2999-05-31" in case["reason"]
 
 
 def test_a_wrong_waiver_is_reported_before_anything_is_sent(tmp_path: Path) -> None:
     waivers = tmp_path / "waivers.yaml"
-    waivers.write_text("waivers:\n  - {id: MB-999, reason: replaced in May, expires: 2999-05-31}\n")
+    waivers.write_text("waivers:\n  - {id: MB-999, owner: A. Berg, reason: replaced in May, expires: 2999-05-31}\n")
     assert isinstance(check("tcp://127.0.0.1:1", "--waivers", waivers).exception, FileInvalid)
 
 

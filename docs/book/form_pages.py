@@ -36,7 +36,8 @@ def _forms() -> str:
     parts = [
         "# Forms\n",
         "Every key of every kind of file, as `fieldtwin schema KIND` has them. What they mean, with examples, is in"
-        " [files](files.md), [scenarios](scenarios.md), [faults](../how-to/faults.md) and [conformance](conformance.md).\n",
+        " [files](files.md), [scenarios](scenarios.md), [fault files](fault-files.md) and"
+        " [conformance tests](../how-to/check-a-client.md).\n",
     ]
     for kind, about in KINDS.items():
         schema = SCHEMAS[kind]()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from fieldtwin.explain.explanation import Explanation
 from fieldtwin.gateway.core.values import Quality, Reason
 
-_SOURCE = "docs/reference/files.md"
+_SOURCE = "docs/reference/system-file.md"
 _REASONS: dict[Reason, tuple[str, str]] = {
     Reason.NEVER_READ: (
         "The gateway has not read the tag since it started, or a sampling device has no sample yet.",

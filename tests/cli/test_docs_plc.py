@@ -1,4 +1,4 @@
-"""The examples of docs/reference/plc.md run: its programs, its proof, its commands."""
+"""The examples of the pages about the PLC run: programs, a proof, commands."""
 
 from __future__ import annotations
 
@@ -14,7 +14,9 @@ from fieldtwin.cli.run.plc_command import command
 from fieldtwin.plc.program import Role, ScanInfo
 from fieldtwin.plc.prove import prove
 
-PAGE = (Path(__file__).parents[2] / "docs" / "reference" / "plc.md").read_text(encoding="utf-8")
+DOCS = Path(__file__).parents[2] / "docs"
+PAGES = ("reference/plc.md", "how-to/state-machines.md", "reference/structured-text.md", "how-to/debug-plc.md")
+PAGE = "".join((DOCS / page).read_text(encoding="utf-8") for page in PAGES)
 MS = 1_000_000
 
 
@@ -23,10 +25,10 @@ def snippets(language: str) -> list[str]:
 
 
 def python() -> dict[str, Any]:
-    """Return all Python code of the page, in order, as one module."""
+    """Return all Python code of the pages, in order, as one module."""
     space: dict[str, Any] = {"__name__": "docs_plc"}
     for text in snippets("python"):
-        exec(compile(text, "docs/reference/plc.md", "exec"), space)
+        exec(compile(text, "docs", "exec"), space)
     return space
 
 

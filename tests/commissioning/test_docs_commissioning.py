@@ -1,4 +1,4 @@
-"""Every option that docs/how-to/commissioning.md names for line, scan and identify exists."""
+"""Every option that the pages name for line, scan and identify exists."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ import pytest
 
 from fieldtwin.cli.main import cli
 
-PAGE = (Path(__file__).parents[2] / "docs" / "how-to" / "commissioning.md").read_text(encoding="utf-8")
+DOCS = Path(__file__).parents[2] / "docs"
+PAGE = (DOCS / "how-to" / "commissioning.md").read_text(encoding="utf-8")
+SCAN = (DOCS / "explanation" / "scanning.md").read_text(encoding="utf-8")
 LINES = [line for line in re.findall(r"```sh\n(.*?)```", PAGE, re.S)[0].splitlines() if line]
 
 
@@ -28,5 +30,6 @@ def test_every_option_that_the_page_names_exists(verb: str) -> None:
     command = cli.get_command(click.Context(cli), verb)
     assert command is not None
     known = {option for parameter in command.params for option in parameter.opts}
-    section = PAGE.split(f"\n## {verb}\n")[1].split("\n## ")[0].replace("`--echo` for the other verbs", "")
+    pages = f"{PAGE}\n## scan\n{SCAN}"
+    section = pages.split(f"\n## {verb}\n")[1].split("\n## ")[0].replace("`--echo` for the other verbs", "")
     assert set(re.findall(r"`(--[a-z-]+)", section)) <= known

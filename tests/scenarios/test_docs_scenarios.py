@@ -1,4 +1,4 @@
-"""The scenario on the page docs/reference/scenarios.md runs and passes."""
+"""The scenarios on docs/reference/scenarios.md and docs/how-to/own-controller.md are valid; the first one runs and passes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from fieldtwin.run.targets.virtual_scenario import run_virtual
 from fieldtwin.scenarios.language.form import load_scenario
 from fieldtwin.scenarios.language.words import WORDS, ScenarioForm
 
-PAGE = (Path(__file__).resolve().parents[2] / "docs" / "reference" / "scenarios.md").read_text()
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+PAGE = "".join((DOCS / page).read_text() for page in ("reference/scenarios.md", "how-to/own-controller.md"))
 
 BLOCKS = re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)
 

@@ -16,7 +16,8 @@ from fieldtwin.service.metrics import families
 
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-SERVICE = (ROOT / "docs" / "how-to" / "service.md").read_text()
+METRICS = (ROOT / "docs" / "reference" / "metrics.md").read_text()
+PACKAGES = (ROOT / "docs" / "reference" / "packages.md").read_text()
 
 
 def unit() -> configparser.ConfigParser:
@@ -27,7 +28,7 @@ def unit() -> configparser.ConfigParser:
 
 
 def test_every_extra_is_in_the_docs_and_the_other_way_round() -> None:
-    table = SERVICE.split("| extra |")[1].split("\n\n")[0]
+    table = PACKAGES.split("| extra |")[1].split("\n\n")[0]
     said = dict(re.findall(r"^\| `([a-z]+)` \| ([^|]+?) \|", table, re.MULTILINE))
     assert said.keys() == PROJECT["optional-dependencies"].keys()
     for extra, brings in said.items():
@@ -48,13 +49,13 @@ def test_no_page_names_an_extra_that_there_is_not() -> None:
 
 
 def test_the_metrics_in_the_docs_are_served() -> None:
-    table = SERVICE.split("| metric |")[1].split("\n\n")[0]
+    table = METRICS.split("| metric |")[1].split("\n\n")[0]
     served = {family.name for family in families(seen())}
-    assert set(re.findall(r"`(fieldtwin_[a-z_]+)", SERVICE)) <= served
+    assert set(re.findall(r"`(fieldtwin_[a-z_]+)", METRICS)) <= served
     parts = re.findall(r"`(_[a-z_]+)", table)
     assert parts
     assert [p for p in parts if not any(name.endswith(p) for name in served)] == []
-    in_alerts = set(re.findall(r"(fieldtwin_[a-z_]+)", SERVICE.split("```yaml")[1].split("```")[0]))
+    in_alerts = set(re.findall(r"(fieldtwin_[a-z_]+)", METRICS.split("```yaml")[1].split("```")[0]))
     assert in_alerts <= served
 
 

@@ -142,7 +142,7 @@ class ThreadOptions:
         "--metrics",
         default="",
         metavar="HOST:PORT",
-        help="Serve metrics for Prometheus at HOST:PORT, e.g. 127.0.0.1:9464; default host: loopback (docs/how-to/service.md).",
+        help="Serve metrics for Prometheus at HOST:PORT, default host: loopback. See docs/reference/metrics.md.",
     ),
     click.option(
         "--log",

@@ -31,7 +31,7 @@ MAX_FORMS = 1_000
 """Forms of lines that a probe remembers."""
 SHOWN_CHARACTERS = 80
 PERIOD_S = 0.05
-"""Period in seconds of a `tcp://` probe. docs/reference/conformance.md states it, because a shorter-lived value may be missed."""
+"""Period in seconds of a `tcp://` probe. docs/how-to/check-a-client.md states it, because a shorter-lived value may be missed."""
 TIMEOUT_S = 2.0
 
 

@@ -42,7 +42,7 @@ Tell = Callable[[dict[str, str]], None]
 
 
 def environment(contact: FieldContact, system: System, control: Path) -> dict[str, str]:
-    """Return the environment variables that tell the program where the field is (docs/reference/scenarios.md has the table)."""
+    """Return the environment variables that tell the program where the field is (docs/reference/with.md has the table)."""
     env = _of_system(system, control)
     for name, bus in system.buses.items():
         endpoint = contact.mapping.get(bus.endpoint)

@@ -3,7 +3,7 @@
     probes:
       crane: {endpoint: "tcp://192.0.2.7:502", unit: 1, every: 200ms, registers: {height: {at: 30001, type: float32}}}
 
-Registers are written like the tags of a device profile (docs/reference/files.md); they are read, never written.
+Registers are written like the tags of a device profile (docs/reference/device-profile.md); they are read, never written.
 """
 
 from __future__ import annotations

@@ -197,7 +197,7 @@ def test_lists() -> None:
 def test_the_docs_have_every_case() -> None:
     from fieldtwin.conformance.devices.canopen.cases import CASES as CANOPEN_CASES
 
-    text = (Path(__file__).parents[3] / "docs" / "reference" / "conformance.md").read_text()
+    text = (Path(__file__).parents[3] / "docs" / "reference" / "conformance-devices.md").read_text()
     for case in (*CASES, *CANOPEN_CASES):
         row = f"{case.title}: {case.does} | {case.must} | {case.sources} |"
         assert any(

@@ -159,3 +159,16 @@ def test_output_and_exit_codes(invoke: Invoke, site: Path, tmp_path: Path) -> No
     code, _, err = invoke("check", "site", str(tmp_path / "other"))
     assert code == 2
     assert "no file of fieldtwin" in err
+
+
+def test_a_name_that_a_program_does_not_publish_is_named_although_the_program_publishes_none(
+    tmp_path: Path, invoke: Invoke
+) -> None:
+    site = Path(shutil.copytree(data_root() / "examples" / "own-plc", tmp_path / "site"))
+    (site / "wrong.scenario.yaml").write_text(
+        "scenario: wrong\nsystem: mooring.yaml\nsteps:\n  - expect: {that: 'sampling.period_s == 5'}\n"
+    )
+    (error,) = check_site(site).errors
+    assert (error.line, "no tag or variable 'sampling.period_s'" in str(error)) == (4, True), error
+    code, _, told = invoke("test", str(site / "wrong.scenario.yaml"))
+    assert (code, "no tag or variable 'sampling.period_s'" in told) == (3, True), told

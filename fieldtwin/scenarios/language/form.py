@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -121,16 +121,19 @@ def invariants_of(system: System, group: SystemGroup | None = None, errors: Erro
         for prefix, one in members:
             if one.invariants != NONE_STATED:
                 names = names_of(one, errors=collector)
-                every += load_invariants(one, names, collector, incomplete_parts(one, names), prefix)
+                every += load_invariants(one, names, collector, incomplete_parts(one), prefix)
     return every
 
 
-def incomplete_parts(system: System, names: Iterable[str]) -> frozenset[str]:
+def incomplete_parts(system: System) -> frozenset[str]:
     """Return the devices, buses and programs of the system file that were not resolved because of errors.
 
-    `names` are those of the resolved parts, as `names_of` returns them.
+    A program whose variables are all bound to tags publishes no name of its own, and is nevertheless complete.
     """
-    known = {*system.devices, *system.buses, *(name.partition(".")[0] for name in names)}
+    from fieldtwin.twin.plant.physical import bound_programs
+
+    programs = [program.name for program in bound_programs(system, ErrorCollector())]
+    known = {*system.devices, *system.buses, *programs}
     return frozenset({*system.file.data["devices"], *system.file.data["buses"], *system.plc.programs} - known)
 
 
@@ -159,7 +162,7 @@ def _resolve(
             if name in system.devices or name in system.plc.programs:
                 raise file.error(("probes", name), f"{name!r} is already a device or program of the system")
     own = names_of(system, group, errors)
-    incomplete = incomplete_parts(system, own) if group is None else frozenset()
+    incomplete = incomplete_parts(system) if group is None else frozenset()
     known = tuple(dict.fromkeys([*own, *(name for probe in probes for name in probe.names)]))
     scenario = Scenario(
         path,

@@ -287,7 +287,9 @@ def resolve_address(text: int | str, numbering: str, count: int = 1) -> Register
         found = next((t for t, d in PRINTED if d == int(digits[0])), None)
         address = int(digits[1:]) - 1
     else:
-        raise ValueError(f"address {text!r}: 30001 or 400001 as printed in manuals, or holding:0x10 as sent")
+        raise ValueError(
+            f"address {text!r}: 00001 (coil), 10001, 30001 or 400001 as printed in manuals, or coil:0, holding:0x10 as sent"
+        )
     if found is None:
         raise ValueError(
             f"address {text!r} starts with {str(text)[0]}: 0 coil, 1 discrete, 3 input, 4 holding register"

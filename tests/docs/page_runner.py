@@ -3,12 +3,14 @@
 A comment before a fence gives its purpose. Forges and the book do not show it.
 
     <!-- file: tank.yaml -->    the fence is the content of that file
+    <!-- clone: fieldtwin -->   without a fence: the folder `fieldtwin` is this checkout, as after `git clone`
     <!-- run -->                `$ ` lines are commands, the lines below each its output; `...` matches anything
+    <!-- run: numbers -->       numbers, and the spaces around them, may differ from the page
     <!-- begin -->              a command that runs until the end of the page; its output must appear before the page continues
     <!-- end -->                without a fence: running commands are interrupted
 
-Other fences are illustrations. Long blocks have `<!-- run: long -->`: then the whole page runs with the tests marked
-long.
+Other fences are illustrations. Long blocks have `<!-- run: long -->` or `<!-- run: long numbers -->`: then the whole page
+runs with the tests marked long. After a command `cd FOLDER` the page continues in that folder.
 """
 
 from __future__ import annotations
@@ -26,7 +28,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 PATIENCE_S = 30.0
 
-_MARK = re.compile(r"^<!-- (file|run|begin|end)(?:: (\S+))? -->\n(?:```[^\n]*\n(.*?)^```$)?", re.MULTILINE | re.DOTALL)
+_MARK = re.compile(r"^<!-- (file|clone|run|begin|end)(?:: ([\w./ -]+?))? -->\n(?:```[^\n]*\n(.*?)^```$)?", re.MULTILINE | re.DOTALL)
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +51,7 @@ def blocks(page: Path) -> list[Block]:
 
 
 def is_long(page: Path) -> bool:
-    return any(block.word == "long" and block.does in ("run", "begin") for block in blocks(page))
+    return any("long" in block.word.split() and block.does in ("run", "begin") for block in blocks(page))
 
 
 def commands(text: str) -> list[tuple[str, str]]:
@@ -63,10 +65,20 @@ def commands(text: str) -> list[tuple[str, str]]:
     return [(command, "\n".join(output)) for command, output in found]
 
 
-def agrees(shown: str, seen: str) -> bool:
-    """Return whether `seen` matches the text shown; `...` matches anything, and spaces at line ends are ignored."""
+def agrees(shown: str, seen: str, numbers: bool = False) -> bool:
+    """Return whether `seen` matches the text shown; `...` matches anything, and spaces at line ends are ignored.
+
+    With `numbers`, every number agrees with every other, because columns of a table have the width of their numbers also
+    with different spaces around them.
+    """
+    if numbers:
+        shown, seen = _without_numbers(shown), _without_numbers(seen)
     parts = [re.escape(part.strip("\n")) for part in _bare(shown).split("...")]
     return re.fullmatch(r"\s*" + r"(?s:.*?)".join(parts) + r"\s*", _bare(seen)) is not None
+
+
+def _without_numbers(text: str) -> str:
+    return re.sub(r" +", " ", re.sub(r"\d+(?:\.\d+)?(?:e-?\d+)?", "0", text.replace("-0", " 0")))
 
 
 def _bare(text: str) -> str:
@@ -79,19 +91,26 @@ class Reader:
 
     folder: Path
     going_on: list[subprocess.Popen[str]] = field(default_factory=list)
+    below: str = ""  # the folder below `folder` that the page has changed into
 
     def does(self, block: Block) -> None:
         """Execute one block. Raise AssertionError with the command, the expected output and the actual output."""
         if block.does == "file":
-            place = self.folder / block.word
+            place = self.folder / self.below / block.word
             place.parent.mkdir(parents=True, exist_ok=True)
             place.write_text(block.text, "utf-8")
+        elif block.does == "clone":
+            (self.folder / block.word).symlink_to(ROOT)
         elif block.does == "end":
             self.ends()
         else:
             for command, shown in commands(block.text):
+                if command.startswith("cd "):
+                    self.below = os.path.normpath(Path(self.below) / command.removeprefix("cd "))
+                    assert (self.folder / self.below).is_dir(), f"line {block.line}: {command}: no such folder"
+                    continue
                 seen = self._begins(command, shown) if block.does == "begin" else self._runs(command)
-                assert agrees(shown, seen), f"line {block.line}: {command}\n--- shown\n{shown}\n--- seen\n{seen}"
+                assert agrees(shown, seen, "numbers" in block.word.split()), f"line {block.line}: {command}\n--- shown\n{shown}\n--- seen\n{seen}"
 
     def ends(self) -> None:
         """Interrupt running commands, as Ctrl-C does, the newest first."""
@@ -145,7 +164,7 @@ class Reader:
         }
         return subprocess.Popen(
             ["sh", "-c", command],
-            cwd=self.folder,
+            cwd=self.folder / self.below,
             env=environment,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,

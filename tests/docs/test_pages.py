@@ -46,3 +46,17 @@ def test_output_is_compared_with_its_gaps():
     assert not agrees("a ... c", "a b d")
     assert not agrees("a", "a\nb")
     assert commands("$ one\nsays\n$ two\n") == [("one", "says"), ("two", "")]
+
+
+def test_numbers_may_differ_only_where_the_page_allows_it():
+    assert agrees("seed 1  | took 12.5 s", "seed 27 |  took 3 s", numbers=True)
+    assert not agrees("took 12.5 s", "took 3 s")
+    assert not agrees("took 12.5 s", "took 3 ms", numbers=True)
+
+
+def test_a_page_changes_into_a_folder(tmp_path):
+    reader = Reader(tmp_path)
+    reader.does(Block("file", "site/a.txt", "one\n", 1))
+    reader.does(Block("run", "", "$ cd site\n$ cat a.txt\none\n", 3))
+    with pytest.raises(AssertionError, match="line 5: cd gone"):
+        reader.does(Block("run", "", "$ cd gone\n", 5))

@@ -28,7 +28,9 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 PATIENCE_S = 30.0
 
-_MARK = re.compile(r"^<!-- (file|clone|run|begin|end)(?:: ([\w./ -]+?))? -->\n(?:```[^\n]*\n(.*?)^```$)?", re.MULTILINE | re.DOTALL)
+_MARK = re.compile(
+    r"^<!-- (file|clone|run|begin|end)(?:: ([\w./ -]+?))? -->\n(?:```[^\n]*\n(.*?)^```$)?", re.MULTILINE | re.DOTALL
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +112,8 @@ class Reader:
                     assert (self.folder / self.below).is_dir(), f"line {block.line}: {command}: no such folder"
                     continue
                 seen = self._begins(command, shown) if block.does == "begin" else self._runs(command)
-                assert agrees(shown, seen, "numbers" in block.word.split()), f"line {block.line}: {command}\n--- shown\n{shown}\n--- seen\n{seen}"
+                alike = agrees(shown, seen, numbers="numbers" in block.word.split())
+                assert alike, f"line {block.line}: {command}\n--- shown\n{shown}\n--- seen\n{seen}"
 
     def ends(self) -> None:
         """Interrupt running commands, as Ctrl-C does, the newest first."""
